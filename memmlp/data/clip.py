@@ -16,6 +16,11 @@ from memmlp.errors import InputError
 SMPLH_POSE_DIM = 156
 FRAME_RATE_KEYS = ("mocap_framerate", "mocap_frame_rate")  # SMPL+H and SMPL-X releases
 FRAME_RATE_RANGE = (1.0, 1000.0)
+# What NumPy and zipfile raise on damaged bytes.
+DAMAGE = (
+    OSError, ValueError, EOFError, KeyError, AttributeError, TypeError, IndexError, MemoryError,
+    NotImplementedError, SyntaxError, RuntimeError, OverflowError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 RATE_TOLERANCE = 1e-3  # relative: 59.94 is not 60, and 120.0001 is 120
 
 
@@ -54,8 +59,7 @@ def read_clip(path: Path, name: str) -> Clip:
             poses, trans, rate = file["poses"], file["trans"], file[rate_key]
     except InputError:
         raise
-    except (OSError, ValueError, EOFError, KeyError, AttributeError, TypeError, IndexError, MemoryError,
-            NotImplementedError, SyntaxError, RuntimeError, OverflowError, zipfile.BadZipFile, zlib.error) as error:  # fmt: skip
+    except DAMAGE as error:
         raise InputError(f"{path}: not a readable npz ({_brief(error)})") from error
     fps = _frame_rate(path, rate)
     if poses.ndim != 2 or poses.shape[1] < 3 * N_JOINTS or not np.issubdtype(poses.dtype, np.floating):
