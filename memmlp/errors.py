@@ -6,3 +6,7 @@ class InputError(ValueError):
 
     The command line prints it without a traceback and exits with code 2.
     """
+
+
+class TrainingDiverged(RuntimeError):
+    """The loss became NaN or Inf: one line with the step, the term and the batch's clips; exit code 1."""

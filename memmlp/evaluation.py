@@ -1,0 +1,143 @@
+"""Evaluation in the two modes of the field, all clips side by side in one batch.
+
+`stream` is live use: one frame at a time, the network's own history, the last frame of each window kept.
+`window` is AGRoL's: non-overlapping windows whose T frames all count; the tail window is shifted back and
+its overlap dropped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from memmlp import metrics
+from memmlp.body import N_JOINTS, POSITION, ROTATION, SPARSE_DIM
+from memmlp.data.dataset import Frames
+from memmlp.features import Frame
+from memmlp.geometry import sixd_to_matrix
+from memmlp.memory import State
+from memmlp.progress import track
+
+
+class Network(Protocol):
+    """What can be evaluated: Mem-MLP, or anything that moves in time as it does."""
+
+    frame: Frame
+    frames: int
+
+    def initial_state(self, batch: int = 1) -> State:
+        """A fresh start."""
+
+    def advance(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
+        """New inputs (B, n, 54) -> motion (B, T, 198) in the world, and the new state."""
+
+
+@torch.no_grad()
+def stream(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
+    """Motion (N, 198) in the world of clips' frames (N, 252), frame by frame."""
+    order = sorted(range(len(clips)), key=lambda i: -len(clips[i]))
+    lengths = [len(clips[i]) for i in order]
+    inputs = torch.nn.utils.rnn.pad_sequence([clips[i][:, :SPARSE_DIM] for i in order], batch_first=True)
+    motion = inputs.new_zeros(*inputs.shape[:2], POSITION.stop)
+    state = network.initial_state(len(clips))
+    active = len(clips)
+    for t in track(range(lengths[0]), "stream"):
+        while lengths[active - 1] <= t:  # the clips are sorted: those that ended are the last ones
+            active -= 1
+            state = {name: tensor[:active] for name, tensor in state.items()}
+        output, state = network.advance(inputs[:active, t : t + 1], state)
+        motion[:active, t] = output[:, -1]
+    return [motion[order.index(i), : len(clip)] for i, clip in enumerate(clips)]
+
+
+@torch.no_grad()
+def window(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
+    """Motion (N, 198) in the world of clips' frames (N, 252), by non-overlapping windows."""
+    size = network.frames
+    padded = [_at_least(clip[:, :SPARSE_DIM], size) for clip in clips]
+    order = sorted(range(len(clips)), key=lambda i: -len(padded[i]))
+    motion = [clip.new_zeros(len(clip), POSITION.stop) for clip in padded]
+    state = network.initial_state(len(clips))
+    for start in range(0, len(padded[order[0]]), size):
+        order = [i for i in order if len(padded[i]) > start]
+        state = {name: tensor[: len(order)] for name, tensor in state.items()}
+        begin = [min(start, len(padded[i]) - size) for i in order]
+        inputs = torch.stack([padded[i][b : b + size] for i, b in zip(order, begin, strict=True)])
+        output, state = network.advance(inputs, state)
+        for i, b, result in zip(order, begin, output, strict=True):
+            motion[i][start : b + size] = result[start - b :]
+    return [whole[-len(clip) :] for whole, clip in zip(motion, clips, strict=True)]
+
+
+MODES: dict[str, Callable[[Network, Sequence[Tensor]], list[Tensor]]] = {"window": window, "stream": stream}
+
+
+def evaluate(network: Network, frames: Frames, modes: Sequence[str], batch: int) -> dict[str, Any]:
+    """Metrics of a split: `{"mean": {mode: {branch: {metric: value}}}, "clips": [...]}`.
+
+    The mean is over clips of each clip's mean over frames. At most `batch` clips stand side by side.
+    """
+    clips = [frames.clip(i) for i in range(len(frames.names))]
+    rows: list[dict[str, Any]] = [
+        {"name": name, "frames": len(clip)} for name, clip in zip(frames.names, clips, strict=True)
+    ]
+    for mode in modes:
+        for row, clip, motion in zip(rows, clips, predict(network, clips, mode, batch), strict=True):
+            row[mode] = clip_report(network.frame, motion, clip)
+    return {"mean": {mode: _mean([row[mode] for row in rows]) for mode in modes}, "clips": rows}
+
+
+def predict(network: Network, clips: Sequence[Tensor], mode: str, batch: int) -> list[Tensor]:
+    """Motion (N, 198) of each clip (N, 252), at most `batch` clips side by side."""
+    groups = [clips[i : i + batch] for i in range(0, len(clips), batch)]
+    return [motion for group in groups for motion in MODES[mode](network, group)]
+
+
+def clip_report(frame: Frame, motion: Tensor, truth: Tensor) -> dict[str, dict[str, float]]:
+    """Metrics of both branches for motion (N, 198) and true frames (N, 252)."""
+    sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
+    positions = joint_positions(target)
+    rotation = metrics.rotations_report(local_rotations(motion), local_rotations(target))
+    rotation |= metrics.positions_report(frame.pose(motion, sparse), positions)
+    return {"rotation": rotation, "position": metrics.positions_report(joint_positions(motion), positions)}
+
+
+def local_rotations(motion: Tensor) -> Tensor:
+    """Rotation matrices (N, 22, 3, 3) of motion (N, 198)."""
+    return sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6)))
+
+
+def joint_positions(motion: Tensor) -> Tensor:
+    """Positions (N, 22, 3) of motion (N, 198), metres, world."""
+    return motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
+
+
+def chunks(frames: Frames, length: int, least: int) -> list[Tensor]:
+    """A split's clips cut into pieces of `length` frames, those under `least` left out unless alone."""
+    pieces = [p for i in range(len(frames.names)) for p in frames.clip(i).split(length)]
+    return [p for p in pieces if len(p) >= least] or pieces
+
+
+@torch.no_grad()
+def quick_stream(network: Network, pieces: Sequence[Tensor]) -> dict[str, float]:
+    """Stream-mode means over pieces of clips: for validation during training."""
+    motions = stream(network, pieces)
+    mean = _mean([clip_report(network.frame, m, p) for m, p in zip(motions, pieces, strict=True)])
+    return {f"{branch} {name}": value for branch, values in mean.items() for name, value in values.items()}
+
+
+def _at_least(sparse: Tensor, size: int) -> Tensor:
+    """Inputs (N, 54), the first repeated in front up to `size` frames."""
+    return torch.cat([sparse[:1].expand(max(size - len(sparse), 0), -1), sparse])
+
+
+def _mean(rows: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+    """Mean over clips of each branch's metrics; a clip too short for a metric does not count in it."""
+    first = rows[0]
+    return {
+        branch: {name: float(torch.tensor([row[branch][name] for row in rows]).nanmean()) for name in values}
+        for branch, values in first.items()
+    }

@@ -1,0 +1,176 @@
+"""The training loss: the terms of Eqs. 1-4, the hand term, and how they are weighted (Eq. 5).
+
+As printed: L1, summed over joints and components, mean over time and batch (reading 10). Everything is
+in the world: 6D components, metres, per frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from memmlp.body import FRAME_DIM, HANDS, LOWER, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
+from memmlp.features import Frame, World
+
+Terms = dict[str, Tensor]
+
+
+def l1(error: Tensor) -> Tensor:
+    """Sum over components, mean over batch and time, of an error (B, T, ...)."""
+    return error.abs().flatten(2).sum(-1).mean()
+
+
+def joints(motion: Tensor) -> Tensor:
+    """Positions (B, T, 22, 3) of motion (B, T, 198)."""
+    return motion[..., POSITION].unflatten(-1, (N_JOINTS, 3))
+
+
+class NoHand:
+    """No hand term."""
+
+    branch = "position"
+
+    def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+        """No term."""
+        return {}
+
+
+class HandPosition:
+    """L1 on both wrists' positions of the position branch (reading 9)."""
+
+    branch = "position"
+
+    def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+        """The term, from motion and truth (B, T, 198)."""
+        hands = list(HANDS)
+        return {"hand": l1((joints(motion) - joints(truth))[:, :, hands])}
+
+
+class HandFK:
+    """L1 on both wrists' positions by forward kinematics of the rotation branch, head on its tracker."""
+
+    branch = "rotation"
+
+    def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+        """The term, from motion and truth (B, T, 198) and inputs (B, T, 54)."""
+        hands = list(HANDS)
+        return {"hand": l1(frame.pose(motion, sparse)[:, :, hands] - joints(truth)[:, :, hands])}
+
+
+Hand = NoHand | HandPosition | HandFK
+
+
+def rotation_terms(motion: Tensor, truth: Tensor) -> Terms:
+    """Eqs. 1 and 2 for motion and truth (B, T, 198)."""
+    error = (motion - truth)[..., ROTATION]
+    return {"rotation": l1(error), "rotation_velocity": l1(error.diff(dim=1))}
+
+
+def position_terms(motion: Tensor, truth: Tensor) -> Terms:
+    """Eqs. 3 and 4 (the latter on the lower body alone) for motion and truth (B, T, 198)."""
+    error = joints(motion) - joints(truth)
+    return {"position": l1(error), "velocity": l1(error[:, :, list(LOWER)].diff(dim=1))}
+
+
+class Manual(nn.Module):
+    """Fixed weights; the defaults are the paper's grid search (Sec. 4.4)."""
+
+    def __init__(
+        self,
+        rotation: float = 1.0,
+        rotation_velocity: float = 30.0,
+        position: float = 0.5,
+        velocity: float = 0.1,
+        hand: float = 0.1,
+    ):
+        super().__init__()
+        self.values = {
+            "rotation": rotation,
+            "rotation_velocity": rotation_velocity,
+            "position": position,
+            "velocity": velocity,
+            "hand": hand,
+        }
+
+    def build(self, names: list[str]) -> None:
+        """Nothing to learn."""
+
+    def parameter_groups(self) -> list[dict]:
+        """Nothing to learn."""
+        return []
+
+    def forward(self, terms: Terms) -> Tensor:
+        """The weighted sum."""
+        return torch.stack([self.values[name] * term for name, term in terms.items()]).sum()
+
+    def weights(self) -> Mapping[str, float]:
+        """The weight of each term."""
+        return self.values
+
+
+class Uncertainty(nn.Module):
+    """Homoscedastic uncertainty (Kendall et al. 2018): e^-s L + s, one learned s a term (reading 8).
+
+    Args:
+        lr: learning rate of the s; the model's own is too small for them to settle.
+    """
+
+    def __init__(self, lr: float = 1e-2):
+        super().__init__()
+        self.lr = lr
+        self.s = nn.ParameterDict()
+
+    def build(self, names: list[str]) -> None:
+        """One s, from 0, for each term."""
+        self.s = nn.ParameterDict({name: nn.Parameter(torch.zeros(())) for name in names})
+
+    def parameter_groups(self) -> list[dict]:
+        """The s, with their own learning rate and no decay."""
+        return [{"params": list(self.s.values()), "lr": self.lr, "weight_decay": 0.0}]
+
+    def forward(self, terms: Terms) -> Tensor:
+        """The weighted sum."""
+        return torch.stack(
+            [(-self.s[name]).exp() * term + self.s[name] for name, term in terms.items()]
+        ).sum()
+
+    def weights(self) -> Mapping[str, float]:
+        """The weight of each term now."""
+        return {name: float((-s).exp()) for name, s in self.s.items()}
+
+
+Weighting = Manual | Uncertainty
+
+
+class MotionLoss(nn.Module):
+    """The loss of Eq. 5 over the branches that the predictor has.
+
+    Args:
+        weighting: Manual or Uncertainty. hand: the hand term. branches: the predictor's.
+    """
+
+    def __init__(self, weighting: Weighting, hand: Hand, branches: frozenset[str]):
+        super().__init__()
+        self.weighting, self.hand, self.branches = weighting, hand, branches
+        probe = torch.zeros(1, 2, FRAME_DIM)
+        frame = Frame.raw(World(), torch.zeros(N_JOINTS, 3))
+        motion = probe[..., SPARSE_DIM:]
+        weighting.build(list(self.terms(motion, motion, probe[..., :SPARSE_DIM], frame)))
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+        """Each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
+        terms: Terms = {}
+        if "rotation" in self.branches:
+            terms |= rotation_terms(motion, truth)
+        if "position" in self.branches:
+            terms |= position_terms(motion, truth)
+        if self.hand.branch in self.branches:
+            terms |= self.hand(motion, truth, sparse, frame)
+        return terms
+
+    def forward(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> tuple[Tensor, Terms]:
+        """The loss and its unweighted terms."""
+        terms = self.terms(motion, truth, sparse, frame)
+        return self.weighting(terms), terms

@@ -1,0 +1,59 @@
+"""The predictor slot: from the backbone's hidden state to motion (Sec. 3.2.2)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from memmlp.body import MOTION_DIM, ROTATION, SPARSE_DIM
+from memmlp.features import Frame
+from memmlp.layers import MLPBlock
+
+
+def branch(hidden: int, frames: int, depth: int, size: int) -> nn.Sequential:
+    """`depth` MLP blocks and one linear layer."""
+    return nn.Sequential(*(MLPBlock(hidden, frames) for _ in range(depth)), nn.Linear(hidden, size))
+
+
+class TwoBranch(nn.Module):
+    """One branch for rotations, one for positions.
+
+    Args:
+        depth: MLP blocks a branch. hidden, frames: the backbone's d and T.
+    """
+
+    branches: ClassVar[frozenset[str]] = frozenset({"rotation", "position"})
+
+    def __init__(self, depth: int, *, hidden: int, frames: int):
+        super().__init__()
+        self.rotation = branch(hidden, frames, depth, ROTATION.stop)
+        self.position = branch(hidden, frames, depth, MOTION_DIM - ROTATION.stop)
+
+    def forward(self, h: Tensor, sparse: Tensor, frame: Frame) -> Tensor:
+        """Hidden state (B, T, d) -> motion (B, T, 198) in network space."""
+        return torch.cat([self.rotation(h), self.position(h)], -1)
+
+
+class RotationOnly(nn.Module):
+    """Rotations alone; the positions follow from them by forward kinematics, without gradient."""
+
+    branches: ClassVar[frozenset[str]] = frozenset({"rotation"})
+
+    def __init__(self, depth: int, *, hidden: int, frames: int):
+        super().__init__()
+        self.rotation = branch(hidden, frames, depth, ROTATION.stop)
+
+    def forward(self, h: Tensor, sparse: Tensor, frame: Frame) -> Tensor:
+        """Hidden state (B, T, d) and world inputs (B, T, 54) -> motion (B, T, 198) in network space."""
+        rotation = self.rotation(h)
+        with torch.no_grad():
+            physical = rotation * frame.std[SPARSE_DIM:][ROTATION] + frame.mean[SPARSE_DIM:][ROTATION]
+            positions = frame.pose(physical, sparse).flatten(-2)
+            world = torch.cat([physical, positions], -1)
+            position = frame.encode_motion(world, frame.origin(sparse))[..., ROTATION.stop :]
+        return torch.cat([rotation, position], -1)
+
+
+Predictor = TwoBranch | RotationOnly
