@@ -75,7 +75,7 @@ class MemMLP(nn.Module):
         for block in self.blocks:
             h = block(h, past)
         motion = self.predictor(h, window, self.frame)
-        kept = {"sparse": inputs[:, -self.memory.length :], "started": torch.ones_like(state["started"])}
+        kept = {"sparse": inputs[:, -self.memory.length :], "started": state["started"].clamp_min(1)}
         kept |= self.memory.remember(motion, state, new)
         return self.frame.decode_motion(motion, self.frame.origin(window)), kept
 

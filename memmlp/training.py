@@ -86,10 +86,15 @@ class StepResult:
 
 
 class Task(Protocol):
-    """What is trained: `module` holds all that a checkpoint must carry."""
+    """What is trained."""
 
-    module: nn.Module
-    frames: Frames
+    @property
+    def module(self) -> nn.Module:
+        """All that a checkpoint must carry."""
+
+    @property
+    def frames(self) -> Frames:
+        """The training split."""
 
     def parameter_groups(self) -> list[dict]:
         """For the optimiser."""
@@ -110,8 +115,8 @@ class VQVAETask:
     def __init__(
         self, model: VQVAE, frame: Frame, frames: Frames, validation: Frames, optim: Optim, seed: int
     ):
-        self.module = self.model = model
-        self.frame, self.frames, self.validation = frame, frames, validation
+        self.model, self.frame, self.frames, self.validation = model, frame, frames, validation
+        self.module: nn.Module = model
         self.sampler = WindowSampler(frames, batch=optim.batch, window=1, seed=seed)
         self.used = torch.zeros(len(model.codebook.vectors))
 
@@ -161,7 +166,7 @@ class MotionTask:
         validate: Callable[[MemMLP], dict[str, float]],
     ):
         self.model, self.loss, self.rollout, self.frames = model, loss, rollout, frames
-        self.module = nn.ModuleDict({"model": model, "loss": loss, "rollout": rollout})
+        self.module: nn.Module = nn.ModuleDict({"model": model, "loss": loss, "rollout": rollout})
         self.sampler = WindowSampler(frames, batch=optim.batch, window=model.frames, seed=seed)
         self._validate = validate
 

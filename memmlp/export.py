@@ -1,0 +1,123 @@
+"""ONNX of one streaming step with its state explicit, and the proof that it computes the same.
+
+Inputs: `sparse` (1, 54), the world features of the newest frame (order: memmlp.body), and `state.*`, all
+zeros for a fresh start. Outputs: `rotation6d` (1, 22, 6) local rotations, `position` (1, 22, 3) metres in
+the world, and the new `state.*` under the same names with the suffix `.next`.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import warnings
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from torch import Tensor, nn
+
+from memmlp import __version__
+from memmlp.body import FPS, JOINTS, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
+from memmlp.model import MemMLP
+
+OPSET = 18
+TOLERANCE = 1e-4
+FEATURES = (
+    "joints head, left_wrist, right_wrist; 0:18 global rotation 6D, 18:36 R[t-1]^-1 R[t] 6D, "
+    "36:45 global position m, 45:54 p[t]-p[t-1] m/frame; 6D = first two columns; world Z up"
+)
+
+
+class StreamStep(nn.Module):
+    """One step of the live stream with flat inputs and outputs."""
+
+    def __init__(self, model: MemMLP):
+        super().__init__()
+        self.model = model
+        self.names = list(model.initial_state(1))
+
+    def forward(self, sparse: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        """sparse (1, 54) and the state -> rotation6d (1, 22, 6), position (1, 22, 3), the new state."""
+        motion, new = self.model.advance(sparse[:, None], dict(zip(self.names, state, strict=True)))
+        last = motion[:, -1]
+        rotation = last[:, ROTATION].unflatten(-1, (N_JOINTS, 6))
+        position = last[:, POSITION].unflatten(-1, (N_JOINTS, 3))
+        return rotation, position, *(new[name] for name in self.names)
+
+
+def export(model: MemMLP, path: Path, run_id: str) -> None:
+    """Write the model's streaming step, on the CPU in float32, as one ONNX file with its metadata."""
+    step = StreamStep(model.cpu().eval())
+    states = tuple(model.initial_state(1).values())
+    names = [f"state.{name}" for name in step.names]
+    quiet = logging.getLogger("torch.onnx")
+    level = quiet.level
+    quiet.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the exporter's own deprecations are no news to our users
+            program = torch.onnx.export(
+                step,
+                (torch.zeros(1, SPARSE_DIM), *states),
+                input_names=["sparse", *names],
+                output_names=["rotation6d", "position", *(f"{name}.next" for name in names)],
+                opset_version=OPSET,
+                dynamo=True,
+                verbose=False,
+            )
+    finally:
+        quiet.setLevel(level)
+    assert program is not None
+    graph = program.model_proto
+    onnx.helper.set_model_props(graph, metadata(model, run_id))
+    temporary = path.with_name(path.name + ".tmp")
+    onnx.save(graph, temporary)
+    temporary.replace(path)
+
+
+def metadata(model: MemMLP, run_id: str) -> dict[str, str]:
+    """What a program needs to know to drive the file."""
+    return {
+        "joints": json.dumps(JOINTS),
+        "fps": str(FPS),
+        "T": str(model.frames),
+        "features": FEATURES,
+        "memmlp_version": __version__,
+        "run_id": run_id,
+    }
+
+
+class OnnxStream:
+    """The exported step in ONNX Runtime on one thread, with its state."""
+
+    def __init__(self, path: Path):
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        self.session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        self.shapes = {i.name: i.shape for i in self.session.get_inputs() if i.name != "sparse"}
+        self.reset()
+
+    def reset(self) -> None:
+        """A fresh start."""
+        self.state = {name: np.zeros(shape, np.float32) for name, shape in self.shapes.items()}
+
+    def step(self, sparse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """sparse (1, 54) -> rotation6d (1, 22, 6) and position (1, 22, 3)."""
+        rotation, position, *state = self.session.run(None, {"sparse": sparse, **self.state})
+        self.state = dict(zip(self.state, state, strict=True))
+        return rotation, position
+
+
+@torch.no_grad()
+def parity(model: MemMLP, path: Path, clip: Tensor) -> float:
+    """Largest difference between torch and ONNX Runtime, each with its own history, over a clip (N, 252)."""
+    model = model.cpu().eval()
+    onnx_stream, state, worst = OnnxStream(path), model.initial_state(1), 0.0
+    for sparse in clip[:, None, None, :SPARSE_DIM].cpu():
+        motion, state = model.advance(sparse, state)
+        rotation, position = onnx_stream.step(sparse[:, 0].numpy())
+        ours = np.concatenate([rotation.reshape(-1), position.reshape(-1)])
+        worst = max(worst, float(np.abs(ours - motion[0, -1].numpy()).max()))
+    return worst

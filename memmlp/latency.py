@@ -1,0 +1,99 @@
+"""How long one streaming step takes on a CPU, and how much work it is."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from onnx import TensorProto, helper
+from torch.utils.flop_counter import FlopCounterMode
+
+from memmlp.body import SPARSE_DIM
+from memmlp.export import OnnxStream
+from memmlp.model import MemMLP
+
+WARM_UP = 30
+REFERENCE_SHAPE = (41, 512, 8)  # rows, width, layers: 86 M multiply-adds of plain matrix products
+
+
+def measure(path: Path, steps: int = 200) -> dict[str, Any]:
+    """Median and p95 milliseconds a step of an exported file, one thread, beside the reference network.
+
+    The two are timed in turn, step by step, in the same minute, so that machines can be compared by the
+    ratio. `steps` is at least 200.
+    """
+    stream, reference = OnnxStream(path), reference_session()
+    sparse = np.zeros((1, SPARSE_DIM), np.float32)
+    rows = {"input": np.ones(REFERENCE_SHAPE[:2], np.float32)}
+    ours, theirs = [], []
+    for step in range(WARM_UP + max(steps, 200)):
+        start = time.perf_counter()
+        stream.step(sparse)
+        middle = time.perf_counter()
+        reference.run(None, rows)
+        if step >= WARM_UP:
+            ours.append(middle - start)
+            theirs.append(time.perf_counter() - middle)
+    return {
+        **_milliseconds("", ours),
+        **_milliseconds("reference_", theirs),
+        "ratio_to_reference": float(np.median(ours) / np.median(theirs)),
+        "steps": len(ours),
+        "threads": 1,
+    }
+
+
+def size(model: MemMLP, path: Path) -> dict[str, Any]:
+    """Parameters, MACs and FLOPs of one streaming step, and the file's bytes.
+
+    A FLOP is a multiplication or an addition of the matrix products, a MAC one of each.
+    """
+    model = model.cpu().eval()
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        model.advance(torch.zeros(1, 1, SPARSE_DIM), model.initial_state(1))
+    flops = counter.get_total_flops()
+    return {
+        "parameters": model.count_parameters(),
+        "parameters_with_vqvae": sum(p.numel() for p in model.parameters()),
+        "macs": flops // 2,
+        "flops": flops,
+        "onnx_bytes": path.stat().st_size,
+    }
+
+
+def reference_session() -> onnxruntime.InferenceSession:
+    """A fixed stack of matrix products and ReLUs, the same for ever, as a yardstick for machines."""
+    rows, width, layers = REFERENCE_SHAPE
+    weight = np.random.default_rng(0).standard_normal((width, width), np.float32) / np.sqrt(width)
+    nodes, name = [], "input"
+    for layer in range(layers):
+        nodes.append(helper.make_node("MatMul", [name, "weight"], [f"product{layer}"]))
+        nodes.append(helper.make_node("Relu", [f"product{layer}"], [f"hidden{layer}"]))
+        name = f"hidden{layer}"
+    value = helper.make_tensor_value_info
+    graph = helper.make_graph(
+        nodes,
+        "reference",
+        [value("input", TensorProto.FLOAT, [rows, width])],
+        [value(name, TensorProto.FLOAT, [rows, width])],
+        [onnx.numpy_helper.from_array(weight.astype(np.float32), "weight")],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    return onnxruntime.InferenceSession(
+        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+    )
+
+
+def _milliseconds(prefix: str, seconds: list[float]) -> dict[str, float]:
+    """Median and 95th percentile in milliseconds."""
+    return {
+        f"{prefix}median_ms": 1000 * float(np.median(seconds)),
+        f"{prefix}p95_ms": 1000 * float(np.percentile(seconds, 95)),
+    }

@@ -1,0 +1,283 @@
+"""A whole experiment: data, VQ-VAE run, Mem-MLP run. Every finished stage is found again, not redone."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from memmlp import checkpoint, evaluation, latency
+from memmlp.body import SPARSE_DIM
+from memmlp.data.dataset import Frames
+from memmlp.data.prepare import Manifest, Source, prepare
+from memmlp.export import TOLERANCE, export, parity
+from memmlp.features import Coordinates, Frame
+from memmlp.losses import Hand, MotionLoss, Weighting
+from memmlp.memory import Memory
+from memmlp.model import MemMLP
+from memmlp.predictor import Predictor
+from memmlp.render import poses_png
+from memmlp.rollout import PersistentStreams, Rollout
+from memmlp.runs import Run, run_id, write_json
+from memmlp.tracking import Tracker, project_safely
+from memmlp.training import MotionTask, Optim, VQVAETask, train
+from memmlp.vqvae import VQVAE
+
+VALIDATION_PIECE = 240  # frames: validation streams through pieces of clips of 4 s
+PICTURE_FRAMES = 600  # the picture shows the first 10 s of the first test clip
+MOTION_ARTIFACTS = ("model.safetensors", "clips.json", "results.json", "step.onnx", "latency.json")
+
+
+@dataclass(frozen=True)
+class Data:
+    """Where motion comes from and where its cache lies.
+
+    Attributes:
+        source: the folder of clips, its split and body.
+        generate: makes the folder where it is synthetic; None for the user's own.
+        caches: folder of all caches.
+    """
+
+    source: Source
+    generate: Callable[[Path], object] | None
+    caches: Path
+
+    def prepare(self) -> tuple[Path, Manifest]:
+        """The cache, made where it is missing or out of date, and its manifest."""
+        if self.generate is not None and not self.source.root.exists():
+            self._generate(self.generate)
+        key = repr(replace(self.source, root=self.source.root.resolve()))
+        cache = self.caches / f"{self.source.root.name}-{hashlib.sha256(key.encode()).hexdigest()[:8]}"
+        return cache, prepare(self.source, cache)
+
+    def _generate(self, generate: Callable[[Path], object]) -> None:
+        """Make the clips beside their place and move them there, so that a kill leaves no half folder."""
+        root = self.source.root
+        unfinished = root.with_name(root.name + ".unfinished")
+        generate(unfinished)
+        unfinished.rename(root)
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """The network: partial constructors for the slots, and its sizes."""
+
+    coordinates: Coordinates
+    normalize: bool
+    frames: int
+    hidden: int
+    depth: int
+    vqvae: Callable[[], VQVAE]
+    memory: Callable[..., Memory]
+    uses_codes: bool
+    predictor: Callable[..., Predictor]
+
+    def build(self, frame: Frame, codes: VQVAE | None) -> MemMLP:
+        """The network with fresh weights."""
+        sizes = {"hidden": self.hidden, "frames": self.frames}
+        memory = self.memory(codes=codes, depth=self.depth, **sizes)
+        return MemMLP(frame, memory, self.predictor(**sizes), depth=self.depth, **sizes)
+
+    def frame(self, manifest: Manifest, frames: Tensor) -> Frame:
+        """World <-> network space, with the statistics of the training frames (F, 252) where asked."""
+        rest = torch.as_tensor(np.asarray(manifest.rest), dtype=torch.float32)
+        if self.normalize:
+            return Frame.fit(self.coordinates, rest, frames)
+        return Frame.raw(self.coordinates, rest)
+
+    def load(self, run: Run) -> MemMLP:
+        """The network of a finished run."""
+        tensors, _ = checkpoint.read(run.model)
+        codes = self.vqvae() if self.uses_codes else None
+        model = self.build(Frame.raw(self.coordinates, torch.zeros(22, 3)), codes)
+        checkpoint.load_module("model", model, tensors)
+        return model.eval()
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """All that a run needs, as built objects; `config` is the record of where they came from."""
+
+    config: dict[str, Any]
+    outputs: Path
+    device: torch.device
+    seed: int
+    force: bool
+    data: Data
+    architecture: Architecture
+    vqvae_config: dict[str, Any]
+    vqvae_optim: Optim
+    vqvae_seed: int
+    weighting: Weighting
+    hand: Hand
+    rollout: Rollout
+    optim: Optim
+    modes: Sequence[str]
+    evaluation_batch: int
+    latency_steps: int
+    save_predictions: Path | None
+    tracker: Tracker
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A run, and whether it was made just now."""
+
+    run: Run
+    fresh: bool
+
+
+def run(experiment: Experiment) -> Outcome:
+    """Bring the experiment's run to its end, doing only what is missing."""
+    cache, manifest = experiment.data.prepare()
+    upstream = vqvae_run(experiment, cache, manifest) if experiment.architecture.uses_codes else None
+    config, data, above = experiment.config, manifest.digest, upstream.id if upstream else None
+    run = Run.of(experiment.outputs, run_id("memmlp", config, data=data, upstream=above))
+    with run.lock():
+        fresh = experiment.force or not run.done
+        if fresh:
+            if experiment.force:
+                run.reset()
+            run.begin("memmlp", config, data=data, upstream=above)
+            motion_run(experiment, run, cache, manifest, upstream)
+        if experiment.save_predictions is not None:
+            model = experiment.architecture.load(run).to(experiment.device)
+            save_predictions(experiment, model, cache)
+    if fresh:
+        project_safely(experiment.tracker, run)
+    return Outcome(run, fresh)
+
+
+def vqvae_run(experiment: Experiment, cache: Path, manifest: Manifest) -> Run:
+    """The finished run of the VQ-VAE that this configuration needs, trained where it is missing."""
+    config, data = experiment.vqvae_config, manifest.digest
+    run = Run.of(experiment.outputs, run_id("vqvae", config, data=data, upstream=None))
+    with run.lock():
+        if run.done:
+            return run
+        run.begin("vqvae", config, data=data, upstream=None)
+        started = time.monotonic()
+        frames, validation = (Frames.open(cache, split).to(experiment.device) for split in ("train", "val"))
+        torch.manual_seed(experiment.vqvae_seed)
+        frame = experiment.architecture.frame(manifest, frames.frames).to(experiment.device)
+        model = experiment.architecture.vqvae().to(experiment.device)
+        task = VQVAETask(model, frame, frames, validation, experiment.vqvae_optim, experiment.vqvae_seed)
+        train(task, experiment.vqvae_optim, run, experiment.vqvae_seed, "VQ-VAE")
+        checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
+        write_json(run.results_path, {"val": task.validate()})
+        run.write_manifest({"seconds": round(time.monotonic() - started, 1)})
+        run.finish(("model.safetensors", "results.json"))
+    project_safely(experiment.tracker, run)
+    return run
+
+
+def load_vqvae(architecture: Architecture, run: Run) -> VQVAE:
+    """The VQ-VAE of a finished run."""
+    model = architecture.vqvae()
+    checkpoint.load_module("model", model, checkpoint.read(run.model)[0])
+    return model.eval()
+
+
+def motion_run(
+    experiment: Experiment, run: Run, cache: Path, manifest: Manifest, upstream: Run | None
+) -> None:
+    """Train, evaluate, export and time one Mem-MLP, and mark its run as done."""
+    seconds: dict[str, float] = {}
+    started = time.monotonic()
+    model = trained(experiment, run, cache, manifest, upstream)
+    checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
+    seconds["train"], started = time.monotonic() - started, time.monotonic()
+    test = Frames.open(cache, "test")
+    results = evaluation.evaluate(
+        model, test.to(experiment.device), experiment.modes, experiment.evaluation_batch
+    )
+    write_json(run.clips, results["clips"])
+    picture(model, test, run)
+    seconds["evaluate"], started = time.monotonic() - started, time.monotonic()
+    export_checked(model, run, test.clip(0))
+    measured = latency.measure(run.onnx, experiment.latency_steps) | latency.size(model, run.onnx)
+    write_json(run.latency, measured)
+    seconds["export"] = time.monotonic() - started
+    write_json(run.results_path, {**results["mean"], "latency": measured})
+    run.write_manifest({"seconds": {name: round(value, 1) for name, value in seconds.items()}})
+    run.finish(MOTION_ARTIFACTS)
+
+
+def trained(
+    experiment: Experiment, run: Run, cache: Path, manifest: Manifest, upstream: Run | None
+) -> MemMLP:
+    """The trained network, its training resumed where it was left."""
+    architecture, device = experiment.architecture, experiment.device
+    frames = Frames.open(cache, "train").to(device)
+    torch.manual_seed(experiment.seed)
+    codes = load_vqvae(architecture, upstream) if upstream else None
+    model = architecture.build(architecture.frame(manifest, frames.frames), codes).to(device)
+    if isinstance(experiment.rollout, PersistentStreams):
+        experiment.rollout.build(model)
+    pieces = evaluation.chunks(Frames.open(cache, "val").to(device), VALIDATION_PIECE, least=60)
+    task = MotionTask(
+        model,
+        MotionLoss(experiment.weighting, experiment.hand, model.predictor.branches).to(device),
+        experiment.rollout.to(device),
+        frames,
+        experiment.optim,
+        experiment.seed,
+        validate=lambda network: evaluation.quick_stream(network, pieces),
+    )
+    train(task, experiment.optim, run, experiment.seed, "Mem-MLP")
+    return model.eval()
+
+
+def export_checked(model: MemMLP, run: Run, clip: Tensor) -> None:
+    """Write the run's ONNX file and prove it on a whole clip (N, 252)."""
+    export(model, run.onnx, run.id)
+    worst = parity(model, run.onnx, clip)
+    run.write_manifest({"onnx_parity": worst})
+    if not worst <= TOLERANCE:
+        raise RuntimeError(f"{run.onnx}: ONNX Runtime differs from torch by {worst:.2e} (> {TOLERANCE:.0e})")
+
+
+def picture(model: MemMLP, test: Frames, run: Run) -> None:
+    """Draw the start of the first test clip, streamed."""
+    device = model.stem.weight.device
+    clip = test.clip(0)[:PICTURE_FRAMES].to(device)
+    motion = evaluation.stream(model, [clip])[0]
+    predicted = model.frame.pose(motion, clip[:, :SPARSE_DIM])
+    truth = evaluation.joint_positions(clip[:, SPARSE_DIM:])
+    poses_png(run.folder / "poses.png", truth.cpu().numpy(), predicted.cpu().numpy(), test.names[0])
+
+
+def save_predictions(experiment: Experiment, model: MemMLP, cache: Path) -> None:
+    """Write `<folder>/<mode>/<clip>.npz` for every test clip: positions (N, 22, 3) and rotations."""
+    assert experiment.save_predictions is not None
+    test = Frames.open(cache, "test").to(experiment.device)
+    clips = [test.clip(i) for i in range(len(test.names))]
+    for mode in experiment.modes:
+        motions = evaluation.predict(model, clips, mode, experiment.evaluation_batch)
+        for name, clip, motion in zip(test.names, clips, motions, strict=True):
+            path = experiment.save_predictions / mode / f"{name}.npz"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.savez(path, allow_pickle=False, **prediction_arrays(model.frame, clip, motion))
+
+
+def prediction_arrays(frame: Frame, clip: Tensor, motion: Tensor) -> dict[str, np.ndarray]:
+    """What a prediction file holds: metres in the world, local rotation matrices, float32.
+
+    `predicted_positions` are those of the rotation branch by forward kinematics, the head on its tracker.
+    """
+    sparse, truth = clip[:, :SPARSE_DIM], clip[:, SPARSE_DIM:]
+    arrays = {
+        "predicted_positions": frame.pose(motion, sparse),
+        "predicted_positions_of_position_branch": evaluation.joint_positions(motion),
+        "true_positions": evaluation.joint_positions(truth),
+        "predicted_rotations": evaluation.local_rotations(motion),
+        "true_rotations": evaluation.local_rotations(truth),
+    }
+    return {name: tensor.cpu().numpy() for name, tensor in arrays.items()}
