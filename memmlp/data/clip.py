@@ -21,7 +21,7 @@ DAMAGE = (
     OSError, ValueError, EOFError, KeyError, AttributeError, TypeError, IndexError, MemoryError,
     NotImplementedError, SyntaxError, RuntimeError, OverflowError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
-RATE_TOLERANCE = 1e-3  # relative: 59.94 is not 60, and 120.0001 is 120
+RATE_TOLERANCE = 1e-4  # relative: 59.94 is not 60, and 120.0005 (a BVH's frame time of .0083333) is 120
 
 
 @dataclass(frozen=True)
@@ -120,12 +120,14 @@ def resample(clip: Clip, fps: float = FPS) -> tuple[Clip, str]:
 
 
 def _frame_rate(path: Path, value: np.ndarray) -> float:
-    """The rate from a float, an int, bytes or a 0-d or 1-element array."""
+    """The rate from a float, an int, bytes or text, as a 0-d or 1-element array."""
+    if value.size != 1 or value.dtype.kind not in "fiuSU":
+        raise InputError(f"{path}: the frame rate is {value.dtype} {value.shape}, not one number")
     try:
-        item = np.asarray(value).reshape(-1)
-        fps = float(item[0].decode() if isinstance(item[0], bytes) else item[0])
-    except (ValueError, TypeError, IndexError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: the frame rate {value!r} is no number") from error
+        item = value.item()
+        fps = float(item.decode() if isinstance(item, bytes) else item)
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"{path}: the frame rate is no number ({_brief(error)})") from error
     low, high = FRAME_RATE_RANGE
     if not low <= fps <= high:
         raise InputError(f"{path}: a frame rate of {fps:g} Hz; allowed: {low:g} to {high:g}")
