@@ -173,6 +173,7 @@ class Run:
         "results.json",
         "step.onnx",
         "latency.json",
+        "poses.png",
     )
 
     def __init__(self, folder: Path | str):
