@@ -139,7 +139,8 @@ def run(experiment: Experiment) -> Outcome:
     cache, manifest = experiment.data.prepare()
     upstream = vqvae_run(experiment, cache, manifest) if experiment.architecture.uses_codes else None
     config, data, above = experiment.config, manifest.digest, upstream.id if upstream else None
-    run = Run.of(experiment.outputs, run_id("memmlp", config, data=data, upstream=above))
+    own = {key: value for key, value in config.items() if key != "vqvae"}  # the upstream's id stands for it
+    run = Run.of(experiment.outputs, run_id("memmlp", own, data=data, upstream=above))
     with run.lock():
         fresh = experiment.force or not run.done
         if fresh:

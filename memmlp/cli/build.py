@@ -1,0 +1,134 @@
+"""From a composed config to built objects, and from there through the pipeline to a table on the screen."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.utils import get_class, instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from memmlp import pipeline
+from memmlp.cli.report import show
+from memmlp.cli.schema import Config, check
+from memmlp.data.prepare import Source
+from memmlp.data.synthetic import synthesize
+from memmlp.errors import InputError
+from memmlp.features import HeadRelative, World
+from memmlp.runs import Run
+from memmlp.training import Optim
+from memmlp.vqvae import VQVAE
+
+COORDINATES = {"head_relative": HeadRelative, "world": World}
+
+
+def run_training(cfg: DictConfig) -> None:
+    """Check the config, bring its run to its end, and show the results."""
+    check(cfg)
+    if cfg.threads:
+        torch.set_num_threads(cfg.threads)
+    show(pipeline.run(build_experiment(cfg)))
+
+
+def build_experiment(cfg: DictConfig) -> pipeline.Experiment:
+    """The experiment of a checked config."""
+    outputs = Path(cfg.paths.outputs)
+    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    return pipeline.Experiment(
+        config=config,
+        outputs=outputs,
+        device=device(cfg.device),
+        seed=cfg.seed,
+        force=cfg.force,
+        data=build_data(cfg),
+        architecture=build_architecture(cfg),
+        vqvae_config={"frame": config["frame"], "vqvae": config["vqvae"]},
+        vqvae_optim=build_vqvae_optim(cfg),
+        vqvae_seed=0,
+        weighting=instantiate(cfg.loss),
+        hand=instantiate(cfg.hand),
+        rollout=instantiate(cfg.rollout),
+        optim=Optim(**config["optim"]),
+        modes=list(cfg.evaluation.modes),
+        evaluation_batch=cfg.evaluation.batch,
+        latency_steps=cfg.export.latency_steps,
+        save_predictions=Path(cfg.save_predictions) if cfg.save_predictions else None,
+        tracker=instantiate(cfg.tracker, outputs=outputs)
+        if "uri" in cfg.tracker
+        else instantiate(cfg.tracker),
+    )
+
+
+def device(name: str) -> torch.device:
+    """The device of a config's word."""
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("device=cuda: there is no CUDA device; allowed here is device=cpu or device=auto")
+    return torch.device("cuda" if name == "cuda" or (name == "auto" and torch.cuda.is_available()) else "cpu")
+
+
+def build_data(cfg: DictConfig) -> pipeline.Data:
+    """Where the motion is; the synthetic folder's name tells its length and seed, so that it is never stale."""
+    data, root = cfg.data, Path(cfg.data.root)
+    generate = None
+    if data.synth is not None:
+        root = root / f"{data.synth.minutes:g}min-seed{data.synth.seed}"
+        generate = partial(synthesize, minutes=data.synth.minutes, seed=data.synth.seed)
+    split = instantiate(data.split, _convert_="all")
+    source = Source(root, split, str(data.body), data.min_frames, data.strict)
+    return pipeline.Data(source, generate, Path(cfg.paths.outputs) / "cache")
+
+
+def build_architecture(cfg: DictConfig) -> pipeline.Architecture:
+    """The network of a checked config."""
+    own = ("codes", "width", "encoder_depth", "decoder_depth", "commitment", "decay", "codebook")
+    return pipeline.Architecture(
+        coordinates=COORDINATES[cfg.frame.coordinates](),
+        normalize=cfg.frame.normalize,
+        frames=cfg.model.frames,
+        hidden=cfg.model.width,
+        depth=cfg.model.depth,
+        vqvae=partial(VQVAE, **{name: cfg.vqvae[name] for name in own}),
+        memory=instantiate(cfg.memory, _convert_="all"),
+        uses_codes=get_class(cfg.memory._target_).uses_codes,
+        predictor=instantiate(cfg.predictor),
+    )
+
+
+def build_vqvae_optim(cfg: DictConfig) -> Optim:
+    """Adam as App. A has it; its epochs are steps here."""
+    return Optim(
+        steps=cfg.vqvae.steps,
+        batch=cfg.vqvae.batch,
+        lr=cfg.vqvae.lr,
+        schedule="milestones",
+        weight_decay=cfg.vqvae.weight_decay,
+        betas=(0.9, 0.99),
+        decoupled=False,
+        checkpoint_every=cfg.optim.checkpoint_every,
+        validate_every=cfg.vqvae.steps,
+        log_every=cfg.optim.log_every,
+    )
+
+
+def config_of(run: Run) -> DictConfig:
+    """The typed config of a finished Mem-MLP run. Raises InputError where it is none of ours."""
+    if not run.done or run.manifest.get("kind") != "memmlp":
+        raise InputError(f"run {run.id}: not a finished Mem-MLP run")
+    cfg = OmegaConf.create(run.config)
+    targets = [str(value) for key, value in _leaves(run.config) if key == "_target_"]
+    foreign = [name for name in targets if not name.startswith("memmlp.")]
+    if foreign or set(run.config) != set(Config.__dataclass_fields__):
+        raise InputError(f"{run.config_path}: not a config of this version of memmlp ({foreign or 'keys'})")
+    return cfg
+
+
+def _leaves(tree: dict[str, Any]) -> list[tuple[str, Any]]:
+    """Key and value of every leaf of nested mappings."""
+    nested = [(key, value) for key, value in tree.items()]
+    return [
+        leaf
+        for key, value in nested
+        for leaf in (_leaves(value) if isinstance(value, dict) else [(key, value)])
+    ]

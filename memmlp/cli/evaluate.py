@@ -1,0 +1,50 @@
+"""`memmlp eval`: the metrics of a finished run again, and its predictions as files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from memmlp.cli.options import outputs_option
+
+
+@click.command("eval")
+@click.argument("run")
+@click.option("--save-predictions", type=click.Path(path_type=Path), help="Folder for one npz a test clip.")
+@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write per-clip values here.")
+@click.option("--device", default="auto", type=click.Choice(["auto", "cpu", "cuda"]), show_default=True)
+@outputs_option
+def evaluate(
+    run: str, save_predictions: Path | None, json_path: Path | None, device: str, outputs: Path
+) -> None:
+    """Evaluate a finished run (id, its beginning, or folder) on its test clips in its modes."""
+    from dataclasses import replace
+
+    from rich.console import Console
+
+    from memmlp import evaluation, pipeline
+    from memmlp.cli.build import build_experiment, config_of
+    from memmlp.cli.build import device as device_of
+    from memmlp.cli.report import metrics_table
+    from memmlp.data.dataset import Frames
+    from memmlp.errors import InputError
+    from memmlp.runs import find_run, write_json
+
+    found = find_run(outputs, run)
+    experiment = replace(build_experiment(config_of(found)), device=device_of(device))
+    cache, manifest = experiment.data.prepare()
+    if manifest.digest != found.manifest["data"]:
+        raise InputError(
+            f"run {found.id}: its data has changed since (data.root={experiment.data.source.root})"
+        )
+    model = experiment.architecture.load(found).to(experiment.device)
+    frames = Frames.open(cache, "test").to(experiment.device)
+    results = evaluation.evaluate(model, frames, experiment.modes, experiment.evaluation_batch)
+    Console(highlight=False).print(metrics_table(results["mean"]))
+    if json_path is not None:
+        write_json(json_path, json.loads(json.dumps(results)))
+    if save_predictions is not None:
+        pipeline.save_predictions(replace(experiment, save_predictions=save_predictions), model, cache)
+        click.echo(f"predictions of {len(frames.names)} clips under {save_predictions}")
