@@ -1,0 +1,57 @@
+"""Smooth functions of time, on arrays of seconds (N,): the material that motions are made of."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import convolve1d, minimum_filter1d
+
+Array = np.ndarray
+
+
+def ease(t: Array, start: float, end: float) -> Array:
+    """0 before `start`, 1 after `end`, minimum jerk between: (N,)."""
+    s = np.clip((t - start) / (end - start), 0.0, 1.0)
+    return s * s * s * (10.0 - s * (15.0 - 6.0 * s))
+
+
+def pulse(t: Array, start: float, top: float, leave: float, end: float) -> Array:
+    """0, rising from `start` to 1 at `top`, falling from `leave` to 0 at `end`: (N,)."""
+    return ease(t, start, top) - ease(t, leave, end)
+
+
+def arc(t: Array, start: float, end: float) -> Array:
+    """0 outside [start, end], 1 in the middle, velocity and acceleration 0 at both ends: (N,)."""
+    s = np.clip((t - start) / (end - start), 0.0, 1.0)
+    return (4.0 * s * (1.0 - s)) ** 3
+
+
+def wander(
+    rng: np.random.Generator, t: Array, shape: tuple[int, ...] = (), low: float = 0.1, high: float = 1.0
+) -> Array:
+    """Natural variation (N, *shape), RMS 1: independent sums of six sines of `low` to `high` Hz."""
+    size = (6, *shape)
+    frequency = np.exp(rng.uniform(np.log(low), np.log(high), size))
+    amplitude = rng.uniform(0.5, 1.0, size) / np.sqrt(frequency)
+    amplitude *= np.sqrt(2.0 / (amplitude**2).sum(0))
+    start = rng.uniform(0.0, 2 * np.pi, size)
+    time = t.reshape(-1, *([1] * len(shape)))
+    result = np.zeros((len(t), *shape))
+    for wave in range(6):
+        result += amplitude[wave] * np.sin(2 * np.pi * frequency[wave] * time + start[wave])
+    return result
+
+
+def smooth(x: Array, frames: int) -> Array:
+    """Moving average (N, ...) under a bell of 2 * `frames` + 1 frames."""
+    kernel = np.hanning(2 * frames + 3)[1:-1] ** 2
+    return convolve1d(x, kernel / kernel.sum(), axis=0, mode="nearest")
+
+
+def smooth_below(x: Array, frames: int) -> Array:
+    """A smooth curve (N,) that is nowhere above `x`: the minimum over the bell, then the bell's average."""
+    return smooth(minimum_filter1d(x, 2 * frames + 1, mode="nearest"), frames)
+
+
+def soft_minimum(a: Array, b: Array, width: float) -> Array:
+    """Smooth and below both: within `width` / 2 of the minimum, less where they differ more."""
+    return 0.5 * (a + b - np.sqrt((a - b) ** 2 + width**2))
