@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from memmlp.data.clip import FRAME_RATE_RANGE
 from memmlp.errors import InputError
@@ -42,6 +41,7 @@ class Bvh:
     """A BVH file. Its nodes are its J joints, each after its parent, and then its E end sites.
 
     Attributes:
+        path: where it was read, for messages.
         names: joint names, J, no two alike.
         parents: index of each joint's parent, J; the root's is -1.
         offsets: joint minus parent in the zero pose (J, 3).
@@ -51,6 +51,7 @@ class Bvh:
         values: channel values (N, C), degrees and the file's unit.
     """
 
+    path: Path
     names: tuple[str, ...]
     parents: tuple[int, ...]
     offsets: np.ndarray
@@ -90,30 +91,41 @@ class Bvh:
         """Global rotations (N, J+E, 3, 3) and positions (N, J+E, 3); an end site turns with its joint."""
         rotations = np.empty((len(self.nodes), len(self), 3, 3))
         positions = np.empty((len(self.nodes), len(self), 3))
-        rotations[0], positions[0] = self._local(0)
-        for joint, parent in enumerate(self.parents[1:], start=1):
-            local, shift = self._local(joint)
-            rotations[joint] = rotations[parent] @ local
-            positions[joint] = positions[parent] + (rotations[parent] @ shift[..., None])[..., 0]
+        for joint, parent in enumerate(self.parents):
+            above = rotations[parent] if joint else np.eye(3)
+            values = self._joint_values(joint)
+            positions[joint] = np.einsum("...ij,...j->...i", above, self._shift(joint, values))
+            positions[joint] += positions[parent] if joint else 0.0
+            rotations[joint] = above
+            for name, angles in zip(self.channels[joint], np.radians(values).T, strict=True):
+                if name.endswith("rotation"):
+                    _turn(rotations[joint], AXES.index(name[0]), angles)
         for node, end in enumerate(self.ends, start=len(self.names)):
             rotations[node] = rotations[end.parent]
             positions[node] = positions[end.parent] + rotations[end.parent] @ end.offset
         return rotations.swapaxes(0, 1), positions.swapaxes(0, 1)
 
-    def _local(self, joint: int) -> tuple[np.ndarray, np.ndarray]:
-        """A joint's rotation (N, 3, 3) and shift (N, 3) relative to its parent."""
-        names = self.channels[joint]
-        first = sum(len(before) for before in self.channels[:joint])
-        values = self.values[:, first : first + len(names)]
-        shift = np.tile(self.offsets[joint], (len(self), 1))
-        turns = [column for column, name in enumerate(names) if name.endswith("rotation")]
-        for column, name in enumerate(names):
-            if column not in turns:
-                shift[:, AXES.index(name[0])] = values[:, column]
-        if not turns:
-            return np.tile(np.eye(3), (len(self), 1, 1)), shift
-        order = "".join(names[column][0] for column in turns)
-        return Rotation.from_euler(order, values[:, turns], degrees=True).as_matrix(), shift
+    def _joint_values(self, joint: int) -> np.ndarray:
+        """The values (N, c) of a joint's channels."""
+        first = sum(map(len, self.channels[:joint]))
+        return self.values[:, first : first + len(self.channels[joint])]
+
+    def _shift(self, joint: int, values: np.ndarray) -> np.ndarray:
+        """A joint's position (N, 3) in its parent's frame."""
+        shift = np.tile(self.offsets[joint], (len(values), 1))
+        for name, column in zip(self.channels[joint], values.T, strict=True):
+            if name.endswith("position"):
+                shift[:, AXES.index(name[0])] = column
+        return shift
+
+
+def _turn(rotations: np.ndarray, axis: int, angles: np.ndarray) -> None:
+    """Multiply rotations (N, 3, 3), in place and on the right, by turns of (N,) radians about an axis."""
+    second, third = (axis + 1) % 3, (axis + 2) % 3
+    sine, cosine = np.sin(angles)[:, None], np.cos(angles)[:, None]
+    a, b = rotations[:, :, second].copy(), rotations[:, :, third].copy()
+    rotations[:, :, second] = cosine * a + sine * b
+    rotations[:, :, third] = cosine * b - sine * a
 
 
 def read_bvh(path: Path) -> Bvh:
@@ -129,6 +141,7 @@ def read_bvh(path: Path) -> Bvh:
     hierarchy = _Hierarchy(_Words(path, lines[:start]))
     frame_time, values = _motion(path, lines, start + 1, sum(map(len, hierarchy.channels)))
     return Bvh(
+        path=path,
         names=tuple(hierarchy.names),
         parents=tuple(hierarchy.parents),
         offsets=np.array(hierarchy.offsets),
