@@ -138,7 +138,7 @@ class Uncertainty(nn.Module):
 
     def weights(self) -> Mapping[str, float]:
         """The weight of each term now."""
-        return {name: float((-s).exp()) for name, s in self.s.items()}
+        return {name: float((-s.detach()).exp()) for name, s in self.s.items()}
 
 
 Weighting = Manual | Uncertainty

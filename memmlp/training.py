@@ -247,7 +247,7 @@ def check_finite(task: Task, result: StepResult, step: int) -> None:
     bad = [name for name, term in result.terms.items() if not torch.isfinite(term)] or ["weighted sum"]
     names = sorted({task.frames.names[i] for i in result.clips.tolist()})
     raise TrainingDiverged(
-        f"loss is {float(result.loss)} at step {step + 1}, term {', '.join(bad)}; "
+        f"loss is {float(result.loss.detach())} at step {step + 1}, term {', '.join(bad)}; "
         f"clips of the batch: {', '.join(names[:20])}{' ...' if len(names) > 20 else ''}"
     )
 
@@ -259,9 +259,10 @@ def record(
     last = step == optim.steps
     bar.advance(row)
     if step % optim.log_every == 0 or last:
-        terms = {name: float(term) for name, term in result.terms.items()}
-        run.log(step, {"loss": float(result.loss), **terms, **task.report()})
-        bar.update(row, note=f"loss {float(result.loss):.3g}")
+        loss = float(result.loss.detach())
+        terms = {name: float(term.detach()) for name, term in result.terms.items()}
+        run.log(step, {"loss": loss, **terms, **task.report()})
+        bar.update(row, note=f"loss {loss:.3g}")
     if step % optim.validate_every == 0 or last:
         task.module.eval()
         run.log(step, task.validate(), phase="val")

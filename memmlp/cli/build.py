@@ -16,12 +16,13 @@ from memmlp.cli.schema import Config, check
 from memmlp.data.prepare import Source
 from memmlp.data.synthetic import synthesize
 from memmlp.errors import InputError
-from memmlp.features import HeadRelative, World
+from memmlp.features import Coordinates, HeadRelative, World
+from memmlp.memory import Memory
 from memmlp.runs import Run
 from memmlp.training import Optim
 from memmlp.vqvae import VQVAE
 
-COORDINATES = {"head_relative": HeadRelative, "world": World}
+COORDINATES: dict[str, type[Coordinates]] = {"head_relative": HeadRelative, "world": World}
 
 
 def run_training(cfg: DictConfig) -> None:
@@ -65,11 +66,11 @@ def device(name: str) -> torch.device:
     """The device of a config's word."""
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("device=cuda: there is no CUDA device; allowed here is device=cpu or device=auto")
-    return torch.device("cuda" if name == "cuda" or (name == "auto" and torch.cuda.is_available()) else "cpu")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 def build_data(cfg: DictConfig) -> pipeline.Data:
-    """Where the motion is; the synthetic folder's name tells its length and seed, so that it is never stale."""
+    """Where the motion is; a synthetic folder's name has its length and seed, so it is never stale."""
     data, root = cfg.data, Path(cfg.data.root)
     generate = None
     if data.synth is not None:
@@ -91,9 +92,14 @@ def build_architecture(cfg: DictConfig) -> pipeline.Architecture:
         depth=cfg.model.depth,
         vqvae=partial(VQVAE, **{name: cfg.vqvae[name] for name in own}),
         memory=instantiate(cfg.memory, _convert_="all"),
-        uses_codes=get_class(cfg.memory._target_).uses_codes,
+        uses_codes=memory_class(cfg).uses_codes,
         predictor=instantiate(cfg.predictor),
     )
+
+
+def memory_class(cfg: DictConfig) -> type[Memory]:
+    """The class in the memory slot."""
+    return get_class(cfg.memory._target_)
 
 
 def build_vqvae_optim(cfg: DictConfig) -> Optim:
@@ -126,9 +132,7 @@ def config_of(run: Run) -> DictConfig:
 
 def _leaves(tree: dict[str, Any]) -> list[tuple[str, Any]]:
     """Key and value of every leaf of nested mappings."""
-    nested = [(key, value) for key, value in tree.items()]
-    return [
-        leaf
-        for key, value in nested
-        for leaf in (_leaves(value) if isinstance(value, dict) else [(key, value)])
-    ]
+    leaves = []
+    for key, value in tree.items():
+        leaves += _leaves(value) if isinstance(value, dict) else [(key, value)]
+    return leaves

@@ -22,12 +22,13 @@ def show(outcome: Outcome) -> None:
     console.print(metrics_table(results))
     measured = results["latency"]
     console.print(
-        f"one frame on one CPU core: {measured['median_ms']:.2f} ms median, {measured['p95_ms']:.2f} ms p95 "
+        f"a frame on one CPU core: {measured['median_ms']:.2f} ms median, {measured['p95_ms']:.2f} ms p95 "
         f"({measured['ratio_to_reference']:.2f} x the reference network)"
     )
     console.print(
-        f"{measured['parameters'] / 1e6:.2f} M parameters ({measured['parameters_with_vqvae'] / 1e6:.2f} M with "
-        f"the frozen VQ-VAE), {measured['macs'] / 1e6:.0f} MMAC a frame, ONNX {measured['onnx_bytes'] / 1e6:.1f} MB"
+        f"{measured['parameters'] / 1e6:.2f} M parameters "
+        f"({measured['parameters_with_vqvae'] / 1e6:.2f} M with the frozen VQ-VAE), "
+        f"{measured['macs'] / 1e6:.0f} MMAC a frame, ONNX {measured['onnx_bytes'] / 1e6:.1f} MB"
     )
     console.print(f"run      {run.folder}", soft_wrap=True)
     console.print(f"picture  {run.folder / 'poses.png'}", soft_wrap=True)

@@ -495,6 +495,11 @@ def check(cfg: DictConfig) -> None:
 def _values(node: DictConfig, prefix: str) -> Iterator[tuple[str, Any, Any]]:
     """Dotted key, value and rule of every key of a typed node."""
     schema: Any = OmegaConf.get_type(node)
+    known = [spec.name for spec in dataclasses.fields(schema)]
+    for name in node:
+        if name not in known:
+            allowed = ", ".join(spec for spec in known if not spec.startswith("_"))
+            raise InputError(f"{prefix}{name}: no such key; allowed: {allowed}")
     for spec in dataclasses.fields(schema):
         name = prefix + spec.name
         value = _value(node, spec.name, name)
