@@ -496,7 +496,7 @@ def _values(node: DictConfig, prefix: str) -> Iterator[tuple[str, Any, Any]]:
     """Dotted key, value and rule of every key of a typed node."""
     schema: Any = OmegaConf.get_type(node)
     known = [spec.name for spec in dataclasses.fields(schema)]
-    for name in node:
+    for name in map(str, node):
         if name not in known:
             allowed = ", ".join(spec for spec in known if not spec.startswith("_"))
             raise InputError(f"{prefix}{name}: no such key; allowed: {allowed}")

@@ -183,7 +183,7 @@ def jumping(rng: np.random.Generator, t: Array) -> Puppet:
         flight = np.sqrt(8 * rise / GRAVITY)
         shift = rng.uniform(-0.3, 0.3, 2) * rng.integers(2)
         turn = rng.uniform(-0.9, 0.9) * rng.integers(2)
-        work.change(off, flight, 0.0, shift, turn, lift=rise + 0.04, heel=0.9, toe=0.0, push=0.2)
+        work.change(off, flight, 0.0, shift, turn, lift=rise + 0.08, heel=0.9, toe=0.0, push=0.2)
         leaps.append((start, off, flight))
     puppet = stand(rng, t, style, work)
     puppet.settle = 0.03
@@ -197,7 +197,7 @@ def _leap(puppet: Puppet, t: Array, start: float, off: float, flight: float, dep
     speed, on = GRAVITY * flight / 2, off + flight
     low, deep, up = off - 0.28, on + 0.22, on + 0.9
     rise = CubicHermiteSpline(
-        [start, low, off, on, deep, up], [0, -depth, 0.07, 0.05, -0.7 * depth, 0], [0, 0, speed, -speed, 0, 0]
+        [start, low, off, on, deep, up], [0, -depth, 0.02, 0.0, -0.7 * depth, 0], [0, 0, speed, -speed, 0, 0]
     )
     inside = (t > start) & (t < up)
     puppet.pelvis[inside, 2] += rise(t[inside])

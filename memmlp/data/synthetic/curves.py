@@ -19,10 +19,21 @@ def pulse(t: Array, start: float, top: float, leave: float, end: float) -> Array
     return ease(t, start, top) - ease(t, leave, end)
 
 
+def glide(t: Array, start: float, end: float, ramp: float = 0.3) -> Array:
+    """As `ease`, but at an even speed between two ramps that take `ramp` of the time each: (N,)."""
+
+    def ramped(x: Array) -> Array:  # the integral of an ease from 0 to 1
+        c = np.clip(x, 0.0, 1.0)
+        return c**4 * (2.5 - c * (3.0 - c)) + np.maximum(x - 1.0, 0.0)
+
+    s = np.clip((t - start) / (end - start), 0.0, 1.0)
+    return (ramped(s / ramp) - ramped((s - 1.0) / ramp + 1.0)) * ramp / (1.0 - ramp)
+
+
 def arc(t: Array, start: float, end: float) -> Array:
     """0 outside [start, end], 1 in the middle, velocity and acceleration 0 at both ends: (N,)."""
-    s = np.clip((t - start) / (end - start), 0.0, 1.0)
-    return (4.0 * s * (1.0 - s)) ** 3
+    s = glide(t, start, end)
+    return 4.0 * s * (1.0 - s)
 
 
 def wander(

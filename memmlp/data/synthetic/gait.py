@@ -59,7 +59,7 @@ WALK = Gait(
     lift=0.05, heel=0.9, toe=0.28, push=0.24, lean=0.02, yaw=0.11, swing=0.2, elbow=(0.02, 0.02), settle=0.11,
 )  # fmt: skip
 RUN = Gait(
-    speed=(2.0, 4.0), cadence=(1.2, 0.06), duty=0.34, ahead=0.4, turn=1.0, width=0.45, sink=0.05, bounce=0.03,
+    speed=(2.0, 4.0), cadence=(1.2, 0.06), duty=0.31, ahead=0.44, turn=1.0, width=0.45, sink=0.06, bounce=0.03,
     lift=0.26, heel=1.1, toe=0.2, push=0.12, lean=0.14, yaw=0.14, swing=0.16, elbow=(0.24, 0.16), settle=0.07,
 )  # fmt: skip
 

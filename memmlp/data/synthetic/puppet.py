@@ -20,10 +20,10 @@ INDEX = {name: joint for joint, name in enumerate(JOINTS)}
 SIDES = (("left", 1.0), ("right", -1.0))
 ANKLE_HEIGHT = 0.075  # metres above the floor, foot flat
 HEEL = np.array([0.0, -ANKLE_HEIGHT, -0.05])  # from the ankle to the heel's contact
-STRETCH = 0.99  # a leg that carries is no longer than this part of its full length
+STRETCH = 0.993  # a leg that carries is no longer than this part of its full length
 SPINE_SHARES = {"spine1": 0.3, "spine2": 0.3, "spine3": 0.4}
 LEG_POLE, ARM_POLE = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])  # knee and elbow in T-pose
-ELBOW = np.array([0.55, -0.6, -0.6])  # where elbows point: outward, down, back
+ELBOW = np.array([0.32, -0.42, -0.82])  # where elbows point: outward, down, back
 
 
 @dataclass

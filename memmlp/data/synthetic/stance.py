@@ -12,7 +12,7 @@ from memmlp.data.synthetic.curves import Array, smooth, wander
 from memmlp.data.synthetic.puppet import Puppet
 from memmlp.data.synthetic.steps import Feet, Step, tread
 
-STANDING = 0.985  # metres, the root's height with nearly straight legs
+STANDING = 0.992  # metres, the root's height with nearly straight legs
 FOLLOW = 0.3  # seconds in which the pelvis follows the feet
 LEFT_RIGHT = np.array([1.0, -1.0])
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from memmlp.data.synthetic.curves import Array, arc, ease, pulse
+from memmlp.data.synthetic.curves import Array, arc, glide, pulse
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def tread(t: Array, places: Array, yaws: Array, steps: Iterable[Step]) -> Feet:
     place, yaw = np.array(places, float), np.array(yaws, float)
     for step in steps:
         foot, off, on = step.foot, step.off, step.on
-        part = ease(t, off, on)
+        part = glide(t, off, on)
         ground[:, foot, :2] += part[:, None] * (step.to - place[foot])
         ground[:, foot, 2] += step.lift * arc(t, off, on)
         feet.yaw[:, foot] += part * (step.yaw - yaw[foot])
