@@ -49,6 +49,7 @@ class MLflowTracker:
 
     Args:
         uri: of the tracking store; None for MLFLOW_TRACKING_URI, or else sqlite in the outputs folder.
+        outputs: the folder of the runs' folder.
     """
 
     EXPERIMENT = "memmlp"
@@ -56,17 +57,18 @@ class MLflowTracker:
     PARAM_LENGTH = 6000  # MLflow's limits
     PARAMS, METRICS = 100, 1000
 
-    def __init__(self, uri: str | None = None):
-        self.uri = uri
+    def __init__(self, uri: str | None, outputs: Path | str):
+        self.uri, self.outputs = uri, Path(outputs).absolute()
 
     def project(self, run: Run) -> None:
         """Create the MLflow run, or bring it up to date."""
-        outputs = run.folder.absolute().parents[1]
-        with _quiet(), FileLock(outputs / ".mlflow.lock"):  # two first starts at once ruin a sqlite store
+        self.outputs.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(self.outputs / ".mlflow.lock")  # two first starts at once ruin a sqlite store
+        with _quiet(), lock:
             from mlflow import MlflowClient
 
-            client = MlflowClient(tracking_uri=self.store(outputs))
-            name = self._mlflow_run(client, self._experiment(client, outputs), run)
+            client = MlflowClient(tracking_uri=self.store())
+            name = self._mlflow_run(client, self._experiment(client), run)
             self._params(client, name, run)
             self._metrics(client, name, run)
             for artifact in self.ARTIFACTS:
@@ -75,21 +77,21 @@ class MLflowTracker:
             if run.done:
                 client.set_terminated(name, "FINISHED", _milliseconds(run.manifest["finished"]))
 
-    def store(self, outputs: Path) -> str:
+    def store(self) -> str:
         """Where MLflow keeps its runs."""
-        return self.uri or os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{outputs / 'mlflow.db'}"
+        return self.uri or os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{self.outputs / 'mlflow.db'}"
 
-    def _experiment(self, client: MlflowClient, outputs: Path) -> str:
+    def _experiment(self, client: MlflowClient) -> str:
         """The id of the experiment, which is made where it is missing."""
         experiment = client.get_experiment_by_name(self.EXPERIMENT)
         if experiment is not None:
             return experiment.experiment_id
-        local = self.store(outputs).startswith("sqlite:")
-        place = (outputs / "mlflow-artifacts").as_uri() if local else None
+        local = self.store().startswith("sqlite:")
+        place = (self.outputs / "mlflow-artifacts").as_uri() if local else None
         return client.create_experiment(self.EXPERIMENT, artifact_location=place)
 
     def _mlflow_run(self, client: MlflowClient, experiment: str, run: Run) -> str:
-        """The id of the MLflow run; one of a run that was done again from the start gives way to a new one."""
+        """The id of the MLflow run; that of a run since done again from the start is replaced."""
         tags = _tags(run)
         for old in client.search_runs([experiment], f"tags.`memmlp.run_id` = '{run.id}'"):
             if old.data.tags.get("memmlp.started") == tags["memmlp.started"]:

@@ -1,11 +1,13 @@
-"""The `memmlp` command: sub-commands imported when they are called, errors in one line."""
+"""The command `memmlp`. Sub-commands are imported when they are called, so that --help is quick."""
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import os
 import sys
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, NoReturn
 
 import click
 
@@ -14,7 +16,7 @@ from memmlp.errors import InputError, TrainingDiverged
 
 
 class Command(NamedTuple):
-    """Where a sub-command is, and its line of help."""
+    """Where a command is, and its line of help."""
 
     module: str
     attribute: str
@@ -32,56 +34,111 @@ COMMANDS = {
 }
 
 
-class LazyGroup(click.Group):
-    """A group that knows its commands' names and imports one when it is called."""
+class Commands(click.Group):
+    """A group that imports a command when it is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """The names, in the order of use."""
+        """The names in the order of the table."""
         return list(COMMANDS)
 
-    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
-        """The command, imported now."""
-        if name not in COMMANDS:
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The command of that name."""
+        if cmd_name not in COMMANDS:
             return None
-        command = COMMANDS[name]
+        command = COMMANDS[cmd_name]
         return getattr(importlib.import_module(f"memmlp.cli.{command.module}"), command.attribute)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The table of commands, without importing them."""
+        """The help lines of the table."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, command.help) for name, command in COMMANDS.items()])
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command that the first argument names."""
+        if args[0] not in COMMANDS:
+            near = difflib.get_close_matches(args[0], COMMANDS, n=1)
+            hint = f"did you mean {near[0]}? " if near else ""
+            raise InputError(f"{args[0]}: no such command; {hint}allowed are {', '.join(COMMANDS)}")
+        return super().resolve_command(ctx, args)
 
-@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(memmlp.__version__, prog_name="memmlp")
-def cli() -> None:
+def commands() -> None:
     """Mem-MLP: full-body motion from head and hands, and the platform for its ablations.
 
     Works in the current directory: runs and caches lie in outputs/ (or MEMMLP_OUTPUTS).
     """
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Run the command and exit: 0, 1 for a failed run, 2 for bad input, 130 when interrupted."""
-    args = sys.argv[1:] if argv is None else argv
-    if args[:1] == ["-sc"]:  # Hydra's shell completion calls the executable without the word `train`
-        os.environ["COMP_LINE"] = os.environ.get("COMP_LINE", "").replace("memmlp train", "memmlp", 1)
-        args = ["train", *args]
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run a command line. Exits with 1 for a failed run, 2 for bad input, 130 when interrupted.
+
+    MEMMLP_TRACEBACK=1 shows where an error came from.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
     try:
-        cli.main(args, prog_name="memmlp", standalone_mode=False)
-    except click.exceptions.Abort:
-        _fail("interrupted", 130)
-    except KeyboardInterrupt:
-        _fail("interrupted; the same command goes on from the last checkpoint", 130)
-    except click.ClickException as error:
-        _fail(error.format_message().replace("\n", " "), error.exit_code)
-    except (InputError, TrainingDiverged) as error:
-        if os.environ.get("MEMMLP_TRACEBACK"):
+        _run(arguments)
+    except click.exceptions.NoArgsIsHelpError as error:
+        error.show()
+        sys.exit(2)
+    except Exception as error:
+        code = _exit_code(error)
+        if code is None or os.environ.get("MEMMLP_TRACEBACK") == "1":
             raise
-        _fail(" ".join(str(error).split()), 2 if isinstance(error, InputError) else 1)
+        _fail(_line(error), code)
+    except KeyboardInterrupt:
+        _fail(INTERRUPTED, 130)
 
 
-def _fail(line: str, code: int) -> None:
+INTERRUPTED = "interrupted; the same command goes on where it was left"
+
+
+def _run(arguments: list[str]) -> None:
+    if arguments[:1] in (["-sc"], ["--shell-completion"]):
+        _complete(arguments)
+    else:
+        commands.main(arguments, prog_name="memmlp", standalone_mode=False)
+
+
+def _exit_code(error: Exception) -> int | None:
+    """The exit code of an error that a line explains; None for a bug."""
+    if isinstance(error, click.Abort):
+        return 130
+    if isinstance(error, click.ClickException):
+        return error.exit_code
+    return {InputError: 2, TrainingDiverged: 1}.get(type(error))
+
+
+def _line(error: Exception) -> str:
+    """The error in one line."""
+    if isinstance(error, click.Abort):
+        return INTERRUPTED
+    if isinstance(error, click.UsageError):
+        path = error.ctx.command_path if error.ctx else "memmlp"
+        return f"{error.format_message()} (see {path} --help)"
+    return error.format_message() if isinstance(error, click.ClickException) else str(error)
+
+
+def _complete(arguments: list[str]) -> None:
+    """Answer the shell: what `memmlp train -sc install=bash` prints asks `memmlp -sc query=bash`."""
+    words = os.environ.get("COMP_LINE", "").split(" ")
+    if len(words) <= 2:
+        print(" ".join(name for name in COMMANDS if len(words) == 2 and name.startswith(words[1])))
+    elif words[1] == "train":
+        from memmlp.cli.train import train
+
+        os.environ["COMP_LINE"] = " ".join([words[0], *words[2:]])
+        train(arguments)
+
+
+def _fail(line: str, code: int) -> NoReturn:
     """One line on stderr, and out."""
-    print(f"memmlp: {line}", file=sys.stderr)
+    print(f"memmlp: {' '.join(line.split())}", file=sys.stderr)
     sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -7,8 +7,10 @@ same name starts from it, so that unknown keys and wrong types are refused when 
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Optional, Union
@@ -49,7 +51,7 @@ class Within:
 
     def allows(self, value: Any) -> bool:
         """Whether the value is in the range or a word."""
-        if isinstance(value, str | bool):
+        if not isinstance(value, int | float) or isinstance(value, bool):
             return value in self.words
         inside = self.low < value < self.high if self.strict else self.low <= value <= self.high
         return inside and math.isfinite(value)
@@ -70,6 +72,8 @@ class EachOf:
     def allows(self, value: Any) -> bool:
         """Whether all items are allowed and there is one of each."""
         items = list(value)
+        if not all(isinstance(item, int | float | str) for item in items):
+            return False
         fits = all(self.rule is None or self.rule.allows(item) for item in items)
         return fits and len(set(items)) == len(items) and (self.empty or bool(items))
 
@@ -493,13 +497,11 @@ def check(cfg: DictConfig) -> None:
 
 
 def _values(node: DictConfig, prefix: str) -> Iterator[tuple[str, Any, Any]]:
-    """Dotted key, value and rule of every key of a typed node."""
+    """Dotted key, value and rule of every key of a typed node; a key that is not in the schema is refused."""
     schema: Any = OmegaConf.get_type(node)
     known = [spec.name for spec in dataclasses.fields(schema)]
-    for name in map(str, node):
-        if name not in known:
-            allowed = ", ".join(spec for spec in known if not spec.startswith("_"))
-            raise InputError(f"{prefix}{name}: no such key; allowed: {allowed}")
+    for extra in sorted(set(map(str, node)) - set(known)):
+        raise InputError(unknown_key(prefix + extra, known))
     for spec in dataclasses.fields(schema):
         name = prefix + spec.name
         value = _value(node, spec.name, name)
@@ -509,9 +511,16 @@ def _values(node: DictConfig, prefix: str) -> Iterator[tuple[str, Any, Any]]:
             yield name, value, spec.metadata.get("rule")
 
 
+def unknown_key(name: str, keys: Sequence[str]) -> str:
+    """The line about a dotted key that is not among a node's."""
+    own = re.split(r"[./@]", name)[-1]
+    near = difflib.get_close_matches(own, keys, n=1)
+    hint = f"did you mean {near[0]}? " if near else ""
+    listed = ", ".join(word for word in keys if not word.startswith("_")) or "none"
+    return f"{name}: no such key; {hint}allowed here: {listed}"
+
+
 def _value(node: DictConfig, own: str, name: str) -> Any:
-    if own not in node and not OmegaConf.is_missing(node, own):
-        raise InputError(f"{name}: removed, and needed; leave it in")
     if OmegaConf.is_missing(node, own):
         raise InputError(f"{name}: has no value; give one with {name}=...")
     try:

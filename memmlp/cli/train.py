@@ -1,98 +1,168 @@
-"""`memmlp train`: a Hydra application whose errors are one line."""
+"""`memmlp train`: a Hydra application whose errors are one line each and come before anything runs."""
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
+import argparse
 import os
-import re
 import sys
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import NoReturn
 
 import click
-import hydra
-from hydra.errors import HydraException
+from hydra import compose, initialize_config_dir, version
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra._internal.utils import _run_hydra, get_args_parser
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
 
-import memmlp
-from memmlp.cli import schema
+from memmlp.cli.errors import explain
+from memmlp.cli.schema import check, register
+from memmlp.cli.shipped import shipped
 from memmlp.errors import InputError, TrainingDiverged
 
-
-@click.command("train", add_help_option=False, context_settings={"ignore_unknown_options": True})
-@click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
-def command(arguments: tuple[str, ...]) -> None:
-    """Train one configuration; --help shows the groups and keys."""
-    train(list(arguments))
+VERSION_BASE = "1.3"
+CONFIG = "train"
 
 
-def config_folder() -> Path:
-    """conf/ of the checkout, or its copy in the installed package."""
-    package = Path(memmlp.__file__).parent
-    installed = package / "_conf"
-    return installed if installed.is_dir() else package.parent / "conf"
+@click.command(
+    "train",
+    context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
+    add_help_option=False,
+)
+@click.argument("hydra_arguments", nargs=-1, type=click.UNPROCESSED)
+def command(hydra_arguments: Sequence[str]) -> None:
+    """Train, evaluate, export and time one configuration."""
+    train(list(hydra_arguments))
 
 
-def train(arguments: list[str]) -> None:
-    """Run the Hydra application on command-line arguments; bad ones raise InputError.
-
-    In a multirun every job gets its turn, and the first failure is raised at the end.
-    """
-    schema.register()
+def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None) -> None:
+    """Run Hydra on the arguments of `memmlp train`; `job` takes each composed and checked config."""
+    args, parser = parse(argv)
+    register()
+    version.setbase(VERSION_BASE)
+    if _runs(args):
+        preflight(args)
     failures: list[Exception] = []
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises instead of printing, and we print
-    before, sys.argv = sys.argv, ["memmlp train", *arguments]
-    application = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name="train")
-    try:
-        application(partial(_job, failures))()
-    except (HydraException, OmegaConfBaseException) as error:
-        raise InputError(explain(error)) from error
-    finally:
-        sys.argv = before
+    with _raising(args.overrides):
+        _run_hydra(
+            args=args,
+            args_parser=parser,
+            task_function=_collecting(job or _train, failures),
+            config_path=str(shipped("conf")),
+            config_name=CONFIG,
+        )
+    for failure in failures[:-1]:
+        print(f"memmlp: {failure}", file=sys.stderr)
     if failures:
-        raise failures[0]
+        raise failures[-1]
 
 
-def _job(failures: list[Exception], cfg: DictConfig) -> None:
-    """One job; its failure is kept, for Hydra would add lines of its own."""
+def parse(argv: Sequence[str]) -> tuple[argparse.Namespace, argparse.ArgumentParser]:
+    """Hydra's arguments, its flags anywhere among the overrides."""
+    parser = get_args_parser()
+    parser.error = _refuse  # type: ignore[method-assign]
+    args = parser.parse_intermixed_args(list(argv))
+    if args.experimental_rerun:
+        raise InputError("--experimental-rerun: unpickles a file; allowed are overrides")
+    return args, parser
+
+
+def _refuse(message: str) -> NoReturn:
+    raise InputError(f"train: {message} (see memmlp train --help)")
+
+
+def _runs(args: argparse.Namespace) -> bool:
+    """Whether anything is to be trained, and not only shown."""
+    shows = (args.help, args.hydra_help, args.cfg, args.info, args.shell_completion)
+    return not any(shows)
+
+
+def composed(overrides: Sequence[str]) -> DictConfig:
+    """The checked config of the overrides of one job."""
+    args, _ = parse(overrides)
+    register()
+    (cfg,) = preflight(args)
+    return cfg
+
+
+def preflight(args: argparse.Namespace) -> list[DictConfig]:
+    """Compose and check the config of every job, so that a bad one is known before the first starts."""
+    folder = Path(args.config_path).absolute() if args.config_path else shipped("conf")
+    extra = [f"hydra.searchpath=['file://{_folder(args.config_dir)}']"] if args.config_dir else []
+    configs = []
+    with (
+        _explained([f"--config-path {folder}"]),
+        initialize_config_dir(str(folder), version_base=VERSION_BASE),
+    ):
+        for overrides in _jobs(args):
+            with _explained(overrides):
+                configs.append(compose(args.config_name or CONFIG, [*overrides, *extra]))
+            check(configs[-1])
+    return configs
+
+
+def _folder(name: str) -> Path:
+    """An absolute path for Hydra's --config-dir."""
+    if not Path(name).is_dir():
+        raise InputError(f"--config-dir {name}: allowed is an existing folder")
+    return Path(name).absolute()
+
+
+def _jobs(args: argparse.Namespace) -> list[list[str]]:
+    """The overrides of each job: one, or those of a sweep."""
+    with _explained(args.overrides):
+        overrides = OverridesParser.create().parse_overrides(args.overrides)
+        if not args.multirun and "hydra.mode=MULTIRUN" not in args.overrides:
+            return [args.overrides]
+        return BasicSweeper.split_arguments(overrides, None)[0]
+
+
+@contextmanager
+def _explained(overrides: Sequence[str]) -> Iterator[None]:
+    """Turn what composing raises into an InputError of one line."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(explain(error, overrides)) from error
+
+
+@contextmanager
+def _raising(overrides: Sequence[str]) -> Iterator[None]:
+    """Let Hydra raise instead of printing, and put its own complaints into one line."""
+    before = os.environ.get("HYDRA_FULL_ERROR")
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        yield
+    except Exception as error:
+        if type(error).__module__.split(".")[0] in ("hydra", "omegaconf"):
+            raise InputError(explain(error, overrides)) from error
+        raise
+    finally:
+        if before is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = before
+
+
+def _collecting(
+    job: Callable[[DictConfig], object], failures: list[Exception]
+) -> Callable[[DictConfig], None]:
+    """The job, whose expected failures are kept so that a sweep's other jobs still run."""
+
+    def task(cfg: DictConfig) -> None:
+        try:
+            job(cfg)
+        except (InputError, TrainingDiverged) as failure:
+            failures.append(failure)
+
+    return task
+
+
+def _train(cfg: DictConfig) -> None:
     from memmlp.cli.build import run_training
 
-    try:
-        run_training(cfg)
-    except (InputError, TrainingDiverged) as error:
-        failures.append(error)
-
-
-def explain(error: BaseException) -> str:
-    """A composition error in one line that names the key and what is allowed."""
-    whole = "\n".join(_chain(error))
-    key = re.search(r"Could not override '([^'@]+)|full_key: (\S+)", whole)
-    name = next(filter(None, key.groups())) if key else ""
-    if unknown := re.search(r"Key '[^']*' (?:is )?not in '(\w+)'", whole):
-        return _unknown_key(name, getattr(schema, unknown[1], schema.Config))
-    if option := re.search(MISSING_OPTION, whole):
-        return f"{option[1]}={option[2]}: no such option; allowed: {', '.join(option[3].split())}"
-    if value := re.search(r"Value '(.*)' of type '.*' could not be converted to (\w+)", whole):
-        return f"{name}={value[1]}: not allowed; needed is {KINDS.get(value[2], value[2])}"
-    first = " ".join(str(error).split("full_key")[0].split())
-    return f"{name}: {first}" if name and name not in first else first
-
-
-MISSING_OPTION = r"Could not find '(.+)/([^/]+)'\s+Available options in '.+':((?:\s+\S+)+?)\s+Config"
-KINDS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false"}
-
-
-def _chain(error: BaseException | None) -> list[str]:
-    """The texts of an error and of what it came from."""
-    return [str(error), *_chain(error.__cause__ or error.__context__)] if error else []
-
-
-def _unknown_key(key: str, kind: type) -> str:
-    """What is allowed beside a key that is not, in the schema of its group."""
-    own = key.rpartition(".")[2]
-    allowed = [field.name for field in dataclasses.fields(kind) if not field.name.startswith("_")]
-    near = difflib.get_close_matches(own, allowed, 1)
-    hint = f" (did you mean {near[0]}?)" if near else ""
-    return f"{key}: no such key{hint}; allowed: {', '.join(allowed) or 'none with this option'}"
+    run_training(cfg)
