@@ -1,4 +1,4 @@
-"""The embedded data set: procedural motions of a plausible person as AMASS files, seeded, without download."""
+"""The embedded data set: procedural motions of a plausible person as AMASS files, seeded, no download."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ def synthesize(out: Path, *, minutes: float = 10.0, seed: int = 0, fps: float = 
     _check(minutes, seed, fps)
     rng = np.random.default_rng(seed)
     lengths = _lengths(rng, minutes * 60.0, fps)
-    names = [name for _ in range(0, len(lengths), len(ACTIVITIES)) for name in rng.permutation(list(ACTIVITIES))]
+    rounds = math.ceil(len(lengths) / len(ACTIVITIES))
+    names = np.concatenate([rng.permutation(list(ACTIVITIES)) for _ in range(rounds)])
     paths = []
     for index, frames in enumerate(track(lengths, "synthesize")):
         name = str(names[index])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
@@ -64,8 +64,8 @@ def sitting(rng: np.random.Generator, t: Array) -> Puppet:
         talking = ease(t, down, down + 0.5) * (1 - ease(t, up - 0.5, up))
         for side in (0, 1):
             move_hand(puppet, side, lap, pulse(t, start + 0.2, down + 0.2, up - 0.1, end))
-            gesture = lap + rng.uniform(0.3, 1.0) * np.array([0.04, 0.1, 0.04]) * wander(rng, t, (3,), high=0.8)
-            move_hand(puppet, side, gesture + [0, 0.04, 0], talking)
+            lively = rng.uniform(0.3, 1.0) * np.array([0.04, 0.1, 0.04])
+            move_hand(puppet, side, lap + [0, 0.04, 0] + lively * wander(rng, t, (3,), high=0.8), talking)
     return puppet
 
 
@@ -77,10 +77,9 @@ def reaching(rng: np.random.Generator, t: Array) -> Puppet:
         middle = 0.5 * (start + end)
         weight = pulse(t, start, middle - hold, middle + hold, end)
         elevation = rng.uniform(-1.2, 1.2)
-        if rng.random() < 0.35:
-            _reach(puppet, (0, 1), rng.uniform(-0.1, 0.3), elevation, rng.uniform(0.75, 0.97), weight)
-        else:
-            _reach(puppet, (int(rng.integers(2)),), rng.uniform(-0.4, 1.3), elevation, rng.uniform(0.8, 0.97), weight)
+        sides = ((0,), (1,), (0, 1))[rng.integers(3)]
+        outward = rng.uniform(-0.4, 1.3) if len(sides) == 1 else rng.uniform(-0.1, 0.3)
+        _reach(puppet, sides, outward, elevation, rng.uniform(0.75, 0.97), weight)
     return puppet
 
 
@@ -109,7 +108,8 @@ def waving(rng: np.random.Generator, t: Array) -> Puppet:
     """Wave with one hand or both, at one's own height, rate and width."""
     puppet = stand(rng, t, Style.draw(rng))
     sides = ((0,), (1,), (0, 1))[rng.choice(3, p=[0.4, 0.4, 0.2])]
-    raised, rate, width = rng.uniform([0.1, 0.05, 0.12], [0.3, 0.4, 0.25]), rng.uniform(0.9, 2.0), rng.uniform(0.04, 0.1)
+    raised = rng.uniform([0.1, 0.05, 0.12], [0.3, 0.4, 0.25])
+    rate, width = rng.uniform(0.9, 2.0), rng.uniform(0.04, 0.1)
     for start, end in occasions(rng, t, (2.5, 6.0), (0.4, 2.0)):
         weight = pulse(t, start, start + 0.8, end - 0.8, end)
         beat = 2 * np.pi * rate * (t - start) + 0.5 * wander(rng, t)
@@ -130,8 +130,8 @@ def punching(rng: np.random.Generator, t: Array) -> Puppet:
     stagger = LEFT_RIGHT[lead] * rng.uniform(0.12, 0.2)
     work = Footwork(Stance(style.origin, style.heading, style.width + 0.04, style.splay, stagger))
     for start, _ in occasions(rng, t, (0.8, 1.5), (0.5, 3.0)):
-        shift = rng.uniform(-0.2, 0.2, 2)
-        work.change(start, 0.28, 0.2, shift, turn=rng.uniform(-0.3, 0.3), first=int(rng.integers(2)), lift=0.03)
+        shift, turn = rng.uniform(-0.2, 0.2, 2), rng.uniform(-0.3, 0.3)
+        work.change(start, 0.28, 0.32, shift, turn, first=int(rng.integers(2)), lift=0.03)
     puppet = stand(rng, t, style, work)
     puppet.tilt[:, 1] += bladed
     bend_knees(puppet, 0.06 + 0.012 * np.sin(2 * np.pi * rng.uniform(1.2, 2.0) * t + wander(rng, t)))
@@ -166,48 +166,60 @@ def _aimed(puppet: Puppet, side: int, target: Array) -> Array:
     """A place (3,) seen along the heading, as seen in the turned trunk (N, 3)."""
     yaw = LEFT_RIGHT[side] * (puppet.tilt[:, 1] + puppet.spine[:, 1])
     out, up, forward = target
-    return np.stack(
-        [out * np.cos(yaw) - forward * np.sin(yaw), np.full_like(yaw, up), forward * np.cos(yaw) + out * np.sin(yaw)], -1
-    )
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    return np.stack([out * cosine - forward * sine, np.full_like(yaw, up), forward * cosine + out * sine], -1)
+
+
+@dataclass(frozen=True)
+class Leap:
+    """One jump: seconds of its start, take-off, landing and end; metres of the crouch; factor on the arms."""
+
+    start: float
+    off: float
+    on: float
+    depth: float
+    swing: float
+
+    @property
+    def end(self) -> float:
+        return self.on + 0.9
 
 
 def jumping(rng: np.random.Generator, t: Array) -> Puppet:
     """Jumps on the spot, ahead, aside and with a turn: crouch, take-off, flight, landing."""
     style = Style.draw(rng)
     work = Footwork(Stance(style.origin, style.heading, style.width + 0.02, style.splay))
-    height = rng.uniform(0.1, 0.35)
-    leaps = []
-    for start, _ in occasions(rng, t, (2.0, 2.6), (0.0, 1.5)):
-        rise = height * rng.uniform(0.8, 1.1)
-        off = start + rng.uniform(0.7, 0.9)
+    height, leaps = rng.uniform(0.1, 0.35), []
+    for start, _ in occasions(rng, t, (2.3, 2.6), (0.0, 1.5)):
+        rise, off = height * rng.uniform(0.8, 1.1), start + rng.uniform(0.7, 0.9)
         flight = np.sqrt(8 * rise / GRAVITY)
-        shift = rng.uniform(-0.3, 0.3, 2) * rng.integers(2)
-        turn = rng.uniform(-0.9, 0.9) * rng.integers(2)
+        shift, turn = rng.uniform(-0.3, 0.3, 2) * rng.integers(2), rng.uniform(-0.9, 0.9) * rng.integers(2)
         work.change(off, flight, 0.0, shift, turn, lift=rise + 0.08, heel=0.9, toe=0.0, push=0.2)
-        leaps.append((start, off, flight))
+        leaps.append(Leap(start, off, off + flight, rng.uniform(0.18, 0.3), style.swing))
     puppet = stand(rng, t, style, work)
     puppet.settle = 0.03
-    for start, off, flight in leaps:
-        _leap(puppet, t, start, off, flight, depth=rng.uniform(0.18, 0.3), swing=style.swing)
+    for leap in leaps:
+        _leap(puppet, t, leap)
     return puppet
 
 
-def _leap(puppet: Puppet, t: Array, start: float, off: float, flight: float, depth: float, swing: float) -> None:
+def _leap(puppet: Puppet, t: Array, leap: Leap) -> None:
     """Height of the pelvis through one jump, the trunk that goes with it, and the arms that help."""
-    speed, on = GRAVITY * flight / 2, off + flight
-    low, deep, up = off - 0.28, on + 0.22, on + 0.9
-    rise = CubicHermiteSpline(
-        [start, low, off, on, deep, up], [0, -depth, 0.02, 0.0, -0.7 * depth, 0], [0, 0, speed, -speed, 0, 0]
+    start, off, on, end, depth = leap.start, leap.off, leap.on, leap.end, leap.depth
+    low, deep, speed = off - 0.28, on + 0.22, GRAVITY * (on - off) / 2
+    heights, speeds = [0, -depth, -0.04, -0.08, -0.7 * depth, 0], [0, 0, speed, -speed, 0, 0]
+    inside = (t > start) & (t < end)
+    puppet.pelvis[inside, 2] += CubicHermiteSpline([start, low, off, on, deep, end], heights, speeds)(
+        t[inside]
     )
-    inside = (t > start) & (t < up)
-    puppet.pelvis[inside, 2] += rise(t[inside])
-    crouch = pulse(t, start, low, low, off) + 0.7 * pulse(t, on, deep, deep, up)
+    crouch = pulse(t, start, low, low, off) + 0.7 * pulse(t, on, deep, deep, end)
     puppet.pelvis[:, :2] -= 0.3 * depth * crouch[:, None] * direction(puppet.heading)
     puppet.tilt[:, 0] += 1.8 * depth * crouch
     puppet.spine[:, 0] += 1.0 * depth * crouch
+    back, ahead = np.array([0.12, -0.44, -0.25]), np.array([0.1, 0.15 * leap.swing, 0.4])
     for side in (0, 1):
-        move_hand(puppet, side, np.array([0.12, -0.44, -0.25]), swing / 1.4 * pulse(t, start, low - 0.05, low, off - 0.02))
-        move_hand(puppet, side, np.array([0.1, 0.15 * swing, 0.4]), pulse(t, low, off + 0.05, off + 0.1, deep + 0.2))
+        move_hand(puppet, side, back, leap.swing / 1.5 * pulse(t, start, low - 0.05, low, off - 0.02))
+        move_hand(puppet, side, ahead, pulse(t, low, off + 0.05, off + 0.1, deep + 0.2))
 
 
 def sidestepping(rng: np.random.Generator, t: Array) -> Puppet:

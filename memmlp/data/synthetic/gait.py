@@ -8,7 +8,7 @@ import numpy as np
 
 from memmlp.data.synthetic.curves import Array, ease, pulse, smooth, wander
 from memmlp.data.synthetic.puppet import Puppet
-from memmlp.data.synthetic.stance import STANDING, Stance, Style, direction, move_hand, occasions, stand
+from memmlp.data.synthetic.stance import Stance, Style, direction, move_hand, occasions, stand
 from memmlp.data.synthetic.steps import Feet, Step, tread
 
 GRAVITY = 9.81
@@ -55,18 +55,23 @@ class Gait:
 
 
 WALK = Gait(
-    speed=(0.6, 1.8), cadence=(0.52, 0.33), duty=0.62, ahead=0.42, turn=2.0, width=0.8, sink=0.012, bounce=0.006,
-    lift=0.05, heel=0.9, toe=0.28, push=0.24, lean=0.02, yaw=0.11, swing=0.2, elbow=(0.02, 0.02), settle=0.11,
+    speed=(0.6, 1.8), cadence=(0.52, 0.33), duty=0.62, ahead=0.4, turn=2.0, width=0.8,
+    sink=0.012, bounce=0.006, lift=0.05, heel=0.9, toe=0.28, push=0.24,
+    lean=0.02, yaw=0.11, swing=0.2, elbow=(0.02, 0.02), settle=0.11,
 )  # fmt: skip
 RUN = Gait(
-    speed=(2.0, 4.0), cadence=(1.2, 0.06), duty=0.31, ahead=0.44, turn=1.0, width=0.45, sink=0.06, bounce=0.03,
-    lift=0.26, heel=1.1, toe=0.2, push=0.12, lean=0.14, yaw=0.14, swing=0.16, elbow=(0.24, 0.16), settle=0.07,
+    speed=(2.0, 4.0), cadence=(1.2, 0.08), duty=0.29, ahead=0.38, turn=1.0, width=0.45,
+    sink=0.06, bounce=0.03, lift=0.21, heel=0.9, toe=0.15, push=0.2,
+    lean=0.14, yaw=0.14, swing=0.16, elbow=(0.24, 0.16), settle=0.07,
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Course:
-    """The way over N frames: path (N, 2), heading (N,), pace (N,) in m/s, phase (N,) in cycles, go (N,) in [0, 1]."""
+    """The way over N frames: path (N, 2), metres; heading (N,); pace (N,), m/s; phase (N,), cycles.
+
+    `go` (N,) is 0 while standing and 1 while going.
+    """
 
     path: Array
     heading: Array

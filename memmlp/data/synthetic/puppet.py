@@ -7,12 +7,14 @@ positive leans forward, turns left, leans to the right.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 from scipy.spatial.transform import Rotation
 
 from memmlp.body import JOINTS, N_JOINTS, builtin_rest_joints
-from memmlp.data.synthetic.curves import Array, smooth_below, soft_minimum
+from memmlp.data.synthetic.curves import Array, smooth, smooth_below, soft_minimum
 from memmlp.data.synthetic.steps import Feet
 
 REST = builtin_rest_joints()
@@ -23,7 +25,6 @@ HEEL = np.array([0.0, -ANKLE_HEIGHT, -0.05])  # from the ankle to the heel's con
 STRETCH = 0.993  # a leg that carries is no longer than this part of its full length
 SPINE_SHARES = {"spine1": 0.3, "spine2": 0.3, "spine3": 0.4}
 LEG_POLE, ARM_POLE = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])  # knee and elbow in T-pose
-ELBOW = np.array([0.32, -0.42, -0.82])  # where elbows point: outward, down, back
 
 
 @dataclass
@@ -79,7 +80,13 @@ def facing(yaw: Array) -> Rotation:
 
 
 def two_bone(
-    start: Array, target: Array, pole: Array, upper: Array, lower: Array, rest_pole: Array
+    start: Array,
+    target: Array,
+    pole: Array,
+    upper: Array,
+    lower: Array,
+    rest_pole: Array,
+    free: Array | float,
 ) -> tuple[Rotation, Rotation]:
     """Global rotations (N) of two bones that go from `start` to `target`.
 
@@ -88,11 +95,12 @@ def two_bone(
         pole: directions (N, 3) to which the joint between the bones points.
         upper, lower: bones (3,) in the rest pose.
         rest_pole: direction (3,) to which that joint points in the rest pose.
+        free: in [0, 1] (N,): how early a limb that is to be stretched slows down; 0 reaches exactly.
     """
-    a, b = np.linalg.norm(upper), np.linalg.norm(lower)
+    a, b = float(np.linalg.norm(upper)), float(np.linalg.norm(lower))
     span = np.linalg.norm(target - start, axis=-1, keepdims=True)
     along = (target - start) / span
-    reach = np.maximum(_within(span, a + b), 0.28 * (a + b))
+    reach = np.maximum(_within(span, a + b, free), 0.28 * (a + b))
     across = _unit(pole - (pole * along).sum(-1, keepdims=True) * along)
     cosine = (a * a + reach * reach - b * b) / (2 * a * reach)
     middle = a * (cosine * along + np.sqrt(1 - cosine * cosine) * across)
@@ -114,18 +122,20 @@ def ankles(feet: Feet, side: int) -> tuple[Array, Rotation]:
 
 
 def _root(puppet: Puppet, pelvis: Rotation) -> Array:
-    """The root (N, 3), where needed lowered, so that no leg that carries is stretched out."""
+    """The root (N, 3), lowered where a leg would else be stretched out that carries or is about to."""
     wanted = puppet.pelvis[:, 2]
     ceiling = wanted + 0.3
+    frames = round(puppet.settle * puppet.fps)
     for side, (name, _) in enumerate(SIDES):
         hip = pelvis.apply(_bone("pelvis", f"{name}_hip"))
         away = ankles(puppet.feet, side)[0] - puppet.pelvis - hip
         length = STRETCH * _length(f"{name}_hip", f"{name}_knee", f"{name}_ankle")
         height = np.sqrt(np.maximum(length**2 - (away[:, :2] ** 2).sum(-1), 0.0))
         limit = wanted + away[:, 2] + height
-        ceiling = np.where(puppet.feet.planted[:, side], np.minimum(ceiling, limit), ceiling)
+        carries = _near(puppet.feet.planted[:, side], frames // 2)
+        ceiling = np.where(carries, np.minimum(ceiling, limit), ceiling)
     root = puppet.pelvis.copy()
-    root[:, 2] = soft_minimum(wanted, smooth_below(ceiling, round(puppet.settle * puppet.fps)), 0.01)
+    root[:, 2] = soft_minimum(wanted, smooth_below(ceiling, frames), 0.01)
     return root
 
 
@@ -133,6 +143,7 @@ def _leg(puppet: Puppet, side: int, pelvis: Rotation, root: Array) -> dict[str, 
     """Local rotations of hip, knee, ankle and foot; the knee points where pelvis and foot point."""
     name, sign = SIDES[side]
     ankle, foot = ankles(puppet.feet, side)
+    frames = round(puppet.settle * puppet.fps) // 2
     pole = pelvis.apply([0.1 * sign, 0, 1.0]) + facing(puppet.feet.yaw[:, side]).apply([0, 0, 1.0])
     thigh, shin = two_bone(
         root + pelvis.apply(_bone("pelvis", f"{name}_hip")),
@@ -141,6 +152,7 @@ def _leg(puppet: Puppet, side: int, pelvis: Rotation, root: Array) -> dict[str, 
         _bone(f"{name}_hip", f"{name}_knee"),
         _bone(f"{name}_knee", f"{name}_ankle"),
         LEG_POLE,
+        smooth(1.0 - _near(puppet.feet.planted[:, side], frames), frames),
     )
     return {
         f"{name}_hip": pelvis.inv() * thigh,
@@ -173,15 +185,13 @@ def _arm(puppet: Puppet, side: int, chest: Rotation) -> dict[str, Rotation]:
     bones = _bone(f"{name}_shoulder", f"{name}_elbow"), _bone(f"{name}_elbow", f"{name}_wrist")
     hand = puppet.hands[:, side] / _length(f"{name}_shoulder", f"{name}_elbow", f"{name}_wrist")
     raised, forward = 0.11 * (1 + hand[:, 1]).clip(0) ** 2, 0.2 * hand[:, 2]
-    collar = chest * Rotation.from_rotvec(
-        sign * np.stack([np.zeros_like(raised), -forward, raised], -1)
-    )
+    collar = chest * Rotation.from_rotvec(sign * np.stack([np.zeros_like(raised), -forward, raised], -1))
     trunk = facing(puppet.heading + puppet.tilt[:, 1] + puppet.spine[:, 1])
     mirror = np.array([sign, 1.0, 1.0])
     start = chest.apply(shoulder[0]) + collar.apply(shoulder[1])
     target = chest.apply(sum(shoulder)) + trunk.apply(puppet.hands[:, side] * mirror)
-    pole = trunk.apply(ELBOW * mirror)
-    upper, lower = two_bone(start, target, np.broadcast_to(pole, start.shape), *bones, ARM_POLE)
+    pole = trunk.apply(_elbow(hand) * mirror)
+    upper, lower = two_bone(start, target, pole, *bones, ARM_POLE, 0.0)
     return {
         f"{name}_collar": chest.inv() * collar,
         f"{name}_shoulder": collar.inv() * upper,
@@ -190,9 +200,21 @@ def _arm(puppet: Puppet, side: int, chest: Rotation) -> dict[str, Rotation]:
     }
 
 
-def _within(span: Array, full: float) -> Array:
-    """The distance itself up to STRETCH of the full length, then smoothly to 99.9 % of it at most."""
-    start, room = STRETCH * full, (0.999 - STRETCH) * full
+def _elbow(hand: Array) -> Array:
+    """Where the elbow points (N, 3): back while the hand (N, 3) hangs, down when it is ahead."""
+    ahead = 0.5 + 0.5 * np.tanh(2.0 * (hand[:, 2] - 0.35))
+    return np.stack([np.full_like(ahead, 0.35), -0.9 * ahead, -0.9 * (1.0 - ahead)], -1)
+
+
+def _near(flags: Array, frames: int) -> Array:
+    """Whether (N,) a flag is set within `frames` frames."""
+    return maximum_filter1d(flags, 2 * frames + 1, mode="nearest")
+
+
+def _within(span: Array, full: float, free: Array | float) -> Array:
+    """The distance (N, 1) itself up to STRETCH of the full length, then smoothly to 99.9 % of it at most."""
+    start = (STRETCH - 0.05 * np.reshape(free, (-1, 1))) * full
+    room = 0.999 * full - start
     return np.where(span < start, span, start + room * np.tanh((span - start) / room))
 
 
@@ -223,4 +245,4 @@ def _bone(parent: str, child: str) -> Array:
 
 def _length(*chain: str) -> float:
     """Metres along a chain of joints."""
-    return float(sum(np.linalg.norm(_bone(a, b)) for a, b in zip(chain[:-1], chain[1:], strict=True)))
+    return float(sum(np.linalg.norm(_bone(a, b)) for a, b in pairwise(chain)))

@@ -67,7 +67,7 @@ def direction(yaw: float | Array) -> Array:
 
 @dataclass(frozen=True)
 class Stance:
-    """Both feet on the floor about a centre (2,); `stagger` puts the left foot ahead by that much each way."""
+    """Both feet on the floor about a centre (2,): the left one to the left, and ahead by `stagger`."""
 
     center: Array
     heading: float
@@ -98,11 +98,18 @@ class Footwork:
         self.stance = self.start
 
     def change(
-        self, off: float, duration: float, delay: float, shift: Array, turn: float = 0.0, first: int = 0, **how: Any
+        self,
+        off: float,
+        duration: float,
+        delay: float,
+        shift: Array,
+        turn: float = 0.0,
+        first: int = 0,
+        **how: Any,
     ) -> None:
-        """Foot `first` goes at `off`, the other `delay` seconds later, each for `duration`; see Step for `how`.
+        """Foot `first` goes at `off`, the other `delay` seconds later, each for `duration` seconds.
 
-        The centre moves by `shift` (2,), world, and the heading by `turn`.
+        `how` says the rest of the Step. The centre moves by `shift` (2,), world, and the heading by `turn`.
         """
         s = self.stance = replace(
             self.stance, center=self.stance.center + shift, heading=self.stance.heading + turn
