@@ -1,0 +1,147 @@
+"""`memmlp runs`: what the run folders hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from memmlp.cli.options import outputs_option
+
+if TYPE_CHECKING:
+    from memmlp.runs import Run
+
+NEWEST = 20
+SHOWN = {
+    # column -> where it is in results.json
+    "stream\ncm": ("stream", "rotation", "MPJPE"),
+    "window\ncm": ("window", "rotation", "MPJPE"),
+    "jitter": ("stream", "rotation", "Jitter"),
+    "ms": ("latency", "median_ms"),
+}
+
+
+@click.group("runs")
+def runs() -> None:
+    """List, show and compare runs."""
+
+
+@runs.command("list")
+@click.option("--all", "every", is_flag=True, help=f"All of them, not only the newest {NEWEST}.")
+@outputs_option
+def list_command(every: bool, outputs: Path) -> None:
+    """The runs, the newest first: MPJPE of the rotation branch in both modes, Jitter, latency of a frame."""
+    from memmlp.runs import list_runs
+
+    found = list_runs(outputs)
+    if not found:
+        click.echo(f"no runs in {outputs / 'runs'}; memmlp demo makes the first")
+        return
+    table = _table("run", "kind", "status", "age")
+    for column in SHOWN:
+        table.add_column(column, justify="right", no_wrap=True)
+    for run in found if every else found[:NEWEST]:
+        numbers = (_number(run.results, path) for path in SHOWN.values())
+        table.add_row(run.id, run.manifest.get("kind", "-"), _status(run), _age(run), *numbers)
+    _console().print(table)
+    if len(found) > NEWEST and not every:
+        click.echo(f"{len(found) - NEWEST} older ones: memmlp runs list --all")
+
+
+@runs.command("show")
+@click.argument("run")
+@click.option("--config", "config", is_flag=True, help="Print the resolved config too.")
+@outputs_option
+def show_command(run: str, config: bool, outputs: Path) -> None:
+    """One run, by its id, the beginning of it, or its folder."""
+    from memmlp.runs import find_run, flatten
+
+    found = find_run(outputs, run)
+    changed = ", ".join(found.verify())
+    facts = {"run": found.id, "folder": found.folder, "status": _status(found)} | flatten(found.manifest)
+    if changed:
+        facts["changed since"] = changed
+    facts.pop("id", None)
+    _console().print(_pairs(facts))
+    if found.results:
+        _console().print(_pairs(flatten(found.results), title="results"))
+    if config and found.config:
+        _console().print(_pairs(flatten(found.config), title="config"))
+
+
+@runs.command("diff")
+@click.argument("a")
+@click.argument("b")
+@outputs_option
+def diff_command(a: str, b: str, outputs: Path) -> None:
+    """What two runs differ in: config and results."""
+    from memmlp.runs import diff, find_run
+
+    first, second = find_run(outputs, a), find_run(outputs, b)
+    differences = diff(first, second)
+    for title, pairs in (("config", differences.config), ("results", differences.results)):
+        if not pairs:
+            click.echo(f"{title}: no difference")
+            continue
+        table = _table(title, first.id, second.id)
+        for key, values in pairs.items():
+            table.add_row(key, *map(_text, values))
+        _console().print(table)
+
+
+def _console() -> Console:
+    return Console(highlight=False, markup=False)
+
+
+def _table(*columns: str, title: str | None = None) -> Table:
+    """A table of lines without a frame; ids and words stay whole, long values fold."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=title, title_justify="left")
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    return table
+
+
+def _pairs(facts: Mapping[str, Any], title: str | None = None) -> Table:
+    """Keys and values."""
+    table = _table("", "", title=title)
+    table.show_header = False
+    for key, value in facts.items():
+        table.add_row(key, _text(value))
+    return table
+
+
+def _text(value: Any) -> str:
+    """A value in few characters."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return "-" if value is None else str(value)
+
+
+def _number(results: Mapping[str, Any], path: tuple[str, ...]) -> str:
+    """The number at a path of nested results; - where it is not there."""
+    value: Any = results
+    for key in path:
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return f"{value:.2f}" if isinstance(value, int | float) else "-"
+
+
+def _status(run: Run) -> str:
+    return "done" if run.done else "incomplete"
+
+
+def _age(run: Run) -> str:
+    """Time since the start."""
+    started = run.manifest.get("started")
+    if not started:
+        return "-"
+    seconds = (datetime.now(UTC) - datetime.fromisoformat(started)).total_seconds()
+    for unit, size in (("d", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= size:
+            return f"{int(seconds // size)} {unit}"
+    return f"{int(max(seconds, 0))} s"
