@@ -1,0 +1,135 @@
+"""Small BVH files of both shipped skeletons, and damage to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+
+# Joint, parent, offset; a * before an end site's joint, which comes with the offset only.
+DAZ = """
+hip - 0 0 0; abdomen hip 0 20.7 -0.7; chest abdomen 0 11.7 -0.5; neck chest 0 22.2 -2.2; head neck -0.2
+7.1 1.2; leftEye head 4.1 8 8; *leftEye 1 0 0; lCollar chest 2.7 19.3 -4.9; lShldr lCollar 8.8 -2 1.5;
+lForeArm lShldr 28.2 -1.7 0.5; lHand lForeArm 22.6 0.8 7.1; lThumb1 lHand 1.2 -0.5 3.4; *lThumb1 3.4 -0.5
+3.4; rCollar chest -2.7 19.3 -4.9; rShldr rCollar -8.8 -2 1.5; rForeArm rShldr -28.2 -1.7 0.5; rHand
+rForeArm -22.6 0.8 7.1; *rHand -1 0 0; lButtock hip 8.8 4.4 1.2; lThigh lButtock 0 -1.7 -2.2; lShin
+lThigh 0 -36.8 0.7; lFoot lShin -0.7 -45.1 -5.1; *lFoot 1.1 -3.7 12.1; rButtock hip -8.8 4.4 1.2; rThigh
+rButtock 0 -1.7 -2.2; rShin rThigh 0 -36.8 0.7; rFoot rShin 0.7 -45.1 -5.1; *rFoot -1.1 -3.7 12.1
+"""
+MOTIONBUILDER = """
+Hips - 0 0 0; LHipJoint Hips 0 0 0; LeftUpLeg LHipJoint 1.86 -1.74 0.85; LeftLeg LeftUpLeg 2.37 -6.51 0;
+LeftFoot LeftLeg 2.53 -6.96 0; LeftToeBase LeftFoot 0.16 -0.44 1.95; *LeftToeBase 0 0 1; RHipJoint Hips 0
+0 0; RightUpLeg RHipJoint -1.68 -1.74 0.85; RightLeg RightUpLeg -2.45 -6.72 0; RightFoot RightLeg -2.44
+-6.7 0; RightToeBase RightFoot -0.21 -0.57 2.02; *RightToeBase 0 0 1; LowerBack Hips 0 0 0; Spine
+LowerBack 0 2.24 0; Spine1 Spine 0 2.19 -0.2; Neck Spine1 0 0 0; Neck1 Neck -0.12 1.43 0.28; Head Neck1
+0.18 1.46 -0.33; *Head 0 1.5 0; LeftShoulder Spine1 0 0 0; LeftArm LeftShoulder 3.28 0.86 0.05;
+LeftForeArm LeftArm 4.97 0 0; LeftHand LeftForeArm 3.36 0 0; *LeftHand 0.8 0 0; RightShoulder Spine1 0 0
+0; RightArm RightShoulder -3.24 1.02 0.35; RightForeArm RightArm -5.22 0 0; RightHand RightForeArm -3.37
+0 0; *RightHand -0.6 0 0
+"""
+TREES = {"cmu_daz": DAZ, "cmu_motionbuilder": MOTIONBUILDER}
+FOLDED = ("lButtock", "rButtock", "LHipJoint", "RHipJoint", "Neck1")  # unmapped, between mapped ones
+POSITIONS = ("Xposition", "Yposition", "Zposition")
+ORDERS = [tuple(axis + "rotation" for axis in order) for order in permutations("XYZ")]
+
+
+@dataclass
+class Sample:
+    """A BVH file in the making: joints, and end sites as (joint's index, offset)."""
+
+    names: list[str]
+    parents: list[int]
+    offsets: list[list[float]]
+    ends: list[tuple[int, list[float]]]
+    channels: list[tuple[str, ...]]
+    values: np.ndarray
+
+    def text(
+        self, end: str = "\n", frames: str = "Frames:\t{}", time: str = "Frame Time: {}", dt: str = ""
+    ) -> str:
+        lines = [
+            *["HIERARCHY", *self._joint(0), "MOTION"],
+            *[frames.format(len(self.values)), time.format(dt or "0.00833333")],
+            *[" ".join(map(repr, row)) for row in self.values.tolist()],
+        ]
+        return end.join(lines) + end
+
+    def _joint(self, joint: int) -> list[str]:
+        lines = [f"{'JOINT' if joint else 'ROOT'} {self.names[joint]}", "{"]
+        lines += ["OFFSET " + " ".join(map(repr, self.offsets[joint]))]
+        lines += [" ".join(["CHANNELS", str(len(self.channels[joint])), *self.channels[joint]])]
+        for parent, offset in self.ends:
+            if parent == joint:
+                lines += ["End Site", "{", "OFFSET " + " ".join(map(repr, offset)), "}"]
+        for child, parent in enumerate(self.parents):
+            if parent == joint:
+                lines += self._joint(child)
+        return [*lines, "}"]
+
+
+def person(skeleton: str, frames: int, seed: int, folded: bool = False) -> Sample:
+    """Frame 0 the zero pose, then random rotations; those between mapped joints only if `folded`."""
+    random = np.random.default_rng(seed)
+    names, parents, offsets, ends = [], [], [], []
+    for entry in TREES[skeleton].replace("\n", " ").split(";"):
+        name, *rest = entry.split()
+        if name.startswith("*"):
+            ends.append((names.index(name[1:]), [float(word) for word in rest]))
+        else:
+            names.append(name)
+            parents.append(-1 if rest[0] == "-" else names.index(rest[0]))
+            offsets.append([float(word) for word in rest[1:]])
+    channels = [ORDERS[random.integers(len(ORDERS))] for _ in names]
+    channels[0] = (*POSITIONS, *channels[0])
+    values = random.uniform(-180, 180, (frames, sum(map(len, channels))))
+    values[0, 3:] = 0
+    for joint, name in enumerate(names):
+        if name in FOLDED and not folded:
+            values[:, 3 + 3 * joint : 6 + 3 * joint] = 0
+    return Sample(names, parents, offsets, ends, channels, values)
+
+
+def mutate(data: bytes, seed: int) -> bytes:
+    """One piece of damage, drawn by the seed."""
+    random = np.random.default_rng(seed)
+    lines, at = data.splitlines(keepends=True), int(random.integers(1, len(data) - 1))
+    line = int(random.integers(len(lines)))
+    kind = seed % 8
+    if kind == 0:  # bits of four bytes
+        flipped = bytearray(data)
+        for place in random.integers(0, len(data), 4):
+            flipped[place] ^= int(random.integers(1, 256))
+        return bytes(flipped)
+    if kind == 1:
+        return data[:at]
+    if kind == 2:
+        return data[:at] + data[at + int(random.integers(1, 60)) :]
+    if kind == 3:
+        return b"".join(lines[:line] + lines[line + 1 :])
+    if kind == 4:
+        other = int(random.integers(len(lines)))
+        lines[line], lines[other] = lines[other], lines[line]
+        return b"".join(lines)
+    if kind == 5:
+        return data[:at] + random.bytes(20) + data[at:]
+    if kind == 6:
+        return b"".join([*lines[: line + 1], lines[line], *lines[line + 1 :]])
+    words = data.split(b" ")
+    number = random.choice([n for n, word in enumerate(words) if word[-1:].isdigit()])
+    wrong = [
+        b"nan",
+        b"inf",
+        b"-1e999",
+        b"1e300",
+        b"word",
+        b"1,5",
+        b"1_0",
+        b"0x10",
+        b"--1",
+        b"1 2",
+        b"",
+        b"\xff",
+    ]
+    words[number] = wrong[random.integers(len(wrong))]
+    return b" ".join(words)
