@@ -60,7 +60,7 @@ WALK = Gait(
     lean=0.02, yaw=0.11, swing=0.2, elbow=(0.02, 0.02), settle=0.11,
 )  # fmt: skip
 RUN = Gait(
-    speed=(2.0, 4.0), cadence=(1.2, 0.08), duty=0.29, ahead=0.38, turn=1.0, width=0.45,
+    speed=(2.0, 3.8), cadence=(1.2, 0.08), duty=0.29, ahead=0.38, turn=1.0, width=0.45,
     sink=0.06, bounce=0.03, lift=0.21, heel=0.9, toe=0.15, push=0.2,
     lean=0.14, yaw=0.14, swing=0.16, elbow=(0.24, 0.16), settle=0.07,
 )  # fmt: skip
@@ -111,7 +111,7 @@ def _locomotion(rng: np.random.Generator, t: Array, gait: Gait) -> Puppet:
 def _course(rng: np.random.Generator, t: Array, gait: Gait, style: Style) -> Course:
     """Stand, go for most of the time with turns, stand."""
     fps = 1.0 / (t[1] - t[0])
-    start, stop = t[0] + rng.uniform(0.3, 2.0), t[-1] - rng.uniform(1.2, 2.5)
+    start, stop = t[0] + rng.uniform(0.3, 1.2), t[-1] - rng.uniform(1.2, 2.0)
     top = rng.uniform(*gait.speed)
     go = ease(t, start, start + 1.2) * (1 - ease(t, stop - 1.2, stop))
     pace = top * go * (1 + 0.05 * wander(rng, t, high=0.4))
@@ -150,7 +150,7 @@ def _step(t: Array, gait: Gait, style: Style, course: Course, side: int, strike:
     return Step(
         side, off, on, stance.places[side], stance.yaws[side],
         lift=gait.lift * effort, heel=gait.heel * effort, toe=gait.toe * effort,
-        push=gait.push * cycle, roll=0.12 * cycle,
+        push=gait.push * cycle, roll=0.2 * gait.duty * cycle,
     )  # fmt: skip
 
 
