@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.body import (
@@ -11,8 +12,10 @@ from memmlp.body import (
     N_JOINTS,
     POSITION,
     ROTATION,
+    SPARSE_ANGULAR_VELOCITY,
     SPARSE_DIM,
     SPARSE_POSITION,
+    SPARSE_ROTATION,
     SPARSE_VELOCITY,
     TRACKED,
 )
@@ -56,30 +59,93 @@ def motion_frames(poses: Tensor, trans: Tensor, rest: Tensor) -> Tensor:
 
 
 class World:
-    """Positions as they are: the most literal reading of the paper."""
+    """Positions and directions as they are: the most literal reading of the paper.
 
-    def origin(self, sparse: Tensor) -> Tensor:
-        """Zeros (..., 3) for inputs (..., 54)."""
+    The coordinates slot: `place` says, from the inputs of a frame alone, where its local coordinates lie;
+    `sparse_in`, `motion_in` and `motion_out` carry inputs and motion there and back.
+    """
+
+    def place(self, sparse: Tensor) -> Tensor:
+        """The origin (..., 3), metres, of the local coordinates of inputs (..., 54)."""
         return torch.zeros_like(sparse[..., :3])
 
+    def sparse_in(self, sparse: Tensor, place: Tensor) -> Tensor:
+        """World inputs (..., 54) in local coordinates."""
+        position = sparse[..., SPARSE_POSITION] - _tile(place, len(TRACKED))
+        return torch.cat([sparse[..., : SPARSE_POSITION.start], position, sparse[..., SPARSE_VELOCITY]], -1)
 
-class HeadRelative:
+    def motion_in(self, motion: Tensor, place: Tensor) -> Tensor:
+        """World motion (..., 198) in local coordinates."""
+        return torch.cat([motion[..., ROTATION], motion[..., POSITION] - _tile(place, N_JOINTS)], -1)
+
+    def motion_out(self, motion: Tensor, place: Tensor) -> Tensor:
+        """Local motion (..., 198) in the world."""
+        return torch.cat([motion[..., ROTATION], motion[..., POSITION] + _tile(place, N_JOINTS)], -1)
+
+
+class HeadRelative(World):
     """Horizontal positions relative to the head of the same frame; heights stay (reading 20)."""
 
-    def origin(self, sparse: Tensor) -> Tensor:
-        """The head's position on the floor (..., 3), metres, for inputs (..., 54)."""
+    def place(self, sparse: Tensor) -> Tensor:
+        """The head's position on the floor (..., 3), metres."""
         head = sparse[..., SPARSE_POSITION][..., :3]
         return head * head.new_tensor([1.0, 1.0, 0.0])
 
 
-Coordinates = World | HeadRelative
+class Heading(HeadRelative):
+    """Relative to the head on the floor, and turned so that the head of the same frame looks ahead.
+
+    Not in the paper. It takes the heading away, which the motion does not depend on. The head's angular
+    velocity is local already and stays. The heading is the twist of the head's rotation about the vertical,
+    which is defined but where the head is upside down.
+    """
+
+    def place(self, sparse: Tensor) -> Tensor:
+        """The head's position on the floor and cosine and sine of its heading (..., 5)."""
+        first, second = sparse[..., 0:3], sparse[..., 3:6]  # columns of the head's rotation, body frame
+        up = torch.linalg.cross(first, second, dim=-1)  # the rest pose has Y up and faces Z
+        # A = R Rx(-90 deg) is the rotation from upright; its twist is atan2(a10 - a01, a00 + a11).
+        cosine, sine = first[..., 0] - up[..., 1], first[..., 1] + up[..., 0]
+        heading = F.normalize(torch.stack([cosine, sine], -1), dim=-1)
+        return torch.cat([super().place(sparse), heading], -1)
+
+    def sparse_in(self, sparse: Tensor, place: Tensor) -> Tensor:
+        """World inputs (..., 54) in local coordinates."""
+        sparse = super().sparse_in(sparse, place[..., :3])
+        turned = [
+            _turn(sparse[..., SPARSE_ROTATION], place, -1),
+            sparse[..., SPARSE_ANGULAR_VELOCITY],
+            _turn(sparse[..., SPARSE_POSITION], place, -1),
+            _turn(sparse[..., SPARSE_VELOCITY], place, -1),
+        ]
+        return torch.cat(turned, -1)
+
+    def motion_in(self, motion: Tensor, place: Tensor) -> Tensor:
+        """World motion (..., 198) in local coordinates."""
+        return self._turned(super().motion_in(motion, place[..., :3]), place, -1)
+
+    def motion_out(self, motion: Tensor, place: Tensor) -> Tensor:
+        """Local motion (..., 198) in the world."""
+        return super().motion_out(self._turned(motion, place, 1), place[..., :3])
+
+    def _turned(self, motion: Tensor, place: Tensor, way: int) -> Tensor:
+        """The root's rotation and the positions turned; the other rotations are local anyway."""
+        root, body = motion[..., :6], motion[..., 6 : ROTATION.stop]
+        return torch.cat([_turn(root, place, way), body, _turn(motion[..., POSITION], place, way)], -1)
+
+
+def _turn(vectors: Tensor, place: Tensor, way: int) -> Tensor:
+    """Vectors (..., 3 n) turned about the vertical by the heading of a place (..., 5), or back (way -1)."""
+    x, y, z = vectors.unflatten(-1, (-1, 3)).unbind(-1)
+    cosine, sine = place[..., 3:4], way * place[..., 4:5]
+    return torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], -1).flatten(-2)
 
 
 class Frame(nn.Module):
     """World <-> network space: the choice of coordinates, and z-scores where statistics are given.
 
     Args:
-        coordinates: World() or HeadRelative().
+        coordinates: World(), HeadRelative() or Heading().
         rest: rest positions (22, 3), metres, for forward kinematics.
         mean, std: statistics (252,) of frames [X | Theta] in the chosen coordinates.
     """
@@ -90,7 +156,7 @@ class Frame(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, coordinates: Coordinates, rest: Tensor, mean: Tensor, std: Tensor):
+    def __init__(self, coordinates: World, rest: Tensor, mean: Tensor, std: Tensor):
         super().__init__()
         self.coordinates = coordinates
         self.register_buffer("rest", rest.float())
@@ -98,12 +164,12 @@ class Frame(nn.Module):
         self.register_buffer("std", std.float().clamp_min(self.MIN_STD))
 
     @classmethod
-    def raw(cls, coordinates: Coordinates, rest: Tensor) -> Frame:
+    def raw(cls, coordinates: World, rest: Tensor) -> Frame:
         """The frame without normalisation."""
         return cls(coordinates, rest, torch.zeros(FRAME_DIM), torch.ones(FRAME_DIM))
 
     @classmethod
-    def fit(cls, coordinates: Coordinates, rest: Tensor, frames: Tensor, chunk: int = 65536) -> Frame:
+    def fit(cls, coordinates: World, rest: Tensor, frames: Tensor, chunk: int = 65536) -> Frame:
         """The frame with the z-scores of training frames (F, 252), read chunk by chunk."""
         plain = cls.raw(coordinates, rest).to(frames.device)
         count = len(frames)
@@ -116,30 +182,27 @@ class Frame(nn.Module):
             square += (plain.encode(part).double() - mean).square().sum(0)
         return cls(coordinates, rest.cpu(), mean.cpu(), (square / count).sqrt().cpu())
 
-    def origin(self, sparse: Tensor) -> Tensor:
-        """The point (..., 3) of the world that positions of that frame are relative to."""
-        return self.coordinates.origin(sparse)
+    def place(self, sparse: Tensor) -> Tensor:
+        """Where (..., 3 or 5) the local coordinates of inputs (..., 54) lie."""
+        return self.coordinates.place(sparse)
 
     def encode(self, frames: Tensor) -> Tensor:
         """World frames [X | Theta] (..., 252) -> network space (..., 252)."""
         sparse, motion = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:]
-        return torch.cat([self.encode_sparse(sparse), self.encode_motion(motion, self.origin(sparse))], -1)
+        place = self.place(sparse)
+        return torch.cat([self.encode_sparse(sparse, place), self.encode_motion(motion, place)], -1)
 
-    def encode_sparse(self, sparse: Tensor) -> Tensor:
+    def encode_sparse(self, sparse: Tensor, place: Tensor) -> Tensor:
         """World inputs (..., 54) -> network space (..., 54)."""
-        relative = sparse[..., SPARSE_POSITION] - _tile(self.origin(sparse), len(TRACKED))
-        moved = torch.cat([sparse[..., : SPARSE_POSITION.start], relative, sparse[..., SPARSE_VELOCITY]], -1)
-        return (moved - self.mean[:SPARSE_DIM]) / self.std[:SPARSE_DIM]
+        return (self.coordinates.sparse_in(sparse, place) - self.mean[:SPARSE_DIM]) / self.std[:SPARSE_DIM]
 
-    def encode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
+    def encode_motion(self, motion: Tensor, place: Tensor) -> Tensor:
         """World motion (..., 198) -> network space (..., 198)."""
-        moved = torch.cat([motion[..., ROTATION], motion[..., POSITION] - _tile(origin, N_JOINTS)], -1)
-        return (moved - self.mean[SPARSE_DIM:]) / self.std[SPARSE_DIM:]
+        return (self.coordinates.motion_in(motion, place) - self.mean[SPARSE_DIM:]) / self.std[SPARSE_DIM:]
 
-    def decode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
+    def decode_motion(self, motion: Tensor, place: Tensor) -> Tensor:
         """Network space (..., 198) -> world motion (..., 198)."""
-        moved = motion * self.std[SPARSE_DIM:] + self.mean[SPARSE_DIM:]
-        return torch.cat([moved[..., ROTATION], moved[..., POSITION] + _tile(origin, N_JOINTS)], -1)
+        return self.coordinates.motion_out(motion * self.std[SPARSE_DIM:] + self.mean[SPARSE_DIM:], place)
 
     def pose(self, motion: Tensor, sparse: Tensor) -> Tensor:
         """Joint positions (..., 22, 3), metres, world, from the rotations of world motion (..., 198).

@@ -69,15 +69,16 @@ class MemMLP(nn.Module):
         new = sparse.shape[1]
         before = torch.where(state["started"][..., None] > 0, state["sparse"], sparse[:, :1])
         inputs = torch.cat([before, sparse], 1)
-        window = inputs[:, -self.frames :]
-        past = self.memory.recall(self.frame.encode_sparse(before), state, new)
-        h = self.stem(self.frame.encode_sparse(window))
+        place = self.frame.place(inputs)
+        encoded = self.frame.encode_sparse(inputs, place)
+        past = self.memory.recall(encoded[:, : before.shape[1]], state, new)
+        h = self.stem(encoded[:, -self.frames :])
         for block in self.blocks:
             h = block(h, past)
-        motion = self.predictor(h, window, self.frame)
+        motion = self.predictor(h, inputs[:, -self.frames :], self.frame)
         kept = {"sparse": inputs[:, -self.memory.length :], "started": state["started"].clamp_min(1)}
         kept |= self.memory.remember(motion, state, new)
-        return self.frame.decode_motion(motion, self.frame.origin(window)), kept
+        return self.frame.decode_motion(motion, place[:, -self.frames :]), kept
 
     def count_parameters(self) -> int:
         """Trainable parameters (the frozen VQ-VAE apart), the number that the tables call #Params."""

@@ -18,7 +18,7 @@ from memmlp.body import SPARSE_DIM
 from memmlp.data.dataset import Frames
 from memmlp.data.prepare import Manifest, Source, prepare
 from memmlp.export import TOLERANCE, export, parity
-from memmlp.features import Coordinates, Frame
+from memmlp.features import Frame, World
 from memmlp.losses import Hand, MotionLoss, Weighting
 from memmlp.memory import Memory
 from memmlp.model import MemMLP
@@ -69,7 +69,7 @@ class Data:
 class Architecture:
     """The network: partial constructors for the slots, and its sizes."""
 
-    coordinates: Coordinates
+    coordinates: World
     normalize: bool
     frames: int
     hidden: int

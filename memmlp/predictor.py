@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import ClassVar
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
-from memmlp.body import MOTION_DIM, ROTATION, SPARSE_DIM
+from memmlp.body import MOTION_DIM, ROTATION
 from memmlp.features import Frame
 from memmlp.layers import MLPBlock
 
@@ -49,10 +50,11 @@ class RotationOnly(nn.Module):
         """Hidden state (B, T, d) and world inputs (B, T, 54) -> motion (B, T, 198) in network space."""
         rotation = self.rotation(h)
         with torch.no_grad():
-            physical = rotation * frame.std[SPARSE_DIM:][ROTATION] + frame.mean[SPARSE_DIM:][ROTATION]
-            positions = frame.pose(physical, sparse).flatten(-2)
-            world = torch.cat([physical, positions], -1)
-            position = frame.encode_motion(world, frame.origin(sparse))[..., ROTATION.stop :]
+            place = frame.place(sparse)
+            world = frame.decode_motion(F.pad(rotation, (0, MOTION_DIM - ROTATION.stop)), place)
+            positions = frame.pose(world, sparse).flatten(-2)
+            world = torch.cat([world[..., ROTATION], positions], -1)
+            position = frame.encode_motion(world, place)[..., ROTATION.stop :]
         return torch.cat([rotation, position], -1)
 
 

@@ -16,13 +16,13 @@ from memmlp.cli.schema import Config, check
 from memmlp.data.prepare import Source
 from memmlp.data.synthetic import synthesize
 from memmlp.errors import InputError
-from memmlp.features import Coordinates, HeadRelative, World
+from memmlp.features import Heading, HeadRelative, World
 from memmlp.memory import Memory
 from memmlp.runs import Run
 from memmlp.training import Optim
 from memmlp.vqvae import VQVAE
 
-COORDINATES: dict[str, type[Coordinates]] = {"head_relative": HeadRelative, "world": World}
+COORDINATES: dict[str, type[World]] = {"head_relative": HeadRelative, "world": World, "heading": Heading}
 
 
 def run_training(cfg: DictConfig) -> None:

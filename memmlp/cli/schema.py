@@ -244,7 +244,7 @@ class SubsetData(Data):
 
 @dataclass
 class Frame:
-    coordinates: str = one_of("head_relative", "world")
+    coordinates: str = one_of("heading", "head_relative", "world")
     normalize: bool = key()
 
 

@@ -1,0 +1,85 @@
+"""`memmlp bench`: claims about speed, measured on this machine."""
+
+from __future__ import annotations
+
+import click
+
+
+@click.group("bench")
+def bench() -> None:
+    """Measure speed on this machine, as rates and as ratios within one run."""
+
+
+@bench.command("prepare")
+@click.option("--minutes", default=60.0, show_default=True, help="Length of the synthetic motion.")
+def prepare(minutes: float) -> None:
+    """Prepare synthetic AMASS-format motion: seconds, frames a second, and peak memory."""
+    import resource
+    import tempfile
+    import time
+    from pathlib import Path
+
+    from memmlp.data.prepare import Source
+    from memmlp.data.prepare import prepare as run
+    from memmlp.data.splits import SeededSplit
+    from memmlp.data.synthetic import synthesize
+
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder) / "clips"
+        synthesize(root, minutes=minutes)
+        start = time.perf_counter()
+        manifest = run(Source(root, SeededSplit()), Path(folder) / "cache")
+        seconds = time.perf_counter() - start
+    frames = sum(int(part["frames"]) for part in manifest.totals.values())
+    peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    click.echo(
+        f"{frames} frames ({frames / 216000:.2f} h) in {seconds:.1f} s: {frames / seconds:.0f} frames/s, "
+        f"{seconds / (frames / 216000):.1f} s an hour of motion, peak memory {peak / 2**20:.2f} GB"
+    )
+
+
+@bench.command("stream")
+@click.option("--clips", default=64, show_default=True, help="Clips side by side.")
+@click.option("--frames", default=60, show_default=True, help="Frames a clip.")
+@click.option("--rounds", default=3, show_default=True, help="Rounds, the two ways in turn.")
+@click.option("--device", default="cpu", show_default=True, type=click.Choice(["cpu", "cuda"]))
+@click.argument("overrides", nargs=-1)
+def stream(clips: int, frames: int, rounds: int, device: str, overrides: tuple[str, ...]) -> None:
+    """Stream evaluation side by side against clip by clip: milliseconds a frame of motion, and the ratio.
+
+    OVERRIDES are those of `memmlp train`; the default is profile=paper. Weights are random.
+    """
+    import time
+
+    import numpy as np
+    import torch
+
+    from memmlp.body import FRAME_DIM, builtin_rest_joints
+    from memmlp.cli.build import build_architecture
+    from memmlp.cli.train import composed
+    from memmlp.evaluation import stream as run
+    from memmlp.features import Frame
+
+    architecture = build_architecture(composed(["profile=paper", *overrides]))
+    torch.manual_seed(0)
+    codes = architecture.vqvae() if architecture.uses_codes else None
+    frame = Frame.raw(architecture.coordinates, torch.as_tensor(builtin_rest_joints()))
+    model = architecture.build(frame, codes).to(device).eval()
+    motion = list(0.1 * torch.randn(clips, frames, FRAME_DIM, device=device))
+
+    def milliseconds(parts: list[list[torch.Tensor]]) -> float:
+        start = time.perf_counter()
+        for part in parts:
+            run(model, part)[0].sum().item()
+        return 1000 * (time.perf_counter() - start) / (frames * sum(len(part) for part in parts))
+
+    alone, together = [], []
+    for _ in range(rounds + 1):  # the first round warms up
+        together.append(milliseconds([motion]))
+        alone.append(milliseconds([[clip] for clip in motion[:4]]))
+    ratios = np.array(alone[1:]) / np.array(together[1:])
+    click.echo(f"clip by clip      {np.median(alone[1:]):8.3f} ms a frame")
+    click.echo(f"{clips:3d} side by side  {np.median(together[1:]):8.3f} ms a frame")
+    click.echo(
+        f"ratio {np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f} over {rounds} rounds)"
+    )
