@@ -30,8 +30,9 @@ def explain(error: Exception, overrides: Sequence[str]) -> str:
         return f"{error.override}: cannot be read; allowed is KEY=VALUE, +KEY=VALUE or ~KEY"
     if isinstance(error, MissingConfigException):
         return _missing_option(error)
-    if isinstance(error.__cause__, OmegaConfBaseException):
-        return _typed(error.__cause__, _offender(error))
+    below = error.__cause__ or error.__context__
+    if isinstance(below, OmegaConfBaseException):
+        return _typed(below, _offender(error))
     if isinstance(error, OmegaConfBaseException):
         return _typed(error, None)
     if isinstance(error, ConfigCompositionException):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -478,6 +479,7 @@ SCHEMAS: dict[str, type] = {
 }
 
 
+@functools.cache
 def register() -> None:
     """Make the schemas known to Hydra."""
     for name, node in SCHEMAS.items():

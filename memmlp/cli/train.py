@@ -11,9 +11,12 @@ from pathlib import Path
 from typing import NoReturn
 
 import click
-from hydra import compose, initialize_config_dir, version
+from hydra import compose, version
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra._internal.utils import _run_hydra, get_args_parser
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import _run_hydra, create_config_search_path, get_args_parser
+from hydra.core.config_search_path import SearchPathQuery
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
@@ -83,30 +86,40 @@ def composed(overrides: Sequence[str]) -> DictConfig:
     """The checked config of the overrides of one job."""
     args, _ = parse(overrides)
     register()
+    version.setbase(VERSION_BASE)
     (cfg,) = preflight(args)
     return cfg
 
 
 def preflight(args: argparse.Namespace) -> list[DictConfig]:
     """Compose and check the config of every job, so that a bad one is known before the first starts."""
-    folder = Path(args.config_path).absolute() if args.config_path else shipped("conf")
-    extra = [f"hydra.searchpath=['file://{_folder(args.config_dir)}']"] if args.config_dir else []
     configs = []
-    with (
-        _explained([f"--config-path {folder}"]),
-        initialize_config_dir(str(folder), version_base=VERSION_BASE),
-    ):
+    with _hydra(args):
         for overrides in _jobs(args):
             with _explained(overrides):
-                configs.append(compose(args.config_name or CONFIG, [*overrides, *extra]))
+                configs.append(compose(args.config_name or CONFIG, overrides))
             check(configs[-1])
     return configs
 
 
-def _folder(name: str) -> Path:
-    """An absolute path for Hydra's --config-dir."""
+@contextmanager
+def _hydra(args: argparse.Namespace) -> Iterator[None]:
+    """Hydra with the search path that the arguments ask for, as it will be when the jobs run."""
+    path = create_config_search_path(str(_folder(args.config_path or shipped("conf"), "--config-path")))
+    if args.config_dir:
+        own = f"file://{_folder(args.config_dir, '--config-dir')}"
+        path.prepend(provider="command-line", path=own, anchor=SearchPathQuery(provider="schema"))
+    Hydra.create_main_hydra2(task_name="train", config_search_path=path)
+    try:
+        yield
+    finally:
+        GlobalHydra.instance().clear()
+
+
+def _folder(name: str | Path, option: str) -> Path:
+    """The absolute path of an option's folder."""
     if not Path(name).is_dir():
-        raise InputError(f"--config-dir {name}: allowed is an existing folder")
+        raise InputError(f"{option} {name}: allowed is an existing folder")
     return Path(name).absolute()
 
 
