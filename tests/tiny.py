@@ -1,0 +1,79 @@
+"""Tiny motion and tiny networks that the tests share."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from memmlp.body import FRAME_DIM, builtin_rest_joints
+from memmlp.data.dataset import Frames
+from memmlp.features import Frame, HeadRelative, World, motion_frames
+from memmlp.memory import CodeMemory, NoCodesMemory, NoMemory
+from memmlp.model import MemMLP
+from memmlp.predictor import RotationOnly, TwoBranch
+from memmlp.vqvae import VQVAE
+
+SIZES = {"hidden": 16, "frames": 7}
+DEPTH = 4
+REST = torch.tensor(builtin_rest_joints())
+
+
+def clip(length: int, seed: int = 0, spread: float = 0.3) -> torch.Tensor:
+    """World frames (length, 252) of smooth random motion of an upright person."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(length + 1)[:, None, None] / 60
+    waves = rng.normal(size=(3, 22, 3)) * spread
+    rate, phase = rng.uniform(0.5, 3, (3, 22, 3)), rng.uniform(0, 2 * math.pi, (3, 22, 3))
+    poses = sum(waves[i] * np.sin(2 * math.pi * rate[i] * t + phase[i]) for i in range(3))
+    poses[:, 0] = np.array([math.pi / 2, 0, 0]) + 0.1 * poses[:, 0]
+    trans = np.cumsum(rng.normal(size=(length + 1, 3)) * 0.003, 0) + [0, 0, 0.95]
+    return motion_frames(torch.tensor(poses), torch.tensor(trans), REST).float()
+
+
+def frames(lengths: tuple[int, ...] = (60, 45, 80), seed: int = 0) -> Frames:
+    """A split with clips of these lengths."""
+    clips = [clip(length, seed + i) for i, length in enumerate(lengths)]
+    starts = torch.tensor([0, *np.cumsum(lengths)[:-1]])
+    return Frames(torch.cat(clips), starts, torch.tensor(lengths), [f"clip{i}" for i in range(len(lengths))])
+
+
+def frame(coordinates: World | None = None) -> Frame:
+    """World <-> network space with made-up statistics."""
+    draw = torch.Generator().manual_seed(5)
+    std = 0.2 + torch.rand(FRAME_DIM, generator=draw)
+    return Frame(coordinates or HeadRelative(), REST, 0.1 * torch.randn(FRAME_DIM, generator=draw), std)
+
+
+def vqvae() -> VQVAE:
+    """A VQ-VAE with random code-vectors."""
+    torch.manual_seed(3)
+    model = VQVAE(codes=8, width=12, encoder_depth=2)
+    model.codebook.vectors.normal_()
+    return model.eval()
+
+
+def memory(kind: type = CodeMemory, **changes) -> NoMemory | NoCodesMemory:
+    """A memory for the tiny network, with changed settings."""
+    if kind is NoMemory:
+        return NoMemory(depth=DEPTH, **SIZES)
+    settings = {"layers": (2, 4), "width": 6, "shift": "window", "history": "first", "fusion": "residual"}
+    settings |= {"blend": 0.5} | changes
+    codes = vqvae() if kind is CodeMemory else None
+    return kind(**settings, codes=codes, depth=DEPTH, **SIZES)
+
+
+def model(
+    kind: type = CodeMemory,
+    predictor: type = TwoBranch,
+    coordinates: World | None = None,
+    seed: int = 0,
+    **changes,
+) -> MemMLP:
+    """A tiny network with random weights, in evaluation mode."""
+    torch.manual_seed(seed)
+    slot = memory(kind, **changes)
+    torch.manual_seed(seed)
+    head: TwoBranch | RotationOnly = predictor(1, **SIZES)
+    return MemMLP(frame(coordinates), slot, head, depth=DEPTH, **SIZES).eval()
