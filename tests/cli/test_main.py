@@ -1,0 +1,208 @@
+"""The command itself: quick help, exit codes, one line an error, Hydra's own abilities."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import Memmlp, one_line
+from omegaconf import DictConfig
+
+import memmlp as package
+from memmlp.cli.main import COMMANDS, main
+from memmlp.errors import InputError, TrainingDiverged
+
+
+@pytest.fixture
+def jobs(monkeypatch: pytest.MonkeyPatch) -> list[DictConfig]:
+    """The configs that `memmlp train` would train."""
+    seen: list[DictConfig] = []
+    monkeypatch.setattr("memmlp.cli.train._train", seen.append)
+    return seen
+
+
+def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
+    def fail(cfg: DictConfig) -> None:
+        raise error
+
+    monkeypatch.setattr("memmlp.cli.train._train", fail)
+
+
+QUICK = """
+import sys
+from memmlp.cli.main import main
+try:
+    main(["--help"])
+except SystemExit:
+    pass
+print([name for name in ("torch", "hydra", "omegaconf", "mlflow", "numpy", "rich") if name in sys.modules])
+"""
+
+
+def test_help_imports_nothing_slow():
+    out = subprocess.check_output([sys.executable, "-c", QUICK], text=True)
+    assert out.splitlines()[-1] == "[]"
+    assert all(f"  {name} " in out for name in COMMANDS)
+
+
+def test_help_is_quick():
+    def seconds() -> float:
+        start = time.perf_counter()
+        subprocess.run(
+            [sys.executable, "-m", "memmlp.cli.main", "--help"], stdout=subprocess.DEVNULL, check=True
+        )
+        return time.perf_counter() - start
+
+    assert min(seconds() for _ in range(3)) < 0.5
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help(memmlp: Memmlp, name: str):
+    ran = memmlp(name, "--help")
+    assert ran.code == 0
+    assert "memmlp" in ran.out
+    assert ran.err == ""
+
+
+def test_version(memmlp: Memmlp):
+    assert memmlp("--version").out == f"memmlp, version {package.__version__}\n"
+
+
+def test_no_command_shows_the_help(memmlp: Memmlp):
+    ran = memmlp()
+    assert ran.code == 2
+    assert "Commands:" in ran.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["trian"], ["trian", "did you mean train?", "demo, train, data"]),
+        (["--nope"], ["--nope", "memmlp --help"]),
+        (["runs", "shwo"], ["shwo"]),
+        (["runs", "show"], ["RUN", "memmlp runs show --help"]),
+        (["runs", "list", "--nope"], ["--nope", "memmlp runs list --help"]),
+        (["runs", "show", "zz"], ["run 'zz'", "no such folder"]),
+    ],
+)
+def test_bad_usage_is_one_line(memmlp: Memmlp, arguments: list[str], words: list[str]):
+    assert one_line(memmlp(*arguments), *words)
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [(InputError("a\nb"), 2), (TrainingDiverged("a b"), 1), (KeyboardInterrupt(), 130)],
+)
+def test_exit_codes(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int):
+    failing(monkeypatch, error)
+    ran = memmlp("train", "profile=tiny")
+    assert ran.code == code
+    assert [line[:8] for line in ran.err.splitlines() if line] == ["memmlp: "]
+    assert ran.out == ""
+
+
+def test_a_bug_shows_where_it_is(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
+    failing(monkeypatch, ZeroDivisionError("a bug"))
+    with pytest.raises(ZeroDivisionError, match="a bug"):
+        memmlp("train")
+
+
+def test_tracebacks_on_request(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("MEMMLP_TRACEBACK", "1")
+    with pytest.raises(InputError, match="no such command"):
+        main(["trian"])
+
+
+def test_train_gives_the_job_its_config(memmlp: Memmlp, jobs: list[DictConfig], tmp_path: Path):
+    ran = memmlp("train", "profile=tiny", "memory=none", "seed=3")
+    assert (ran.code, ran.out, ran.err) == (0, "", "")
+    (cfg,) = jobs
+    assert (cfg.seed, cfg.model.width, cfg.memory._target_) == (3, 16, "memmlp.memory.NoMemory")
+    assert "hydra" not in cfg
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "arguments", [["-m", "seed=0,1"], ["seed=0,1", "-m"], ["hydra.mode=MULTIRUN", "seed=0,1"]]
+)
+def test_a_multirun(memmlp: Memmlp, jobs: list[DictConfig], tmp_path: Path, arguments: list[str]):
+    assert memmlp("train", *arguments).code == 0
+    assert [cfg.seed for cfg in jobs] == [0, 1]
+    assert {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")} <= {
+        "outputs", "outputs/multirun", "outputs/multirun/multirun.yaml",
+    }  # fmt: skip
+
+
+def test_a_failed_job_does_not_stop_the_others(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
+    seeds = []
+
+    def job(cfg: DictConfig) -> None:
+        seeds.append(cfg.seed)
+        if cfg.seed < 2:
+            raise InputError(f"seed {cfg.seed} is bad")
+
+    monkeypatch.setattr("memmlp.cli.train._train", job)
+    ran = memmlp("train", "-m", "seed=0,1,2")
+    assert seeds == [0, 1, 2]
+    assert ran.code == 2
+    assert ran.err.splitlines() == ["memmlp: seed 0 is bad", "memmlp: seed 1 is bad"]
+
+
+def test_cfg_job_prints_the_config(memmlp: Memmlp, jobs: list[DictConfig]):
+    ran = memmlp("train", "--cfg", "job", "--resolve", "seed=7")
+    assert "seed: 7\n" in ran.out
+    assert "_target_: memmlp.memory.CodeMemory" in ran.out
+    assert jobs == []
+
+
+def test_help_says_what_can_be_chosen(memmlp: Memmlp):
+    assert "memory: no_codes, none, vq" in memmlp("train", "--help").out
+
+
+def test_info_says_where_configs_are_sought(tmp_path: Path):
+    command = [sys.executable, "-m", "memmlp.cli.main", "train", "--info", "searchpath"]
+    out = subprocess.check_output(command, cwd=tmp_path, text=True)
+    assert "conf" in out
+    assert "structured://" in out
+
+
+def test_hydras_environment_is_left_as_it_was(memmlp: Memmlp, jobs: list[DictConfig]):
+    memmlp("train")
+    assert "HYDRA_FULL_ERROR" not in os.environ
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("memmlp train memory=n", {"memory=no_codes", "memory=none"}),
+        ("memmlp train memory=none optim.preci", {"optim.precision="}),
+        ("memmlp train memory=none memory.wid", set()),
+        ("memmlp tr", {"train"}),
+        ("memmlp ", set(COMMANDS)),
+        ("memmlp runs sh", set()),
+    ],
+)
+def test_completion(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch, line: str, expected: set[str]):
+    monkeypatch.setenv("COMP_LINE", line)
+    ran = memmlp("-sc", "query=bash")
+    assert ran.code == 0
+    assert set(ran.out.split()) == expected
+
+
+def test_completion_in_a_real_shell(tmp_path: Path):
+    folder = Path(sys.executable).parent
+    script = """
+    eval "$(memmlp train -sc install=bash)"
+    COMP_LINE="memmlp train profile=t" COMP_POINT=22 COMP_CWORD=2
+    hydra_bash_completion
+    echo "${COMPREPLY[@]}"
+    """
+    environment = os.environ | {"PATH": f"{folder}:{os.environ['PATH']}"}
+    ran = subprocess.run(
+        ["bash", "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert (ran.stdout.strip(), ran.stderr) == ("profile=tiny", "")

@@ -1,0 +1,100 @@
+"""`memmlp runs` on folders made by hand."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from conftest import Memmlp, Ran, one_line
+
+from memmlp.runs import Run, write_json
+
+A, B, C = ("a" * 16, "b" * 16, "c" * 16)
+RESULTS = {
+    "stream": {"rotation": {"MPJPE": 6.512, "Jitter": 4.2}},
+    "window": {"rotation": {"MPJPE": 7.0}},
+    "latency": {"median_ms": 1.5},
+}
+
+
+@pytest.fixture
+def outputs(tmp_path: Path) -> Path:
+    """Two finished runs and one that is not."""
+    folder = tmp_path / "outputs"
+    for name, seed in ((A, 0), (B, 1), (C, 2)):
+        run = Run.of(folder, name)
+        run.begin(
+            "memmlp", {"seed": seed, "memory": {"layers": [2, 4, 6, 8] * 9}}, data="d" * 64, upstream=None
+        )
+        if name != C:
+            write_json(run.results_path, RESULTS | {"stream": {"rotation": {"MPJPE": 6.512 + seed}}})
+            run.finish(["results.json"])
+    return folder
+
+
+def lines_up(ran: Ran, width: int) -> bool:
+    """No line is wider than the screen, and no table is torn: all its lines are equally wide."""
+    widths = {len(line) for line in ran.out.splitlines() if line.strip()}
+    return ran.code == 0 and max(widths) <= width
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_list_lines_up(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch, width: int):
+    monkeypatch.setenv("COLUMNS", str(width))
+    ran = memmlp("runs", "list")
+    assert lines_up(ran, width)
+    rows = {line.split()[0]: line.split() for line in ran.out.splitlines() if line.strip()[:1] in set("abc")}
+    assert rows[A][1:3] == ["memmlp", "done"]
+    assert rows[A][-4:] == ["6.51", "7.00", "-", "1.50"]
+    assert rows[C][2] == "incomplete"
+    assert rows[C][-4:] == ["-"] * 4
+
+
+def test_list_names_the_older_ones(memmlp: Memmlp, outputs: Path):
+    for i in range(25):
+        Run.of(outputs, f"{i:016x}").begin("vqvae", {}, data="d", upstream=None)
+    assert memmlp("runs", "list").out.count("vqvae") < 25
+    assert "8 older ones" in memmlp("runs", "list").out
+    assert memmlp("runs", "list", "--all").out.count("vqvae") == 25
+
+
+def test_an_empty_list_says_where_it_looked(memmlp: Memmlp):
+    assert "no runs in elsewhere/runs" in memmlp("runs", "list", "--outputs", "elsewhere").out
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_show(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch, width: int):
+    monkeypatch.setenv("COLUMNS", str(width))
+    ran = memmlp("runs", "show", "a", "--config")
+    assert lines_up(ran, width)
+    for word in (A, "done", "packages.torch", "stream.rotation.MPJPE", "6.512", "memory.layers"):
+        assert word in ran.out
+    assert "changed since" not in ran.out
+
+
+def test_show_tells_of_changed_artifacts(memmlp: Memmlp, outputs: Path):
+    (outputs / "runs" / A / "results.json").write_text("{}")
+    assert re.search(r"changed since +results.json", memmlp("runs", "show", A).out)
+
+
+def test_show_an_unfinished_run(memmlp: Memmlp, outputs: Path):
+    assert "incomplete" in memmlp("runs", "show", C).out
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_diff(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch, width: int):
+    monkeypatch.setenv("COLUMNS", str(width))
+    ran = memmlp("runs", "diff", "a", "b")
+    assert lines_up(ran, width)
+    assert ["seed", "0", "1"] in [line.split() for line in ran.out.splitlines()]
+    assert ["stream.rotation.MPJPE", "6.512", "7.512"] in [line.split() for line in ran.out.splitlines()]
+    assert "memory.layers" not in ran.out
+
+
+def test_no_difference(memmlp: Memmlp, outputs: Path):
+    assert memmlp("runs", "diff", "a", "a").out == "config: no difference\nresults: no difference\n"
+
+
+def test_an_unknown_run_is_one_line(memmlp: Memmlp, outputs: Path):
+    assert one_line(memmlp("runs", "diff", "a", "zz"), "run 'zz'")
