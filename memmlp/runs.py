@@ -6,6 +6,7 @@ JSON has no word for NaN and infinities: they are stored as the strings "nan", "
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import json
 import math
@@ -386,6 +387,7 @@ def _version(package: str) -> str | None:
         return None
 
 
+@functools.cache
 def _git() -> dict[str, Any] | None:
     """Commit of the checkout that the package lies in and whether it was changed; None when installed."""
 
