@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 
 import memmlp as package
 from memmlp.cli.main import COMMANDS, main
+from memmlp.cli.shipped import shipped
 from memmlp.errors import InputError, TrainingDiverged
 
 
@@ -206,3 +207,13 @@ def test_completion_in_a_real_shell(tmp_path: Path):
         ["bash", "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60
     )
     assert (ran.stdout.strip(), ran.stderr) == ("profile=tiny", "")
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_the_configs_are_found_beside_the_package_or_in_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, installed: bool
+):
+    place = tmp_path / "memmlp" / "_conf" if installed else tmp_path / "conf"
+    place.mkdir(parents=True)
+    monkeypatch.setattr(package, "__file__", str(tmp_path / "memmlp" / "__init__.py"))
+    assert shipped("conf") == place
