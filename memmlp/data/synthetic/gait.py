@@ -61,7 +61,7 @@ WALK = Gait(
 )  # fmt: skip
 RUN = Gait(
     speed=(2.0, 3.8), cadence=(1.2, 0.08), duty=0.29, ahead=0.38, turn=1.0, width=0.45,
-    sink=0.06, bounce=0.03, lift=0.21, heel=0.9, toe=0.15, push=0.2,
+    sink=0.06, bounce=0.03, lift=0.18, heel=0.85, toe=0.15, push=0.2,
     lean=0.14, yaw=0.14, swing=0.16, elbow=(0.24, 0.16), settle=0.07,
 )  # fmt: skip
 
