@@ -78,4 +78,4 @@ def test_uncertainty_settles_where_the_weight_is_one_over_the_loss():
         weighting({"rotation": torch.tensor(4.0), "position": torch.tensor(0.1)}).backward()
         optimiser.step()
     assert weighting.weights() == pytest.approx({"rotation": 1 / 4, "position": 10}, rel=1e-2)
-    assert float(weighting.s["rotation"]) == pytest.approx(math.log(4), rel=1e-2)
+    assert weighting.s["rotation"].item() == pytest.approx(math.log(4), rel=1e-2)

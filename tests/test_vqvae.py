@@ -83,9 +83,7 @@ def test_decay_and_depths_change_it():
         return book.vectors
 
     assert not torch.allclose(codes(0.5), codes(0.99))
-    sizes = {
-        sum(p.numel() for p in VQVAE(encoder_depth=e, decoder_depth=d).parameters())
-        for e, d in [(2, 1), (4, 1), (4, 2)]
-    }
+    models = [VQVAE(encoder_depth=e, decoder_depth=d) for e, d in ((2, 1), (4, 1), (4, 2))]
+    sizes = {sum(p.numel() for p in model.parameters()) for model in models}
     assert len(sizes) == 3
     assert isinstance(VQVAE(codebook="gradient").codebook, GradientCodebook)

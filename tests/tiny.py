@@ -28,7 +28,7 @@ def clip(length: int, seed: int = 0, spread: float = 0.3) -> torch.Tensor:
     rate, phase = rng.uniform(0.5, 3, (3, 22, 3)), rng.uniform(0, 2 * math.pi, (3, 22, 3))
     poses = sum(waves[i] * np.sin(2 * math.pi * rate[i] * t + phase[i]) for i in range(3))
     poses[:, 0] = np.array([math.pi / 2, 0, 0]) + 0.1 * poses[:, 0]
-    trans = np.cumsum(rng.normal(size=(length + 1, 3)) * 0.003, 0) + [0, 0, 0.95]
+    trans = np.cumsum(rng.normal(size=(length + 1, 3)) * 0.003, 0) + np.array([0, 0, 0.95])
     return motion_frames(torch.tensor(poses), torch.tensor(trans), REST).float()
 
 

@@ -1,0 +1,200 @@
+"""The training loop: learning, resuming bit for bit after a kill, stopping at NaN; checkpoints."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import tiny
+import torch
+
+from memmlp import checkpoint
+from memmlp.errors import InputError, TrainingDiverged
+from memmlp.losses import HandPosition, MotionLoss, Uncertainty
+from memmlp.rollout import OwnPredictions, PersistentStreams, TeacherForcing
+from memmlp.runs import Run
+from memmlp.training import SCHEDULES, MotionTask, Optim, VQVAETask, perplexity, train
+from memmlp.vqvae import VQVAE
+
+OPTIM = Optim(steps=12, batch=4, lr=1e-3, final_lr=1e-4, schedule="cosine", checkpoint_every=5, log_every=4)
+ROLLOUTS = {
+    "forced": TeacherForcing,
+    "own": lambda: OwnPredictions(2),
+    "streams": lambda: PersistentStreams(6),
+}
+
+
+def motion_task(rollout: str = "own", optim: Optim = OPTIM, seed: int = 0) -> MotionTask:
+    model, made = tiny.model(seed=seed), ROLLOUTS[rollout]()
+    if isinstance(made, PersistentStreams):
+        made.build(model)
+    loss = MotionLoss(Uncertainty(), HandPosition(), model.predictor.branches)
+    return MotionTask(model, loss, made, tiny.frames(), optim, seed, validate=lambda model: {"answer": 42.0})
+
+
+def vqvae_task(optim: Optim = OPTIM) -> VQVAETask:
+    torch.manual_seed(0)
+    model = VQVAE(codes=8, width=12, encoder_depth=1)
+    return VQVAETask(model, tiny.frame(), tiny.frames(), tiny.frames((30,), seed=9), optim, seed=0)
+
+
+def weights(run: Run) -> dict[str, torch.Tensor]:
+    return checkpoint.read(run.checkpoint)[0]
+
+
+class Kill(Exception):
+    """Stands for a process that ends."""
+
+
+@pytest.mark.parametrize("make", [*ROLLOUTS, "vqvae"])
+def test_a_resumed_run_is_the_same_run(make, tmp_path):
+    """Stopped at step 7 of 12, two steps after the last checkpoint, and gone on by a new process' objects."""
+
+    def task():
+        return vqvae_task() if make == "vqvae" else motion_task(make)
+
+    whole, broken = Run(tmp_path / "a"), Run(tmp_path / "b")
+    for run in (whole, broken):
+        run.folder.mkdir()
+    train(task(), OPTIM, whole, 0, "whole")
+    victim = task()
+    step = victim.step
+
+    def dying(number: int):
+        if number == 7:
+            raise Kill
+        return step(number)
+
+    victim.step = dying
+    with pytest.raises(Kill):
+        train(victim, OPTIM, broken, 0, "broken")
+    torch.rand(99)
+    train(task(), OPTIM, broken, 0, "again")
+    expected, got = weights(whole), weights(broken)
+    assert expected.keys() == got.keys()
+    assert all(torch.equal(expected[name], got[name]) for name in expected)
+    assert [m.values for m in whole.metrics()] == [m.values for m in broken.metrics()]
+
+
+def test_another_seed_is_another_run(tmp_path):
+    runs = [Run(tmp_path / str(seed)) for seed in range(2)]
+    for seed, run in enumerate(runs):
+        run.folder.mkdir()
+        train(motion_task(seed=0), OPTIM, run, seed, "seed")
+    a, b = map(weights, runs)
+    assert not torch.equal(a["module.model.stem.weight"], b["module.model.stem.weight"])
+
+
+CHILD = """
+    import sys; sys.path[:0] = [{here!r}]
+    import test_training as t
+    from dataclasses import replace
+    from pathlib import Path
+    from memmlp.runs import Run
+    run = Run(Path({folder!r})); run.folder.mkdir(exist_ok=True)
+    optim = replace(t.OPTIM, steps=400, checkpoint_every=7)
+    t.torch.set_num_threads(1)
+    t.train(t.motion_task("own", optim), optim, run, 0, "child")
+"""
+
+
+def child(folder: Path) -> subprocess.Popen:
+    code = textwrap.dedent(CHILD).format(here=str(Path(__file__).parent), folder=str(folder))
+    return subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+
+
+def test_kill_9_at_any_moment_then_again_ends_in_the_same_weights(tmp_path):
+    """Real processes, killed at three unrelated moments (a write in progress among them by chance)."""
+    assert child(tmp_path / "whole").wait() == 0
+    broken = Run(tmp_path / "broken")
+    for after in (7, 70, 140):  # kill as soon as the checkpoint has passed that step
+        process = child(broken.folder)
+        while process.poll() is None:
+            if broken.checkpoint.exists() and checkpoint.read(broken.checkpoint)[1]["step"] >= after:
+                os.kill(process.pid, signal.SIGKILL)
+                break
+            time.sleep(0.003)
+        assert process.wait() == -signal.SIGKILL
+    assert child(broken.folder).wait() == 0
+    expected, got = weights(Run(tmp_path / "whole")), weights(broken)
+    assert all(torch.equal(expected[name], got[name]) for name in expected)
+
+
+@pytest.mark.parametrize("make", [vqvae_task, motion_task])
+def test_it_learns_and_logs(make, tmp_path):
+    optim = replace(OPTIM, steps=60, lr=5e-3, final_lr=1e-3, batch=16, validate_every=30)
+    run = Run(tmp_path)
+    train(make(optim=optim), optim, run, 0, "learn")
+    log = [entry for entry in run.metrics() if entry.phase == "train"]
+    assert [entry.step for entry in log] == list(range(4, 61, 4))
+    assert log[-1].values["rotation"] < 0.8 * log[0].values["rotation"]
+    assert [entry.step for entry in run.metrics() if entry.phase == "val"] == [30, 60]
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_loss_that_is_no_number_stops_with_step_term_and_clips(bad, tmp_path):
+    task = motion_task("forced")
+    frames = task.frames.frames
+    start, length = int(task.frames.starts[1]), int(task.frames.lengths[1])
+    frames[start : start + length, 54 + 132 :] = bad
+    with pytest.raises(TrainingDiverged, match=r"step \d+, term .*position.*clip1") as stop:
+        train(task, OPTIM, Run(tmp_path), 0, "diverge")
+    assert "\n" not in str(stop.value)
+
+
+def trained(**changes) -> torch.Tensor:
+    """The stem after a few steps under changed settings."""
+    import tempfile
+
+    optim = replace(OPTIM, steps=4, **changes)
+    with tempfile.TemporaryDirectory() as folder:
+        task = motion_task("forced", optim)
+        train(task, optim, Run(Path(folder)), 0, "knob")
+        return task.model.stem.weight.detach()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"batch": 5}, {"lr": 2e-3}, {"final_lr": 5e-4}, {"schedule": "step", "drop_at": 0.5},
+        {"weight_decay": 0.5}, {"betas": (0.5, 0.9)}, {"decoupled": False, "weight_decay": 0.5},
+        {"clip_norm": 1e-9}, {"precision": "bf16"},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_every_knob_of_the_optimiser_changes_the_weights(changes):
+    assert not torch.equal(trained(**changes), trained())
+
+
+def test_schedules():
+    def rates(name: str) -> list[float]:
+        return [SCHEDULES[name](step / 10, 0.1, 0.75) for step in range(10)]
+
+    assert rates("step") == [1.0] * 8 + [0.1] * 2
+    assert rates("cosine")[0] == 1
+    assert rates("cosine") == sorted(rates("cosine"), reverse=True)
+    assert rates("milestones") == pytest.approx([1, 1, 0.2, 0.2, 0.2, 0.04, 0.04, 0.008, 0.008, 0.008])
+
+
+def test_perplexity():
+    assert perplexity(torch.ones(8)) == pytest.approx(8)
+    assert perplexity(torch.tensor([5.0, 0, 0])) == pytest.approx(1)
+
+
+def test_a_checkpoint_survives_a_torn_write_and_refuses_damage(tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    checkpoint.write(path, {"a": torch.arange(3)}, {"step": 3})
+    (tmp_path / ".checkpoint.safetensors.1.tmp").write_bytes(b"half")
+    tensors, values = checkpoint.read(path)
+    assert values == {"step": 3}
+    assert torch.equal(tensors["a"], torch.arange(3))
+    path.write_bytes(path.read_bytes()[:20])
+    with pytest.raises(InputError, match="not a checkpoint"):
+        checkpoint.read(path)
