@@ -205,6 +205,7 @@ DAMAGE = {
     "no motion": ("MOTION\n", "", "MOTION"),
     "twice a name": ("JOINT knee", "JOINT hip", "line 6"),
     "name of an end site": ("ROOT hip", "ROOT knee.end", "line 10: name 'knee.end'"),
+    "second end site": ("-41 0\n}", "-41 0\n}\nEnd Site\n{\nOFFSET 0 1 0\n}", "line 14: name 'knee.end'"),
     "no name": ("JOINT knee\n", "JOINT\n", "line 7"),
     "second root": ("}\nMOTION", "}\nROOT b\n{\nOFFSET 0 0 0\nCHANNELS 0\n}\nMOTION", "line 16"),
     "two numbers": ("OFFSET 0 -40 0", "OFFSET 0 -40", "line 9: 'CHANNELS'"),
@@ -222,6 +223,7 @@ DAMAGE = {
     "frames in words": ("Frames: 2", "Frames: two", "'two'"),
     "half a frame": ("Frames: 2", "Frames: 1.5", "'1.5'"),
     "wrong count": ("Frames: 2", "Frames: 3", "Frames: 3, but 2"),
+    "line too many": ("Frames: 2", "Frames: 1", "Frames: 1, but 2"),
     "absurd count": ("Frames: 2", "Frames: 999999999999", "line 17"),
     "zero frame time": ("0.01", "0", "line 18: Frame Time: '0'"),
     "long frame time": ("0.01", "10", "0.001 to 1 s"),
@@ -269,6 +271,11 @@ def test_bytes_that_are_no_text(tmp_path: Path) -> None:
 def test_files_that_are_none(tmp_path: Path) -> None:
     refusal(tmp_path)
     refusal(tmp_path / "missing.bvh")
+
+
+def test_files_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("memmlp.data.bvh.MAX_BYTES", len(SMALL) - 1)
+    assert "too large" in refusal(write(tmp_path, SMALL))
 
 
 def test_deep_and_wide_hierarchies(tmp_path: Path) -> None:

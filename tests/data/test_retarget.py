@@ -20,6 +20,7 @@ from memmlp.body import JOINTS, builtin_rest_joints
 from memmlp.data.bvh import Bvh, read_bvh
 from memmlp.data.clip import Clip, read_clip
 from memmlp.data.retarget import (
+    FOLLOWERS,
     LIMBS,
     SKELETONS,
     find_skeleton,
@@ -174,6 +175,7 @@ def test_a_standing_person_stands(tmp_path: Path, skeleton: str) -> None:
     rotations = np.linalg.norm(clip.poses[0], axis=-1)
     assert rotations[JOINT["pelvis"]] == pytest.approx(np.pi / 2)
     assert np.degrees(rotations[1:]).max() < 35
+    np.testing.assert_allclose(rotations[list(FOLLOWERS)], 0, atol=1e-9)  # straight wrists, level soles
 
 
 def test_left_is_left_of_facing(tmp_path: Path) -> None:
