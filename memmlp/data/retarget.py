@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.body import JOINTS, PARENTS, load_rest_joints
 from memmlp.data.bvh import Bvh, read_bvh
-from memmlp.data.clip import FRAME_RATE_RANGE, RATE_TOLERANCE, Clip, read_clip, write_clip
+from memmlp.data.clip import FRAME_RATE_RANGE, Clip, read_clip, write_clip
 from memmlp.errors import InputError
 from memmlp.geometry import axis_angle_to_matrix, forward_kinematics
 from memmlp.progress import track
@@ -86,7 +86,7 @@ def load_skeleton(which: str) -> Skeleton:
         content = yaml.load(path.read_text("utf-8"), _StrictLoader)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         brief = " ".join(str(error).split())[:120]
-        raise InputError(f"{path}: not a readable YAML map ({brief})") from error
+        raise InputError(f"{path}: {brief}; allowed: a readable YAML map") from error
     _check_map(path, content)
     return Skeleton(**content)
 
@@ -156,8 +156,7 @@ class Retargeting:
     """What is constant between one BVH hierarchy and one body, in Y-up axes and metres.
 
     Attributes:
-        nodes: the BVH node (22,) whose rotation each body joint takes.
-        mapped: whether the joint has a counterpart of its own (22,).
+        nodes: the BVH node (22,) whose rotation each body joint takes; its parent's where it has none.
         corrections: K (22, 3, 3), on the right of the node's rotation.
         own_rest: rest positions (22, 3) of the source's own bones, in the corrected joint frames.
         scale: the body's leg length over the source's.
@@ -166,7 +165,6 @@ class Retargeting:
     """
 
     nodes: np.ndarray
-    mapped: np.ndarray
     corrections: np.ndarray
     own_rest: np.ndarray
     scale: float
@@ -179,13 +177,13 @@ def fit(bvh: Bvh, skeleton: Skeleton, rest: np.ndarray) -> Retargeting:
     Raises InputError where joints are missing or stand in another order than the body's, or where the zero
     pose is no upright pose of a person with bones of some length.
     """
-    nodes, mapped = _nodes(bvh, skeleton)
+    nodes = _nodes(bvh, skeleton)
     zero = (bvh.zero_pose() @ skeleton.upright.T * skeleton.unit)[nodes]
     _check_zero_pose(bvh.path, zero, rest)
     corrections = _corrections(zero, rest)
     scale = _leg_length(rest) / _leg_length(zero)
     anchor = scale * (zero[HIPS, :].mean(0) - zero[0]) - (rest[HIPS, :].mean(0) - rest[0])
-    return Retargeting(nodes, mapped, corrections, _own_rest(zero, corrections), scale, anchor)
+    return Retargeting(nodes, corrections, _own_rest(zero, corrections), scale, anchor)
 
 
 def retarget(
@@ -213,8 +211,8 @@ def retarget(
     return Clip(name, poses, trans, fps or bvh.fps)
 
 
-def _nodes(bvh: Bvh, skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
-    """Each body joint's node (22,), its parent's where it has none, and whether it has one (22,)."""
+def _nodes(bvh: Bvh, skeleton: Skeleton) -> np.ndarray:
+    """Each body joint's node (22,), its parent's where it has none."""
     missing = sorted(set(skeleton.joints.values()) - set(bvh.nodes))
     if missing:
         lacking = f"no {', '.join(missing)}, which skeleton {skeleton.name} names"
@@ -226,7 +224,7 @@ def _nodes(bvh: Bvh, skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
         if nodes[parent] not in _line(bvh, nodes[joint]):
             wrong = f"{node} is not below {bvh.nodes[nodes[parent]]}, as skeleton {skeleton.name} has it"
             raise InputError(f"{bvh.path}: {wrong}; allowed: a map of the file's tree")
-    return nodes, np.array([joint in skeleton.joints for joint in JOINTS])
+    return nodes
 
 
 def _line(bvh: Bvh, node: int) -> list[int]:
@@ -325,7 +323,7 @@ def verify(path: Path, *, skeleton: str | None = None, body: str = "builtin", na
     root = torch.from_numpy(rest[0] + clip.trans)
     own_root = (root - local[:, 0] @ torch.from_numpy(fitted.anchor)) / fitted.scale
     own = forward_kinematics(local, own_root, torch.from_numpy(fitted.own_rest))[1].numpy()
-    distance = np.linalg.norm(own - expected, axis=-1).max(0) * fitted.mapped
+    distance = np.linalg.norm(own - expected, axis=-1).max(0)
     bodily = forward_kinematics(local, root, torch.from_numpy(rest))[1].numpy()
     start, end = list(LIMBS), list(LIMBS.values())
     angles = _angles(bodily[:, end] - bodily[:, start], expected[:, end] - expected[:, start])
@@ -505,7 +503,7 @@ def _rate(bvh: Bvh, skeleton: Skeleton, relative: Path, fps: Mapping[str, float]
             return float(fps[_key(folder)]), f"given for {_key(folder) or 'all'}"
     folder_name = bvh.path.resolve().parent.name
     known = float(skeleton.rates.get(folder_name, bvh.fps))
-    if abs(known - bvh.fps) > RATE_TOLERANCE * known:
+    if known != bvh.fps:
         return known, f"known of {folder_name} in {skeleton.name}"
     return bvh.fps, HEADER
 

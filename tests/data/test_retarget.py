@@ -135,6 +135,15 @@ def test_verify_notices_a_wrong_import(tmp_path: Path, monkeypatch: pytest.Monke
     assert verify(path).worst_degrees > 1
 
 
+def test_verify_reads_the_npz(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def shifted(path: Path, name: str) -> Clip:
+        clip = read_clip(path, name)
+        return replace(clip, trans=clip.trans + 0.01)
+
+    monkeypatch.setattr("memmlp.data.retarget.read_clip", shifted)
+    assert verify(write(tmp_path, person("cmu_daz", 10, 5).text())).worst_mm > 10
+
+
 def test_joints_without_counterpart_do_not_turn(tmp_path: Path) -> None:
     clip = retarget(read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz"), REST)
     np.testing.assert_allclose(clip.poses[:, JOINT["spine3"]], 0, atol=1e-9)
@@ -150,6 +159,9 @@ def test_another_body_keeps_limbs_too(tmp_path: Path) -> None:
     body = forward_kinematics(local, tensor[0] + torch.from_numpy(clip.trans), tensor)[1].numpy()
     positions = to_z_up(bvh.kinematics()[1])[1:]
     start, end = bvh.nodes.index("lShldr"), bvh.nodes.index("lForeArm")
+    hips = [bvh.nodes.index("lThigh"), bvh.nodes.index("rThigh")]
+    middle = positions[:, hips].mean(1) * chosen.unit * fit(bvh, chosen, rest).scale
+    np.testing.assert_allclose(body[:, [1, 2]].mean(1), middle, atol=1e-9)
     arm = body[:, JOINT["left_elbow"]] - body[:, JOINT["left_shoulder"]]
     np.testing.assert_allclose(unit(arm), unit(positions[:, end] - positions[:, start]), atol=1e-9)
 
@@ -258,6 +270,12 @@ def test_shipped_maps() -> None:
 
 
 @pytest.mark.parametrize("skeleton", TREES)
+def test_units_give_people(tmp_path: Path, skeleton: str) -> None:
+    own = fit(read(tmp_path, skeleton), load_skeleton(skeleton), REST).own_rest
+    assert 0.75 < sum(np.linalg.norm(own[child] - own[joint]) for joint, child in ((1, 4), (4, 7))) < 0.9
+
+
+@pytest.mark.parametrize("skeleton", TREES)
 def test_the_joints_choose_the_map(tmp_path: Path, skeleton: str) -> None:
     bvh = read(tmp_path, skeleton)
     assert find_skeleton(bvh).name == skeleton
@@ -355,6 +373,12 @@ def test_wrong_maps_are_refused(tmp_path: Path, changes: dict[str, object], said
 def test_maps_that_are_none_are_refused(tmp_path: Path, text: str) -> None:
     path = write(tmp_path, text, "mine.yaml")
     with pytest.raises(InputError, match=r"\A[^\n]*mine\.yaml[^\n]*\Z"):
+        load_skeleton(str(path))
+
+
+def test_a_key_that_stands_twice_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, user_map(tmp_path).read_text() + "\nunit: 0.02\n", "mine.yaml")
+    with refuse(path, "'unit' stands twice"):
         load_skeleton(str(path))
 
 
@@ -466,7 +490,9 @@ def test_known_rate_holds_for_the_folder_or_file_itself(source: Path, tmp_path: 
 
 def test_a_header_that_is_right_is_not_corrected(source: Path, tmp_path: Path) -> None:
     write(source, person("cmu_daz", 3, 0).text(dt="0.0166667"), "salsa/01.bvh")
-    assert import_folder(source / "salsa/01.bvh", tmp_path / "out").notes == ()
+    report = import_folder(source / "salsa/01.bvh", tmp_path / "out")
+    assert (report.clips[0].fps, report.clips[0].fps_reason) == (60, "the header's")
+    assert report.notes == ()
 
 
 def test_bad_files_are_skipped(source: Path, tmp_path: Path) -> None:
