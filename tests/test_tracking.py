@@ -6,6 +6,7 @@ import math
 import os
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,9 @@ def projected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     outputs = tmp_path_factory.mktemp("outputs")
     tracker, run = MLflowTracker(None, outputs), a_run(outputs)
     tracker.project(run)
+    run.begin("memmlp", CONFIG | {"seed": 0.5}, data="d", upstream="u")  # resumed with other settings
+    time.sleep(0.01)
+    run.log(5, {"loss": 1 / 5})  # repeated
     run.log(6, {"loss": 0.1, "new": 1.0})
     tracker.project(run)
     run.finish(["results.json"])
@@ -107,12 +111,23 @@ def test_a_run_done_again_replaces_the_old_one(projected: Path):
     client.delete_run(found.info.run_id)
 
 
-def test_many_metrics_go_in_batches(projected: Path):
+def test_many_metrics_go_in_batches(projected: Path, monkeypatch: pytest.MonkeyPatch):
+    from mlflow import MlflowClient
+
+    sizes: list[tuple[int, int]] = []
+    log_batch = MlflowClient.log_batch
+
+    def spy(client: Any, run_id: str, metrics: Any = (), params: Any = ()) -> None:
+        sizes.append((len(metrics), len(params)))
+        log_batch(client, run_id, metrics=metrics, params=params)
+
+    monkeypatch.setattr(MlflowClient, "log_batch", spy)
     run = Run.of(projected, "2" * 16)
     run.begin("memmlp", {f"key{i}": i for i in range(250)}, data="d", upstream=None)
     for step in range(600):
         run.log(step, {"a": 1.0, "b": 2.0})
     MLflowTracker(None, projected).project(run)
+    assert sizes == [(0, 100), (0, 100), (0, 50), (1000, 0), (200, 0)]
     (found,) = [r for r in shown(projected) if r.data.tags["memmlp.run_id"] == run.id]
     client = client_of(projected)
     assert len(client.get_metric_history(found.info.run_id, "train/b")) == 600

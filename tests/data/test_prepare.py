@@ -131,7 +131,7 @@ def test_the_manifest_has_no_absolute_path(root, tmp_path):
 def test_nothing_to_prepare_is_one_line(tmp_path):
     (tmp_path / "empty").mkdir()
     for where in ("none", "empty"):
-        with pytest.raises(InputError, match="data.root"):
+        with pytest.raises(InputError, match=r"data\.root"):
             prepare(source(tmp_path / where), tmp_path / "cache")
 
 

@@ -1,0 +1,175 @@
+"""The whole way at profile=tiny, by the commands a person would type."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+import yaml
+from PIL import Image
+
+from memmlp import pipeline
+from memmlp.cli.build import build_experiment
+from memmlp.cli.train import composed
+from memmlp.data.dataset import Frames
+from memmlp.pipeline import MOTION_ARTIFACTS
+from memmlp.runs import Run, list_runs
+
+TINY = ["profile=tiny", "data.synth.minutes=0.8", "tracker=none", "threads=1"]
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory) -> Path:
+    """A folder with one finished run and what it printed."""
+    folder = tmp_path_factory.mktemp("home")
+    (folder / "out.txt").write_text(command(folder, "train", *TINY))
+    return folder
+
+
+def command(folder: Path, *arguments: str, code: int = 0) -> str:
+    line = [sys.executable, "-c", "from memmlp.cli.main import main; main()", *arguments]
+    ran = subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False)
+    assert ran.returncode == code, ran.stdout + ran.stderr
+    return ran.stdout + ran.stderr
+
+
+def motion_run(folder: Path) -> Run:
+    return next(run for run in list_runs(folder / "outputs") if run.manifest["kind"] == "memmlp")
+
+
+def test_a_run_leaves_everything(home):
+    run = motion_run(home)
+    assert run.done
+    assert run.verify() == []
+    for name in (
+        *MOTION_ARTIFACTS,
+        "config.yaml",
+        "manifest.json",
+        "metrics.jsonl",
+        "checkpoint.safetensors",
+    ):
+        assert (run.folder / name).stat().st_size > 0
+    assert set(run.results) == {"window", "stream", "latency"}
+    assert run.results["stream"]["rotation"]["MPJPE"] > 0
+    assert run.results["latency"]["steps"] >= 200
+    assert run.manifest["onnx_parity"] < 1e-4
+    upstream = Run.of(home / "outputs", run.manifest["upstream"])
+    assert upstream.done
+    assert upstream.manifest["kind"] == "vqvae"
+    with Image.open(run.folder / "poses.png") as picture:
+        assert picture.size[0] > 600
+        assert len(picture.convert("RGB").getcolors(10**6)) > 50
+    graph = onnx.load(run.onnx)
+    assert {p.key: p.value for p in graph.metadata_props}["run_id"] == run.id
+    out = (home / "out.txt").read_text()
+    assert "MPJPE" in out
+    assert str(run.folder.relative_to(home)) in out
+
+
+def test_the_same_command_finds_the_run_and_others_share_the_vqvae(home):
+    before = {run.id: run.marker.stat().st_mtime_ns for run in list_runs(home / "outputs")}
+    assert "finished already" in command(home, "train", *TINY)
+    assert {run.id: run.marker.stat().st_mtime_ns for run in list_runs(home / "outputs")} == before
+    command(home, "train", *TINY, "seed=1", "evaluation.modes=[stream]")
+    kinds = [run.manifest["kind"] for run in list_runs(home / "outputs")]
+    assert sorted(kinds) == ["memmlp", "memmlp", "vqvae"]
+
+
+def test_eval_repeats_the_runs_numbers_and_saves_predictions(home):
+    run = motion_run(home)
+    first = next(r for r in list_runs(home / "outputs") if "window" in r.results)
+    command(home, "eval", first.id[:6], "--save-predictions", "predictions", "--json", "again.json")
+    again = json.loads((home / "again.json").read_text())
+    for branch, values in again["mean"]["stream"].items():
+        assert values == pytest.approx(first.results["stream"][branch], rel=1e-4)
+    row = again["clips"][0]
+    arrays = np.load(home / "predictions" / "stream" / f"{row['name']}.npz", allow_pickle=False)
+    assert arrays["predicted_positions"].shape == (row["frames"], 22, 3)
+    assert arrays["predicted_rotations"].shape == (row["frames"], 22, 3, 3)
+    error = 100 * np.linalg.norm(arrays["predicted_positions"] - arrays["true_positions"], axis=-1).mean()
+    assert error == pytest.approx(row["stream"]["rotation"]["MPJPE"], rel=1e-4)
+    head = arrays["predicted_positions"][:, 15] - arrays["true_positions"][:, 15]
+    assert np.abs(head).max() < 1e-5
+    assert run.done
+
+
+def test_export_again_and_bad_names(home):
+    run = motion_run(home)
+    assert "differs from torch" in command(home, "export", run.id, "--out", "again.onnx")
+    onnx.checker.check_model(onnx.load(home / "again.onnx"))
+    assert "run 'zzz'" in command(home, "eval", "zzz", code=2)
+    assert "--out" in command(home, "export", run.id, "--out", "no/where.onnx", code=2)
+    vqvae = run.manifest["upstream"]
+    assert "not a finished Mem-MLP run" in command(home, "eval", vqvae, code=2)
+
+
+def test_foreign_targets_in_a_runs_config_are_refused(home, tmp_path):
+    run = motion_run(home)
+    copy = tmp_path / run.id
+    copy.mkdir()
+    for name in ("manifest.json", "DONE"):
+        (copy / name).write_bytes((run.folder / name).read_bytes())
+    config = run.config
+    config["memory"]["_target_"] = "os.system"
+    (copy / "config.yaml").write_text(yaml.safe_dump(config))
+    assert "os.system" in command(home, "eval", str(copy), code=2)
+
+
+def test_kill_9_in_the_pipeline_then_again_gives_the_same_model(home, tmp_path):
+    """The whole command killed at four unrelated moments, from data to export, and then let finish."""
+    line = [sys.executable, "-c", "from memmlp.cli.main import main; main()", "train", *TINY]
+    for seconds in (3.0, 5.0, 6.5, 8.0):
+        process = subprocess.Popen(line, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(seconds)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    command(tmp_path, "train", *TINY)
+    whole = next(run for run in list_runs(home / "outputs") if "window" in run.results)
+    killed = Run.of(tmp_path / "outputs", whole.id)
+    assert killed.done
+    assert killed.model.read_bytes() == whole.model.read_bytes()
+    rotation = killed.results["stream"]["rotation"]
+    assert rotation == pytest.approx(whole.results["stream"]["rotation"], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        [],
+        ["memory=none"],
+        ["memory=no_codes"],
+        ["predictor=rotation_only", "hand=fk"],
+        ["rollout=own_predictions"],
+        ["rollout=streams"],
+        ["loss=manual"],
+        ["hand=off"],
+        ["frame.coordinates=world", "frame.normalize=false"],
+        ["vqvae.codebook=gradient"],
+        ["memory.shift=frame", "memory.history=latest", "memory.fusion=plain"],
+        ["experiment=paper", "profile=tiny"],
+    ],
+    ids=" ".join,
+)
+def test_every_option_trains_and_streams(home, overrides):
+    """Two steps and one validation of each, on the prepared data, without export."""
+    os.chdir(home)
+    cfg = composed([*TINY, "optim.steps=2", "vqvae.steps=2", *overrides])
+    experiment = build_experiment(cfg)
+    cache, manifest = experiment.data.prepare()
+    upstream = None
+    if experiment.architecture.uses_codes:
+        upstream = pipeline.vqvae_run(experiment, cache, manifest)
+    run = Run(home / "variants" / "-".join(overrides).replace("/", "_"))
+    run.folder.mkdir(parents=True, exist_ok=True)
+    model = pipeline.trained(experiment, run, cache, manifest, upstream)
+    values = run.metrics()[-1].values
+    assert all(np.isfinite(value) for value in values.values())
+    assert len(Frames.open(cache, "test").names) > 0
+    assert torch.isfinite(model.stem.weight).all()
