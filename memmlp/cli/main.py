@@ -89,11 +89,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         if code is None or os.environ.get("MEMMLP_TRACEBACK") == "1":
             raise
         _fail(_line(error), code)
-    except KeyboardInterrupt:
-        _fail(INTERRUPTED, 130)
-
-
-INTERRUPTED = "interrupted; the same command goes on where it was left"
 
 
 def _run(arguments: list[str]) -> None:
@@ -105,7 +100,7 @@ def _run(arguments: list[str]) -> None:
 
 def _exit_code(error: Exception) -> int | None:
     """The exit code of an error that a line explains; None for a bug."""
-    if isinstance(error, click.Abort):
+    if isinstance(error, click.Abort):  # what click makes of Ctrl-C
         return 130
     if isinstance(error, click.ClickException):
         return error.exit_code
@@ -115,7 +110,7 @@ def _exit_code(error: Exception) -> int | None:
 def _line(error: Exception) -> str:
     """The error in one line."""
     if isinstance(error, click.Abort):
-        return INTERRUPTED
+        return "interrupted; the same command goes on where it was left"
     if isinstance(error, click.UsageError):
         path = error.ctx.command_path if error.ctx else "memmlp"
         return f"{error.format_message()} (see {path} --help)"
