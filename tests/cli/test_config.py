@@ -66,7 +66,7 @@ def test_the_most_literal_reading():
     cfg = composed(["experiment=paper"])
     assert (cfg.model.width, cfg.model.depth, cfg.model.frames) == (512, 8, 41)
     assert (cfg.frame.coordinates, cfg.frame.normalize) == ("world", False)
-    assert (cfg.memory.shift, cfg.memory.history, cfg.memory.fusion) == ("frame", "latest", "plain")
+    assert (cfg.memory.shift, cfg.memory.history, cfg.memory.fusion) == ("frame", "latest", "residual")
     assert cfg.rollout._target_.endswith("TeacherForcing")
     assert (cfg.optim.steps, cfg.optim.batch, cfg.optim.drop_at) == (300_000, 256, 0.75)
 
