@@ -31,7 +31,7 @@ def poses_png(path: Path, truth: np.ndarray, predicted: np.ndarray, title: str) 
     error = 100 * np.linalg.norm(predicted - truth, axis=-1)
     shown = np.linspace(0, len(truth) - 1, POSES + 2).astype(int)[1:-1]
     colours = Normalize(0, max(MIN_SCALE, float(np.percentile(error, 98))))
-    figure = Figure(figsize=(2.1 * POSES, 7.2), layout="constrained")
+    figure = Figure(figsize=(2.1 * POSES, 5.4), layout="constrained")
     axes = figure.subplots(2, POSES, sharey=True)
     for column, frame in enumerate(shown):
         view = facing(truth[frame])

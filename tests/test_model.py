@@ -109,6 +109,11 @@ def test_the_stream_is_causal_and_remembers():
         assert torch.equal(before[late][:, -1], after[late][:, -1]) != remembers
 
 
+def _name(value: object) -> str:
+    """A value without its address."""
+    return str(value).split(" object at ")[0]
+
+
 def variant(**changes) -> torch.Tensor:
     return run(tiny.model(**changes), SPARSE)[-1]
 
@@ -130,7 +135,7 @@ def variant(**changes) -> torch.Tensor:
         {"coordinates": World()},
         {"coordinates": Heading()},
     ],
-    ids=str,
+    ids=lambda changes: " ".join(f"{key}={_name(value)}" for key, value in changes.items()),
 )
 @torch.no_grad()
 def test_every_switch_changes_the_output(changes):
