@@ -83,6 +83,23 @@ def test_memory_sees_the_shifted_past(shift):
     )
 
 
+@pytest.mark.parametrize("shift", ["frame", "window"])
+@torch.no_grad()
+def test_in_window_mode_the_past_is_the_window_before(shift):
+    """Inputs and output of the call before, whatever the shift."""
+    model = tiny.model(CodeMemory, shift=shift)
+    seen = []
+    model.blocks[1].register_forward_hook(lambda module, args, output: seen.append(args[1]))
+    size, sparse = model.frames, SPARSE[:, : 3 * model.frames]
+    outputs = run(model, sparse, new=size)
+    place = model.frame.place(sparse)[:, size : 2 * size]
+    before = model.frame.encode_sparse(sparse[:, size : 2 * size], place)
+    torch.testing.assert_close(seen[2].sparse, before)
+    torch.testing.assert_close(
+        seen[2].motion, model.frame.encode_motion(outputs[1], place), atol=1e-5, rtol=0
+    )
+
+
 @torch.no_grad()
 def test_latest_history_is_the_last_output():
     model = tiny.model(CodeMemory, shift="frame", history="latest")
