@@ -168,6 +168,7 @@ class MotionTask:
         self.model, self.loss, self.rollout, self.frames = model, loss, rollout, frames
         self.module: nn.Module = nn.ModuleDict({"model": model, "loss": loss, "rollout": rollout})
         self.sampler = WindowSampler(frames, batch=optim.batch, window=model.frames, seed=seed)
+        self.advance = torch.compile(model.advance) if optim.compile else model.advance
         self._validate = validate
 
     def parameter_groups(self) -> list[dict]:
@@ -178,7 +179,7 @@ class MotionTask:
     def step(self, step: int) -> StepResult:
         """The loss of one training call."""
         call = self.rollout.draw(self.model, self.frames, self.sampler, step)
-        motion, state = self.model.advance(call.sparse, call.state)
+        motion, state = self.advance(call.sparse, call.state)
         self.rollout.keep(state)
         sparse, truth = call.truth[..., :SPARSE_DIM], call.truth[..., SPARSE_DIM:]
         loss, terms = self.loss(motion, truth, sparse, self.model.frame)

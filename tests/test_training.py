@@ -173,6 +173,22 @@ def test_every_knob_of_the_optimiser_changes_the_weights(changes):
     assert not torch.equal(trained(**changes), trained())
 
 
+def test_compile_compiles_the_training_call(monkeypatch, tmp_path):
+    """With a stand-in for the compiler, which takes a minute: the compiled call is the one that is trained."""
+    calls = []
+
+    def compiler(function):
+        return lambda *args: (calls.append(1), function(*args))[1]
+
+    monkeypatch.setattr(torch, "compile", compiler)
+    for compiled, expected in ((False, 0), (True, 3)):
+        optim = replace(OPTIM, steps=3, compile=compiled)
+        run = Run(tmp_path / str(compiled))
+        run.folder.mkdir()
+        train(motion_task("forced", optim), optim, run, 0, "compile")
+        assert len(calls) == expected
+
+
 def test_schedules():
     def rates(name: str) -> list[float]:
         return [SCHEDULES[name](step / 10, 0.1, 0.75) for step in range(10)]
