@@ -174,7 +174,7 @@ def test_every_knob_of_the_optimiser_changes_the_weights(changes):
 
 
 def test_compile_compiles_the_training_call(monkeypatch, tmp_path):
-    """With a stand-in for the compiler, which takes a minute: the compiled call is the one that is trained."""
+    """With a stand-in for the slow compiler: the compiled call is the one that is trained."""
     calls = []
 
     def compiler(function):
