@@ -31,8 +31,8 @@ class Network(Protocol):
     def initial_state(self, batch: int = 1) -> State:
         """A fresh start."""
 
-    def advance(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
-        """New inputs (B, n, 54) -> motion (B, T, 198) in the world, and the new state."""
+    def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
+        """New inputs (B, n, 54) -> motion (B, newest or T, 198) in the world, and the new state."""
 
 
 @torch.no_grad()
@@ -48,7 +48,7 @@ def stream(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
         while lengths[active - 1] <= t:  # the clips are sorted: those that ended are the last ones
             active -= 1
             state = {name: tensor[:active] for name, tensor in state.items()}
-        output, state = network.advance(inputs[:active, t : t + 1], state)
+        output, state = network.advance(inputs[:active, t : t + 1], state, 1)
         motion[:active, t] = output[:, -1]
     return [motion[order.index(i), : len(clip)] for i, clip in enumerate(clips)]
 

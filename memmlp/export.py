@@ -40,7 +40,7 @@ class StreamStep(nn.Module):
 
     def forward(self, sparse: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         """sparse (1, 54) and the state -> rotation6d (1, 22, 6), position (1, 22, 3), the new state."""
-        motion, new = self.model.advance(sparse[:, None], dict(zip(self.names, state, strict=True)))
+        motion, new = self.model.advance(sparse[:, None], dict(zip(self.names, state, strict=True)), 1)
         last = motion[:, -1]
         rotation = last[:, ROTATION].unflatten(-1, (N_JOINTS, 6))
         position = last[:, POSITION].unflatten(-1, (N_JOINTS, 3))

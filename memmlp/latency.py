@@ -67,7 +67,7 @@ def size(model: MemMLP, path: Path) -> dict[str, Any]:
 def macs(model: MemMLP) -> int:
     """Multiply-adds of the matrix products of one streaming step."""
     with FlopCounterMode(display=False) as counter:
-        model.advance(torch.zeros(1, 1, SPARSE_DIM), model.initial_state(1))
+        model.advance(torch.zeros(1, 1, SPARSE_DIM), model.initial_state(1), 1)
     return counter.get_total_flops() // 2
 
 

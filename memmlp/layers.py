@@ -19,9 +19,9 @@ class TimeMix(nn.Module):
         self.bias = nn.Parameter(torch.zeros(frames, 1))
         nn.init.uniform_(self.weight, -(frames**-0.5), frames**-0.5)
 
-    def forward(self, h: Tensor) -> Tensor:
-        """(B, T, d) -> (B, T, d)."""
-        return self.weight @ h + self.bias
+    def forward(self, h: Tensor, newest: int = 0) -> Tensor:
+        """(B, T, d) -> (B, T, d), or of the `newest` frames alone."""
+        return self.weight[-newest:] @ h + self.bias[-newest:]
 
 
 class MLPBlock(nn.Module):
@@ -36,7 +36,11 @@ class MLPBlock(nn.Module):
 
     def forward(self, h: Tensor, past: object = None) -> Tensor:
         """(B, T, d) -> (B, T, d); the past is not looked at."""
-        h = h + F.silu(self.time_mix(self.time_norm(h)))
+        return self.newest(h, h.shape[1])
+
+    def newest(self, h: Tensor, count: int) -> Tensor:
+        """(B, T, d) -> the newest frames (B, count, d) of the same, without the work for the others."""
+        h = h[:, -count:] + F.silu(self.time_mix(self.time_norm(h), count))
         return h + F.silu(self.linear(self.norm(h)))
 
 

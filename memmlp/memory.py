@@ -129,6 +129,10 @@ class NoMemory(nn.Module):
         """Nothing is kept."""
         return {}
 
+    def needed(self, new: int) -> int:
+        """Of the output, nothing is needed."""
+        return 0
+
     def recall(self, sparse: Tensor, state: State, new: int) -> None:
         """Nothing is recalled."""
 
@@ -192,6 +196,10 @@ class NoCodesMemory(nn.Module):
         """The state with the true motion (B, length, 198) as history: teacher forcing."""
         return {"motion": motion}
 
+    def needed(self, new: int) -> int:
+        """How many of the output's newest frames `remember` looks at."""
+        return self.frames if self.history == "latest" else new
+
     def recall(self, sparse: Tensor, state: State, new: int) -> Past:
         """What the blocks see when `new` frames follow buffered inputs (B, length, 54)."""
         start = min(new, self.shift) - 1
@@ -204,7 +212,7 @@ class NoCodesMemory(nn.Module):
         return sparse[..., :0]
 
     def remember(self, motion: Tensor, state: State, new: int) -> State:
-        """The state after an output (B, T, 198) whose last `new` frames are new."""
+        """The state after an output (B, at least `needed`, 198) whose last `new` frames are new."""
         buffer = torch.cat([state["motion"], motion[:, -new:]], 1)[:, -self.length :]
         if self.history == "latest":
             buffer = torch.cat([buffer[:, : self.length - self.frames], motion], 1)

@@ -56,15 +56,16 @@ class MemMLP(nn.Module):
         motion = self.frame.encode(frames)[..., SPARSE_DIM:]
         return self.running_state(sparse) | self.memory.true_state(motion)
 
-    def advance(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
+    def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Take the newest frames in.
 
         Args:
             sparse: world inputs (B, n, 54) of the n newest frames: 1 for a live stream, T for windows.
             state: what the last call returned, or `initial_state`.
+            newest: how many of the newest frames are wanted, all T by default; the others cost no work.
 
         Returns:
-            Motion (B, T, 198) in the world of the window that ends with the newest frame, and the new state.
+            Motion (B, newest, 198) in the world of the window that ends with the newest frame, and the state.
         """
         new = sparse.shape[1]
         before = torch.where(state["started"][..., None] > 0, state["sparse"], sparse[:, :1])
@@ -75,10 +76,12 @@ class MemMLP(nn.Module):
         h = self.stem(encoded[:, -self.frames :])
         for block in self.blocks:
             h = block(h, past)
-        motion = self.predictor(h, inputs[:, -self.frames :], self.frame)
+        wanted = self.frames if newest is None else newest
+        made = max(wanted, self.memory.needed(new))
+        motion = self.predictor(h, inputs[:, -self.frames :], self.frame, made)
         kept = {"sparse": inputs[:, -self.memory.length :], "started": state["started"].clamp_min(1)}
         kept |= self.memory.remember(motion, state, new)
-        return self.frame.decode_motion(motion, place[:, -self.frames :]), kept
+        return self.frame.decode_motion(motion[:, -wanted:], place[:, -wanted:]), kept
 
     def count_parameters(self) -> int:
         """Trainable parameters (the frozen VQ-VAE apart), the number that the tables call #Params."""

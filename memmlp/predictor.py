@@ -13,9 +13,22 @@ from memmlp.features import Frame
 from memmlp.layers import MLPBlock
 
 
-def branch(hidden: int, frames: int, depth: int, size: int) -> nn.Sequential:
+class Branch(nn.Module):
     """`depth` MLP blocks and one linear layer."""
-    return nn.Sequential(*(MLPBlock(hidden, frames) for _ in range(depth)), nn.Linear(hidden, size))
+
+    def __init__(self, hidden: int, frames: int, depth: int, size: int):
+        super().__init__()
+        self.blocks = nn.ModuleList(MLPBlock(hidden, frames) for _ in range(depth))
+        self.linear = nn.Linear(hidden, size)
+
+    def forward(self, h: Tensor, newest: int) -> Tensor:
+        """Hidden state (B, T, d) -> the newest frames (B, newest, size)."""
+        for block in self.blocks[:-1]:
+            h = block(h)
+        for block in self.blocks[-1:]:
+            assert isinstance(block, MLPBlock)
+            h = block.newest(h, newest)
+        return self.linear(h[:, -newest:])
 
 
 class TwoBranch(nn.Module):
@@ -29,12 +42,12 @@ class TwoBranch(nn.Module):
 
     def __init__(self, depth: int, *, hidden: int, frames: int):
         super().__init__()
-        self.rotation = branch(hidden, frames, depth, ROTATION.stop)
-        self.position = branch(hidden, frames, depth, MOTION_DIM - ROTATION.stop)
+        self.rotation = Branch(hidden, frames, depth, ROTATION.stop)
+        self.position = Branch(hidden, frames, depth, MOTION_DIM - ROTATION.stop)
 
-    def forward(self, h: Tensor, sparse: Tensor, frame: Frame) -> Tensor:
-        """Hidden state (B, T, d) -> motion (B, T, 198) in network space."""
-        return torch.cat([self.rotation(h), self.position(h)], -1)
+    def forward(self, h: Tensor, sparse: Tensor, frame: Frame, newest: int) -> Tensor:
+        """Hidden state (B, T, d) -> motion of the newest frames (B, newest, 198) in network space."""
+        return torch.cat([self.rotation(h, newest), self.position(h, newest)], -1)
 
 
 class RotationOnly(nn.Module):
@@ -44,11 +57,11 @@ class RotationOnly(nn.Module):
 
     def __init__(self, depth: int, *, hidden: int, frames: int):
         super().__init__()
-        self.rotation = branch(hidden, frames, depth, ROTATION.stop)
+        self.rotation = Branch(hidden, frames, depth, ROTATION.stop)
 
-    def forward(self, h: Tensor, sparse: Tensor, frame: Frame) -> Tensor:
-        """Hidden state (B, T, d) and world inputs (B, T, 54) -> motion (B, T, 198) in network space."""
-        rotation = self.rotation(h)
+    def forward(self, h: Tensor, sparse: Tensor, frame: Frame, newest: int) -> Tensor:
+        """Hidden state (B, T, d), world inputs (B, T, 54) -> motion (B, newest, 198) in network space."""
+        rotation, sparse = self.rotation(h, newest), sparse[:, -newest:]
         with torch.no_grad():
             place = frame.place(sparse)
             world = frame.decode_motion(F.pad(rotation, (0, MOTION_DIM - ROTATION.stop)), place)

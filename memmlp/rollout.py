@@ -66,7 +66,7 @@ class OwnPredictions(nn.Module):
         with torch.no_grad():
             for done in range(passes):
                 start = past + done * stride
-                _, state = model.advance(sparse[:, start : start + stride], state)
+                _, state = model.advance(sparse[:, start : start + stride], state, stride)
         model.train()
         return Call(sparse[:, -stride:], state, segment[:, -model.frames :], clips)
 

@@ -72,7 +72,7 @@ class Copy:
     def initial_state(self, batch=1):
         return {"motion": torch.zeros(batch, self.frames, MOTION_DIM)}
 
-    def advance(self, sparse, state):
+    def advance(self, sparse, state, newest=None):
         new = torch.stack(
             [torch.stack([self.table[tuple(x.tolist())] for x in row]) for row in sparse]
         ).clone()
@@ -84,7 +84,7 @@ class Copy:
 class Still(Copy):
     """Always the first pose of its first clip."""
 
-    def advance(self, sparse, state):
+    def advance(self, sparse, state, newest=None):
         pose = next(iter(self.table.values()))
         return pose.expand(len(sparse), self.frames, -1), state
 
@@ -132,7 +132,7 @@ def test_windows_do_not_overlap_and_the_tail_is_shifted_back():
     class Counter(Copy):
         calls = 0
 
-        def advance(self, sparse, state):
+        def advance(self, sparse, state, newest=None):
             self.calls += 1
             return torch.full((len(sparse), self.frames, MOTION_DIM), float(self.calls)), state
 

@@ -189,6 +189,19 @@ def test_rotation_only_positions_are_forward_kinematics():
     assert motion.shape[-1] == MOTION_DIM
 
 
+@pytest.mark.parametrize("predictor", [TwoBranch, RotationOnly])
+@pytest.mark.parametrize(("kind", "changes"), MEMORIES)
+@torch.no_grad()
+def test_the_newest_frames_alone_are_the_same_numbers(kind, changes, predictor):
+    model = tiny.model(kind, predictor, **changes)
+    whole = part = model.initial_state(1)
+    for sparse in SPARSE.split(1, 1):
+        all_frames, whole = model.advance(sparse, whole)
+        newest, part = model.advance(sparse, part, 2)
+        torch.testing.assert_close(newest, all_frames[:, -2:], atol=1e-5, rtol=0)
+    torch.testing.assert_close(part, whole, atol=1e-5, rtol=0)
+
+
 def test_time_mix_is_a_convolution_over_frames():
     """The T x T product equals AGRoL's Conv1d T -> T with kernel 1."""
     from memmlp.layers import TimeMix
