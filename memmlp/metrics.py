@@ -13,10 +13,6 @@ from torch import Tensor
 from memmlp.body import FPS, HANDS, LOWER, ROOT, UPPER
 from memmlp.geometry import geodesic_angle, matrix_to_axis_angle
 
-UNITS = {
-    "MPJRE": "deg", "geodesic": "deg", "MPJPE": "cm", "Hand PE": "cm", "Upper PE": "cm", "Lower PE": "cm",
-    "Root PE": "cm", "MPJVE": "cm/s", "Jitter": "10^2 m/s^3", "GT Jitter": "10^2 m/s^3",
-}  # fmt: skip
 POSITION_GROUPS = {"Hand PE": HANDS, "Upper PE": UPPER, "Lower PE": LOWER, "Root PE": (ROOT,)}
 
 

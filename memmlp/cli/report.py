@@ -7,7 +7,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from memmlp.metrics import UNITS
+from memmlp.units import UNITS
 from memmlp.pipeline import Outcome
 
 COLUMNS = [("stream", "rotation"), ("stream", "position"), ("window", "rotation"), ("window", "position")]

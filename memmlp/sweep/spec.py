@@ -1,0 +1,266 @@
+"""Sweep files: arms (a label and the smallest difference to the base), seeds, and the paper's values.
+
+    title: Placement of memory blocks in the backbone
+    table: 14                          # of the paper; left out in sweeps of your own
+    base: [experiment=paper]           # overrides that all arms share
+    seeds: [0, 1, 2]
+    reference: 2, 4, 6, 8              # the arm that the others are compared with; the first one by default
+    metrics: [MPJRE, MPJPE, MPJVE, Jitter]
+    arms:
+      2, 4, 6, 8: {overrides: [], paper: {MPJRE: 2.57}}
+      "2": {overrides: ['memory.layers=[2]'], paper: {MPJRE: 2.63}, note: as printed}
+    axes: {model.frames: [11, 21], seed: [0, 1, 2]}      # a grid, instead of arms or over each of them
+"""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from memmlp.errors import InputError
+from memmlp.units import UNITS
+
+BRANCHES = ("rotation", "position", "combined")
+KEYS = ("title", "table", "notes", "base", "seeds", "reference", "metrics", "arms", "axes")
+ARM_KEYS = ("overrides", "branch", "paper", "note")
+COSTS = ("FLOPs", "parameters", "size", "ms", "FPS")
+"""Columns of the paper's tables that are no errors: GFLOP, millions, MB, ms, frames a second."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A row of a table.
+
+    Attributes:
+        label: its name in the table.
+        overrides: its difference to the base; None where the row is the paper's alone (a system not built).
+        branch: whose errors the row shows: rotation, position, or combined (after inverse kinematics).
+        paper: the paper's values by metric, as printed.
+        note: a word of warning shown under the table.
+    """
+
+    label: str
+    overrides: tuple[str, ...] | None = ()
+    branch: str = "rotation"
+    paper: Mapping[str, float] | None = None
+    note: str | None = None
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training: an arm with a seed, as overrides of `memmlp train`."""
+
+    label: str
+    seed: int
+    overrides: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A sweep file, or one with overrides added on the command line.
+
+    Attributes:
+        name: the file's stem. title, notes: for the table. table: its number in the paper.
+        base: overrides of all arms. seeds: of each arm.
+        arms: the rows in order. reference: the label that the others are compared with.
+        metrics: the columns.
+    """
+
+    name: str
+    title: str
+    table: int | None
+    notes: tuple[str, ...]
+    base: tuple[str, ...]
+    seeds: tuple[int, ...]
+    arms: tuple[Arm, ...]
+    reference: str
+    metrics: tuple[str, ...]
+
+    def with_overrides(self, overrides: Sequence[str]) -> Sweep:
+        """The same sweep, further overrides standing after its base and before its arms' differences.
+
+        `seed=0,1` or `seed=0` sets the seeds.
+        """
+        seeds = [word.partition("=")[2] for word in overrides if word.startswith("seed=")]
+        others = tuple(word for word in overrides if not word.startswith("seed="))
+        chosen = _seeds(seeds[-1].split(","), "seed") if seeds else self.seeds
+        return replace(self, base=(*self.base, *others), seeds=chosen)
+
+    def jobs(self) -> list[Job]:
+        """What has to be run, arm by arm."""
+        return [
+            Job(arm.label, seed, (*self.base, *arm.overrides, f"seed={seed}"))
+            for arm in self.arms
+            if arm.overrides is not None
+            for seed in self.seeds
+        ]
+
+
+def load_sweep(path: Path) -> Sweep:
+    """Read a sweep file. Raises InputError, naming file and key."""
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+    try:
+        return parse_sweep(path.stem, content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def parse_sweep(name: str, content: Any) -> Sweep:
+    """The sweep of a file's content. Raises InputError, naming the key."""
+    content = _mapping(content, "the file", KEYS)
+    arms = [_arm(label, value) for label, value in _labelled(content.get("arms", {})).items()]
+    axes = dict(_mapping(content.get("axes", {}), "axes"))
+    seeds = _seeds(axes.pop("seed", content.get("seeds", [0])), "seeds")
+    arms = list(_grid(arms, axes)) if axes else arms
+    runnable = [arm.label for arm in arms if arm.overrides is not None]
+    if not runnable:
+        raise InputError("arms: none to run; allowed is at least one arm with overrides, or axes")
+    reference = str(content.get("reference", runnable[0]))
+    if reference not in runnable:
+        raise InputError(f"reference: '{reference}' is no arm; allowed are {', '.join(runnable)}")
+    return Sweep(
+        name=name,
+        title=_text(content.get("title", name), "title"),
+        table=_table(content.get("table")),
+        notes=tuple(_texts(content.get("notes", []), "notes")),
+        base=tuple(_overrides(content.get("base", []), "base")),
+        seeds=seeds,
+        arms=tuple(arms),
+        reference=reference,
+        metrics=_metrics(content.get("metrics", ["MPJRE", "MPJPE", "MPJVE", "Jitter"])),
+    )
+
+
+def _arm(label: str, value: Any) -> Arm:
+    """An arm from its mapping, or from its overrides alone."""
+    name = f"arms.{label}"
+    if isinstance(value, list):
+        return Arm(label, tuple(_overrides(value, name)))
+    value = _mapping(value or {}, name, ARM_KEYS)
+    overrides = value.get("overrides", [])
+    branch = value.get("branch", BRANCHES[0])
+    if branch not in BRANCHES:
+        raise InputError(f"{name}.branch: '{branch}'; allowed are {', '.join(BRANCHES)}")
+    return Arm(
+        label,
+        None if overrides is None else tuple(_overrides(overrides, f"{name}.overrides")),
+        branch,
+        _paper(value.get("paper", {}), f"{name}.paper"),
+        value.get("note"),
+    )
+
+
+def _grid(arms: Sequence[Arm], axes: Mapping[str, Any]) -> Iterable[Arm]:
+    """Every arm with every combination of the axes' values."""
+    for key, values in axes.items():
+        if not isinstance(values, list) or not values:
+            raise InputError(f"axes.{key}: allowed is a list of values, not empty")
+    for arm in arms or [Arm("")]:
+        for values in itertools.product(*axes.values()):
+            words = [f"{key}={_word(value)}" for key, value in zip(axes, values, strict=True)]
+            label = ", ".join([arm.label, *words] if arm.label else words)
+            yield replace(arm, label=label, overrides=(*(arm.overrides or ()), *words))
+
+
+def _word(value: Any) -> str:
+    """A value as an override has it."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return f"[{','.join(map(_word, value))}]"
+    return str(value)
+
+
+def _mapping(value: Any, name: str, keys: Sequence[str] = ()) -> Mapping[str, Any]:
+    """The value as a mapping whose keys are known."""
+    if not isinstance(value, Mapping):
+        raise InputError(f"{name}: {_kind(value)}; allowed is a mapping")
+    for key in value:
+        if keys and key not in keys:
+            near = difflib.get_close_matches(str(key), keys, n=1)
+            hint = f"did you mean {near[0]}? " if near else ""
+            where = "" if name == "the file" else f"{name}."
+            raise InputError(f"{where}{key}: no such key; {hint}allowed are {', '.join(keys)}")
+    return value
+
+
+def _labelled(value: Any) -> dict[str, Any]:
+    """The arms by label; labels that YAML takes for numbers are words here."""
+    arms = {str(label): arm for label, arm in _mapping(value, "arms").items()}
+    if len(arms) < len(value):
+        raise InputError("arms: two have the same label")
+    return arms
+
+
+def _overrides(value: Any, name: str) -> list[str]:
+    """A list of Hydra's overrides; what they mean is found out when they are composed."""
+    words = _texts(value, name)
+    for word in words:
+        if not re.match(r"[+~]*[\w./@]+(=|$)", word):
+            raise InputError(f"{name}: '{word}'; allowed is KEY=VALUE or GROUP=OPTION")
+        if re.match(r"seed=", word):
+            raise InputError(f"{name}: '{word}'; the seeds are set by the key seeds")
+    return words
+
+
+def _texts(value: Any, name: str) -> list[str]:
+    if not isinstance(value, list):
+        raise InputError(f"{name}: {_kind(value)}; allowed is a list of words")
+    return [_text(item, name) for item in value]
+
+
+def _text(value: Any, name: str) -> str:
+    if not isinstance(value, str) or not value.strip():
+        raise InputError(f"{name}: {_kind(value)}; allowed is text that is not empty")
+    return value
+
+
+def _table(value: Any) -> int | None:
+    if value is None or (isinstance(value, int) and not isinstance(value, bool) and value > 0):
+        return value
+    raise InputError(f"table: {value!r}; allowed is the number of a table of the paper")
+
+
+def _seeds(value: Any, name: str) -> tuple[int, ...]:
+    """Whole numbers, each once."""
+    items = value if isinstance(value, list) else [value]
+    words = [str(item).strip() for item in items]
+    if not words or not all(re.fullmatch(r"\d+", word) for word in words) or len(set(words)) < len(words):
+        raise InputError(f"{name}: {value}; allowed is a list of whole numbers, each once")
+    return tuple(map(int, words))
+
+
+def _metrics(value: Any) -> tuple[str, ...]:
+    names = _texts(value, "metrics")
+    for name in names:
+        if name not in UNITS and name not in COSTS:
+            raise InputError(f"metrics: '{name}'; allowed are {', '.join([*UNITS, *COSTS])}")
+    return tuple(names)
+
+
+def _paper(value: Any, name: str) -> dict[str, float]:
+    """The paper's values by metric."""
+    values = dict(_mapping(value or {}, name, [*UNITS, *COSTS]))
+    for metric, number in values.items():
+        if not isinstance(number, int | float) or isinstance(number, bool):
+            raise InputError(f"{name}.{metric}: {number!r}; allowed is a number")
+    return values
+
+
+def _kind(value: Any) -> str:
+    """A value of the wrong kind, as an error names it."""
+    return "nothing" if value is None else f"{value!r}"[:60]
