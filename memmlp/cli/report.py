@@ -7,8 +7,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from memmlp.units import UNITS
 from memmlp.pipeline import Outcome
+from memmlp.units import UNITS
 
 COLUMNS = [("stream", "rotation"), ("stream", "position"), ("window", "rotation"), ("window", "position")]
 

@@ -1,15 +1,15 @@
 """Sweep files: arms (a label and the smallest difference to the base), seeds, and the paper's values.
 
-    title: Placement of memory blocks in the backbone
-    table: 14                          # of the paper; left out in sweeps of your own
-    base: [experiment=paper]           # overrides that all arms share
-    seeds: [0, 1, 2]
-    reference: 2, 4, 6, 8              # the arm that the others are compared with; the first one by default
-    metrics: [MPJRE, MPJPE, MPJVE, Jitter]
-    arms:
-      2, 4, 6, 8: {overrides: [], paper: {MPJRE: 2.57}}
-      "2": {overrides: ['memory.layers=[2]'], paper: {MPJRE: 2.63}, note: as printed}
-    axes: {model.frames: [11, 21], seed: [0, 1, 2]}      # a grid, instead of arms or over each of them
+title: Placement of memory blocks in the backbone
+table: 14                          # of the paper; left out in sweeps of your own
+base: [experiment=paper]           # overrides that all arms share
+seeds: [0, 1, 2]
+reference: 2, 4, 6, 8              # the arm that the others are compared with; the first one by default
+metrics: [MPJRE, MPJPE, MPJVE, Jitter]
+arms:
+  2, 4, 6, 8: {overrides: [], paper: {MPJRE: 2.57}}
+  "2": {overrides: ['memory.layers=[2]'], paper: {MPJRE: 2.63}, note: as printed}
+axes: {model.frames: [11, 21], seed: [0, 1, 2]}      # a grid, instead of arms or over each of them
 """
 
 from __future__ import annotations
