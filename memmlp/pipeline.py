@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,8 @@ from torch import Tensor
 from memmlp import checkpoint, evaluation, latency
 from memmlp.body import SPARSE_DIM
 from memmlp.data.dataset import Frames
-from memmlp.data.prepare import Manifest, Source, prepare
+from memmlp.data.motion import Motion
+from memmlp.data.prepare import Manifest
 from memmlp.export import TOLERANCE, export, parity
 from memmlp.features import Frame, World
 from memmlp.losses import Hand, MotionLoss, Weighting
@@ -33,36 +33,6 @@ from memmlp.vqvae import VQVAE
 VALIDATION_PIECE = 240  # frames: validation streams through pieces of clips of 4 s
 PICTURE_FRAMES = 600  # the picture shows the first 10 s of the first test clip
 MOTION_ARTIFACTS = ("model.safetensors", "clips.json", "results.json", "step.onnx", "latency.json")
-
-
-@dataclass(frozen=True)
-class Data:
-    """Where motion comes from and where its cache lies.
-
-    Attributes:
-        source: the folder of clips, its split and body.
-        generate: makes the folder where it is synthetic; None for the user's own.
-        caches: folder of all caches.
-    """
-
-    source: Source
-    generate: Callable[[Path], object] | None
-    caches: Path
-
-    def prepare(self) -> tuple[Path, Manifest]:
-        """The cache, made where it is missing or out of date, and its manifest."""
-        if self.generate is not None and not self.source.root.exists():
-            self._generate(self.generate)
-        key = repr(replace(self.source, root=self.source.root.resolve()))
-        cache = self.caches / f"{self.source.root.name}-{hashlib.sha256(key.encode()).hexdigest()[:8]}"
-        return cache, prepare(self.source, cache)
-
-    def _generate(self, generate: Callable[[Path], object]) -> None:
-        """Make the clips beside their place and move them there, so that a kill leaves no half folder."""
-        root = self.source.root
-        unfinished = root.with_name(root.name + ".unfinished")
-        generate(unfinished)
-        unfinished.rename(root)
 
 
 @dataclass(frozen=True)
@@ -110,7 +80,7 @@ class Experiment:
     device: torch.device
     seed: int
     force: bool
-    data: Data
+    data: Motion
     architecture: Architecture
     vqvae_config: dict[str, Any]
     vqvae_optim: Optim

@@ -11,10 +11,9 @@ from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from memmlp import pipeline
+from memmlp.cli.motion import build_motion
 from memmlp.cli.report import show
 from memmlp.cli.schema import Config, check
-from memmlp.data.prepare import Source
-from memmlp.data.synthetic import synthesize
 from memmlp.errors import InputError
 from memmlp.features import Heading, HeadRelative, World
 from memmlp.memory import Memory
@@ -43,7 +42,7 @@ def build_experiment(cfg: DictConfig) -> pipeline.Experiment:
         device=device(cfg.device),
         seed=cfg.seed,
         force=cfg.force,
-        data=build_data(cfg),
+        data=build_motion(cfg),
         architecture=build_architecture(cfg),
         vqvae_config={"frame": config["frame"], "vqvae": config["vqvae"]},
         vqvae_optim=build_vqvae_optim(cfg),
@@ -67,18 +66,6 @@ def device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("device=cuda: there is no CUDA device; allowed here is device=cpu or device=auto")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
-
-
-def build_data(cfg: DictConfig) -> pipeline.Data:
-    """Where the motion is; a synthetic folder's name has its length and seed, so it is never stale."""
-    data, root = cfg.data, Path(cfg.data.root)
-    generate = None
-    if data.synth is not None:
-        root = root / f"{data.synth.minutes:g}min-seed{data.synth.seed}"
-        generate = partial(synthesize, minutes=data.synth.minutes, seed=data.synth.seed)
-    split = instantiate(data.split, _convert_="all")
-    source = Source(root, split, str(data.body), data.min_frames, data.strict)
-    return pipeline.Data(source, generate, Path(cfg.paths.outputs) / "cache")
 
 
 def build_architecture(cfg: DictConfig) -> pipeline.Architecture:

@@ -21,14 +21,12 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-import torch
 from filelock import FileLock
 
 from memmlp.body import FPS, FRAME_DIM, load_rest_joints
 from memmlp.data.clip import Clip, read_clip, resample
 from memmlp.data.splits import PARTS, Split
 from memmlp.errors import InputError
-from memmlp.features import motion_frames
 from memmlp.progress import track
 
 FORMAT = 1  # of the cache; a new number makes every cache anew
@@ -171,12 +169,20 @@ def prepare(source: Source, out: Path) -> Manifest:
         out.mkdir(parents=True, exist_ok=True)
         with FileLock(out / ".lock"):
             request = _request(source, rest)
-            finished = _finished(out, request)
-            if finished and not (source.strict and finished.skipped):
-                return finished
+            found = _finished(out, request)
+            if found and not (source.strict and found.skipped):
+                return found
             return _make(source, rest, request, out)
     except OSError as error:
         raise InputError(f"{out}: cannot write the cache there ({error.strerror or error})") from error
+
+
+def finished(source: Source, out: Path) -> Manifest | None:
+    """The manifest of a finished, up-to-date cache of the source in `out`, if there is one."""
+    try:
+        return _finished(out, _request(source, load_rest_joints(str(source.body))))
+    except InputError:
+        return None
 
 
 def survey(root: Path, min_frames: int = 2, strict: bool = False) -> Survey:
@@ -262,6 +268,10 @@ def _sync(file: BinaryIO) -> None:
 
 def _frames(clip: Clip, rest: np.ndarray) -> Iterator[np.ndarray]:
     """The frames of a 60 Hz clip in blocks (<= CHUNK, 252), float32, computed in float64."""
+    import torch  # seconds to import, and not needed to find a finished cache
+
+    from memmlp.features import motion_frames
+
     poses, trans, joints = (torch.from_numpy(np.ascontiguousarray(x)) for x in (clip.poses, clip.trans, rest))
     for start in range(0, len(clip) - 1, CHUNK):
         block = slice(start, start + CHUNK + 1)  # a frame more than comes out: the first has no velocity
