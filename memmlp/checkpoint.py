@@ -13,7 +13,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from memmlp.errors import InputError
-from memmlp.runs import atomic_write
+from memmlp.files import atomic_write
 
 
 def write(path: Path, tensors: dict[str, Tensor], values: dict[str, Any]) -> None:

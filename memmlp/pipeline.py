@@ -19,15 +19,17 @@ from memmlp.data.motion import Motion
 from memmlp.data.prepare import Manifest
 from memmlp.export import TOLERANCE, export, parity
 from memmlp.features import Frame, World
+from memmlp.files import write_json
+from memmlp.identity import run_id
 from memmlp.losses import Hand, MotionLoss, Weighting
 from memmlp.memory import Memory
 from memmlp.model import MemMLP
 from memmlp.predictor import Predictor
 from memmlp.render import poses_png
 from memmlp.rollout import PersistentStreams, Rollout
-from memmlp.runs import Run, run_id, write_json
+from memmlp.runs import Run
 from memmlp.tracking import Tracker, project_safely
-from memmlp.training import MotionTask, Optim, VQVAETask, train
+from memmlp.training import MotionTask, Optim, VQVAETask, Watch, train, unwatched
 from memmlp.vqvae import VQVAE
 
 VALIDATION_PIECE = 240  # frames: validation streams through pieces of clips of 4 s
@@ -104,20 +106,22 @@ class Outcome:
     fresh: bool
 
 
-def run(experiment: Experiment) -> Outcome:
-    """Bring the experiment's run to its end, doing only what is missing."""
+def run(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
+    """Bring the experiment's run to its end, doing only what is missing.
+
+    `watch` is called after each validation with the step and its values, and may raise to stop the run.
+    """
     cache, manifest = experiment.data.prepare()
     upstream = vqvae_run(experiment, cache, manifest) if experiment.architecture.uses_codes else None
-    config, data, above = experiment.config, manifest.digest, upstream.id if upstream else None
-    own = {key: value for key, value in config.items() if key != "vqvae"}  # the upstream's id stands for it
-    run = Run.of(experiment.outputs, run_id("memmlp", own, data=data, upstream=above))
+    above = upstream.id if upstream else None
+    run = Run.of(experiment.outputs, motion_id(experiment, manifest.digest))
     with run.lock():
         fresh = experiment.force or not run.done
         if fresh:
             if experiment.force:
                 run.reset()
-            run.begin("memmlp", config, data=data, upstream=above)
-            motion_run(experiment, run, cache, manifest, upstream)
+            run.begin("memmlp", experiment.config, data=manifest.digest, upstream=above)
+            motion_run(experiment, run, cache, manifest, upstream, watch)
         if experiment.save_predictions is not None:
             model = experiment.architecture.load(run).to(experiment.device)
             save_predictions(experiment, model, cache)
@@ -126,14 +130,29 @@ def run(experiment: Experiment) -> Outcome:
     return Outcome(run, fresh)
 
 
+def vqvae_id(experiment: Experiment, data: str) -> str | None:
+    """The identity of the VQ-VAE run that the experiment needs on data of that digest; None if it needs none."""
+    if not experiment.architecture.uses_codes:
+        return None
+    return run_id("vqvae", experiment.vqvae_config, data=data, upstream=None)
+
+
+def motion_id(experiment: Experiment, data: str) -> str:
+    """The identity of the experiment's run on data of that digest."""
+    # the VQ-VAE's own identity stands for its config
+    own = {key: value for key, value in experiment.config.items() if key != "vqvae"}
+    return run_id("memmlp", own, data=data, upstream=vqvae_id(experiment, data))
+
+
 def vqvae_run(experiment: Experiment, cache: Path, manifest: Manifest) -> Run:
     """The finished run of the VQ-VAE that this configuration needs, trained where it is missing."""
-    config, data = experiment.vqvae_config, manifest.digest
-    run = Run.of(experiment.outputs, run_id("vqvae", config, data=data, upstream=None))
+    identity = vqvae_id(experiment, manifest.digest)
+    assert identity is not None
+    run = Run.of(experiment.outputs, identity)
     with run.lock():
         if run.done:
             return run
-        run.begin("vqvae", config, data=data, upstream=None)
+        run.begin("vqvae", experiment.vqvae_config, data=manifest.digest, upstream=None)
         started = time.monotonic()
         frames, validation = (Frames.open(cache, split).to(experiment.device) for split in ("train", "val"))
         torch.manual_seed(experiment.vqvae_seed)
@@ -157,12 +176,12 @@ def load_vqvae(architecture: Architecture, run: Run) -> VQVAE:
 
 
 def motion_run(
-    experiment: Experiment, run: Run, cache: Path, manifest: Manifest, upstream: Run | None
+    experiment: Experiment, run: Run, cache: Path, manifest: Manifest, upstream: Run | None, watch: Watch
 ) -> None:
     """Train, evaluate, export and time one Mem-MLP, and mark its run as done."""
     seconds: dict[str, float] = {}
     started = time.monotonic()
-    model = trained(experiment, run, cache, manifest, upstream)
+    model = trained(experiment, run, cache, manifest, upstream, watch)
     checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
     seconds["train"], started = time.monotonic() - started, time.monotonic()
     test = Frames.open(cache, "test")
@@ -182,7 +201,7 @@ def motion_run(
 
 
 def trained(
-    experiment: Experiment, run: Run, cache: Path, manifest: Manifest, upstream: Run | None
+    experiment: Experiment, run: Run, cache: Path, manifest: Manifest, upstream: Run | None, watch: Watch
 ) -> MemMLP:
     """The trained network, its training resumed where it was left."""
     architecture, device = experiment.architecture, experiment.device
@@ -202,7 +221,7 @@ def trained(
         experiment.seed,
         validate=lambda network: evaluation.quick_stream(network, pieces),
     )
-    train(task, experiment.optim, run, experiment.seed, "Mem-MLP")
+    train(task, experiment.optim, run, experiment.seed, "Mem-MLP", watch)
     return model.eval()
 
 

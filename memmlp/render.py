@@ -14,7 +14,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from memmlp.body import FPS, PARENTS, ROOT
-from memmlp.runs import atomic_write
+from memmlp.files import atomic_write
 
 POSES = 6
 REACH = 0.85  # metres shown to the left and right of the pelvis

@@ -1,51 +1,29 @@
-"""Run folders: identity, lock, manifest, metrics log, completion. The folder is the truth; nothing else is.
-
-JSON has no word for NaN and infinities: they are stored as the strings "nan", "inf" and "-inf".
-"""
+"""Run folders: lock, manifest, metrics log, completion. The folder is the truth; nothing else is."""
 
 from __future__ import annotations
 
 import contextlib
-import functools
-import hashlib
 import json
-import math
 import os
-import platform
 import re
-import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
 from filelock import FileLock, Timeout
 
-import memmlp
+from memmlp.environment import environment, host
 from memmlp.errors import InputError
+from memmlp.files import atomic_write, file_digest, plain, read_json, sync_folder, write_json
+from memmlp.identity import RECIPE, flatten
 
-RECIPE = 1
-"""Part of every identity: raise it when the code's results change for an unchanged config."""
-
-IGNORED = (
-    "data",  # its digest stands for it: frames, clips, split and rest pose
-    "profile",  # sizes, read by the groups that use them
-    "paths",
-    "tracker",
-    "device",
-    "threads",
-    "force",
-    "save_predictions",
-    "optim.checkpoint_every",
-    "optim.log_every",
-    "export",  # how long the clock runs
-    "hydra",
-)
-"""Config keys that cannot change a run's result, and so are no part of its identity."""
+HEARTBEAT = 5.0  # seconds between signs of life of a run's process
+STALE = 60.0  # seconds without one after which a process on another machine counts as dead
 
 ID = re.compile(r"[0-9a-f]{16}")
 
@@ -71,90 +49,6 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """A nested mapping with dotted keys; lists stay values."""
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        if isinstance(value, Mapping) and value:
-            flat |= flatten(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value
-    return flat
-
-
-def plain(value: Any) -> Any:
-    """The value as JSON can hold it."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    return value
-
-
-def atomic_write(path: Path, content: bytes | str) -> None:
-    """Write a file whole or not at all, even if the machine stops: temporary file, fsync, rename."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with open(temporary, "wb") as file:
-        file.write(content.encode() if isinstance(content, str) else content)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-    sync_folder(path.parent)
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON atomically, keys in the order given."""
-    atomic_write(path, json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
-
-
-def sync_folder(folder: Path) -> None:
-    """Make renames and removals in a folder durable."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file, hexadecimal."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def run_id(kind: str, config: Mapping[str, Any], *, data: str, upstream: str | None) -> str:
-    """The identity of a run: 16 hex digits over all that can change its result.
-
-    Args:
-        kind: the stage ("vqvae", "memmlp").
-        config: resolved config; IGNORED keys do not count, nor does 1 against 1.0.
-        data: digest of the prepared data. upstream: id of the run whose artifact this one uses.
-    """
-    what = {"recipe": RECIPE, "kind": kind, "config": relevant(config), "data": data, "upstream": upstream}
-    text = json.dumps(plain(what), sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def relevant(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The dotted keys of a config that are part of the identity."""
-
-    def counts(key: str) -> bool:
-        return not any(key == ignored or key.startswith(f"{ignored}.") for ignored in IGNORED)
-
-    return {key: _canonical(value) for key, value in flatten(config).items() if counts(key)}
-
-
-def _canonical(value: Any) -> Any:
-    """The same value for the same number, however it was typed."""
-    if isinstance(value, list | tuple):
-        return [_canonical(item) for item in value]
-    if isinstance(value, float) and value.is_integer():
-        return int(value)
-    return value
-
-
 class Run:
     """A folder outputs/runs/<id>/.
 
@@ -175,6 +69,7 @@ class Run:
         "step.onnx",
         "latency.json",
         "poses.png",
+        "FAILED",
     )
 
     def __init__(self, folder: Path | str):
@@ -201,33 +96,84 @@ class Run:
         return f"Run({str(self.folder)!r})"
 
     @contextlib.contextmanager
-    def lock(self, say: Callable[[str], None] | None = None) -> Iterator[None]:
-        """Hold the run for this process; while another one has it, wait and say so once (on stderr)."""
+    def lock(self, say: Callable[[str], None] | None = None, wait: bool = True) -> Iterator[bool]:
+        """Hold the run for this process, which may hold it already; yields whether it does.
+
+        While another process has the run: wait and say so once (on stderr), or yield False without `wait`.
+        A killed process loses its lock at once.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(self.folder / ".lock")
+        lock = FileLock(self.folder / ".lock", is_singleton=True)
         try:
             lock.acquire(timeout=0)
         except Timeout:
+            if not wait:
+                yield False
+                return
             (say or _say)(f"run {self.id} is in the hands of {self._holder()}; waiting for it")
             lock.acquire()
         try:
-            write_json(self.folder / ".holder", {"pid": os.getpid(), "since": now()})
-            yield
+            with self._heartbeat() if lock.lock_counter == 1 else contextlib.nullcontext():
+                yield True
         finally:
-            (self.folder / ".holder").unlink(missing_ok=True)
             lock.release()
 
+    @contextlib.contextmanager
+    def _heartbeat(self) -> Iterator[None]:
+        """Leave word of who holds the run, and a sign of life every few seconds."""
+        holder, ended = self.folder / ".holder", threading.Event()
+        write_json(holder, {"pid": os.getpid(), "host": host(), "since": now()})
+        thread = threading.Thread(target=_beat, args=(holder, ended), daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+            holder.unlink(missing_ok=True)
+
     def _holder(self) -> str:
-        holder = _read_json(self.folder / ".holder")
+        holder = read_json(self.folder / ".holder")
         return f"process {holder['pid']} since {holder['since']}" if holder else "another process"
+
+    @property
+    def status(self) -> str:
+        """One of: done, failed, running (a process is at it), lost (its process died), stopped, new."""
+        if self.done:
+            return "done"
+        holder = read_json(self.folder / ".holder")
+        if holder:
+            return "running" if _lives(holder, self.folder / ".holder") else "lost"
+        if self.failure:
+            return "failed"
+        return "stopped" if self.manifest_path.exists() else "new"
+
+    @property
+    def failure(self) -> str | None:
+        """Why the run failed, in a line; None where it didn't."""
+        return read_json(self.folder / "FAILED").get("reason")
+
+    def fail(self, reason: str, details: str = "") -> None:
+        """Leave word of why the run ended before it was done."""
+        write_json(
+            self.folder / "FAILED", {"reason": " ".join(reason.split()), "when": now(), "details": details}
+        )
+
+    def retry(self) -> None:
+        """Forget the failure."""
+        (self.folder / "FAILED").unlink(missing_ok=True)
 
     def begin(self, kind: str, config: Mapping[str, Any], *, data: str, upstream: str | None) -> None:
         """Write config.yaml and the manifest of a run that starts or resumes."""
         self.folder.mkdir(parents=True, exist_ok=True)
         atomic_write(self.config_path, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
+        self.retry()
         started = self.manifest.get("started", now())
+        attempt = {"started": now(), "pid": os.getpid(), "host": host()}
+        attempts = [*self.manifest.get("attempts", []), attempt]
         identity = {"id": self.id, "kind": kind, "data": data, "upstream": upstream, "recipe": RECIPE}
-        self.write_manifest(identity | {"started": started, "finished": None} | environment())
+        times = {"started": started, "finished": None, "attempts": attempts}
+        self.write_manifest(identity | times | environment())
 
     def write_manifest(self, fields: Mapping[str, Any]) -> None:
         """Add fields to the manifest, or replace them."""
@@ -236,7 +182,7 @@ class Run:
     @property
     def manifest(self) -> dict[str, Any]:
         """What is known of the run; empty before it began."""
-        return _read_json(self.manifest_path)
+        return read_json(self.manifest_path)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -246,7 +192,7 @@ class Run:
     @property
     def results(self) -> dict[str, Any]:
         """The results; empty before the evaluation."""
-        return _read_json(self.results_path)
+        return read_json(self.results_path)
 
     def log(self, step: int, values: Mapping[str, float], phase: str = "train") -> None:
         """Append one line to the metrics, in one write: a kill tears at most that line."""
@@ -291,11 +237,11 @@ class Run:
     @property
     def done(self) -> bool:
         """Whether the run was finished."""
-        return "artifacts" in _read_json(self.marker)
+        return "artifacts" in read_json(self.marker)
 
     def verify(self) -> list[str]:
         """The artifacts of a finished run that are missing or changed since."""
-        artifacts = _read_json(self.marker).get("artifacts", {})
+        artifacts = read_json(self.marker).get("artifacts", {})
         return [name for name, digest in artifacts.items() if not self._same(name, digest)]
 
     def _same(self, name: str, digest: str) -> bool:
@@ -314,17 +260,35 @@ class Run:
         sync_folder(self.folder)
 
 
+def _beat(holder: Path, ended: threading.Event) -> None:
+    """Touch the holder's file until the end."""
+    while not ended.wait(HEARTBEAT):
+        with contextlib.suppress(OSError):
+            os.utime(holder)
+
+
+def _lives(holder: Mapping[str, Any], path: Path) -> bool:
+    """Whether a holder's process lives: on this machine by its number, elsewhere by its heartbeat."""
+    if holder.get("host") == host():
+        return _runs(int(holder["pid"]))
+    try:
+        return time.time() - path.stat().st_mtime < STALE
+    except OSError:
+        return False
+
+
+def _runs(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
 def _say(line: str) -> None:
     print(f"memmlp: {line}", file=sys.stderr, flush=True)
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file; empty if there is none or it does not parse."""
-    try:
-        value = json.loads(path.read_bytes())
-    except (OSError, ValueError):
-        return {}
-    return value if isinstance(value, dict) else {}
 
 
 def list_runs(outputs: Path | str) -> list[Run]:
@@ -363,50 +327,3 @@ def _differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, tuple[
     flat_a, flat_b = flatten(a), flatten(b)
     pairs = {key: (flat_a.get(key, "-"), flat_b.get(key, "-")) for key in flat_a | flat_b}
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
-
-
-def environment() -> dict[str, Any]:
-    """What a run ran on and with; the machine's name only as a digest."""
-    packages = ("torch", "numpy", "onnxruntime")
-    return {
-        "version": memmlp.__version__,
-        "git": _git(),
-        "python": platform.python_version(),
-        "packages": {name: _version(name) for name in packages},
-        "platform": platform.platform(),
-        "cpu": _cpu(),
-        "cores": os.cpu_count(),
-        "host": hashlib.sha256(platform.node().encode()).hexdigest()[:12],
-    }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
-
-
-@functools.cache
-def _git() -> dict[str, Any] | None:
-    """Commit of the checkout that the package lies in and whether it was changed; None when installed."""
-
-    def git(*args: str) -> str:
-        command = ["git", "-C", str(Path(memmlp.__file__).parent), *args]
-        return subprocess.run(command, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
-
-    try:
-        git("ls-files", "--error-unmatch", "__init__.py")
-        commit = git("rev-parse", "HEAD")
-        return {"commit": commit, "dirty": bool(git("status", "--porcelain", "--", "."))}
-    except (OSError, subprocess.SubprocessError):
-        return None
-
-
-def _cpu() -> str:
-    """The processor's model name."""
-    with contextlib.suppress(OSError):
-        match = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-        if match:
-            return match[1].strip()
-    return platform.processor() or platform.machine()

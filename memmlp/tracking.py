@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from filelock import FileLock
 
-from memmlp.runs import Run, flatten
+from memmlp.identity import flatten
+from memmlp.runs import Run
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

@@ -205,10 +205,17 @@ def seed_step(seed: int, step: int) -> None:
     torch.manual_seed(int(np.random.SeedSequence([seed, step]).generate_state(1, np.uint64)[0] >> 1))
 
 
-def train(task: Task, optim: Optim, run: Run, seed: int, description: str) -> None:
+Watch = Callable[[int, dict[str, float]], None]
+
+
+def unwatched(step: int, values: dict[str, float]) -> None:
+    """Lets every run go on."""
+
+
+def train(task: Task, optim: Optim, run: Run, seed: int, description: str, watch: Watch = unwatched) -> None:
     """Train to `optim.steps`, from the run's checkpoint where there is one, and leave the last checkpoint.
 
-    Raises TrainingDiverged, naming step, term and clips, where a term is NaN or Inf.
+    `watch` is called after each validation with the step and its values, and may raise to stop. Raises TrainingDiverged, naming step, term and clips, where a term is NaN or Inf.
     """
     optimiser = optim.build(task.parameter_groups())
     start = resume(task, optimiser, run) if run.checkpoint.exists() else 0
@@ -217,9 +224,11 @@ def train(task: Task, optim: Optim, run: Run, seed: int, description: str) -> No
         for step in range(start, optim.steps):
             seed_step(seed, step)
             result = train_step(task, optim, optimiser, step)
-            record(task, optim, run, step + 1, result, bar, row)
+            validation = record(task, optim, run, step + 1, result, bar, row)
             if (step + 1) % optim.checkpoint_every == 0 or step + 1 == optim.steps:
                 save(task, optimiser, run, step + 1)
+            if validation:
+                watch(step + 1, validation)
 
 
 def train_step(task: Task, optim: Optim, optimiser: torch.optim.Optimizer, step: int) -> StepResult:
@@ -255,8 +264,8 @@ def check_finite(task: Task, result: StepResult, step: int) -> None:
 
 def record(
     task: Task, optim: Optim, run: Run, step: int, result: StepResult, bar: Progress, row: TaskID
-) -> None:
-    """Log and show a finished step, and validate where it is time."""
+) -> dict[str, float]:
+    """Log and show a finished step, and validate where it is time; the validation's values, or none."""
     last = step == optim.steps
     bar.advance(row)
     if step % optim.log_every == 0 or last:
@@ -266,7 +275,10 @@ def record(
         bar.update(row, note=f"loss {loss:.3g}")
     if step % optim.validate_every == 0 or last:
         task.module.eval()
-        run.log(step, task.validate(), phase="val")
+        values = task.validate()
+        run.log(step, values, phase="val")
+        return values
+    return {}
 
 
 def save(task: Task, optimiser: torch.optim.Optimizer, run: Run, step: int) -> None:

@@ -12,20 +12,12 @@ from pathlib import Path
 
 import pytest
 
-import memmlp.runs
+import memmlp.identity
+from memmlp.environment import environment
 from memmlp.errors import InputError
-from memmlp.runs import (
-    IGNORED,
-    Run,
-    atomic_write,
-    diff,
-    environment,
-    find_run,
-    flatten,
-    list_runs,
-    run_id,
-    write_json,
-)
+from memmlp.files import atomic_write, write_json
+from memmlp.identity import IGNORED, flatten, run_id
+from memmlp.runs import Run, diff, find_run, list_runs
 
 CONFIG = {"seed": 0, "model": {"width": 16, "layers": [2, 4]}, "optim": {"lr": 1e-3, "log_every": 5}}
 
@@ -61,7 +53,7 @@ def test_what_changes_the_result_changes_the_identity(other: dict):
 
 def test_recipe_is_part_of_the_identity(monkeypatch: pytest.MonkeyPatch):
     before = identity()
-    monkeypatch.setattr(memmlp.runs, "RECIPE", memmlp.runs.RECIPE + 1)
+    monkeypatch.setattr(memmlp.identity, "RECIPE", memmlp.identity.RECIPE + 1)
     assert identity() != before
 
 

@@ -13,7 +13,8 @@ from typing import Any
 
 import pytest
 
-from memmlp.runs import Run, write_json
+from memmlp.files import write_json
+from memmlp.runs import Run
 from memmlp.tracking import MLflowTracker, NoTracker, project_safely
 
 CONFIG = {"seed": 0, "memory": {"layers": [2, 4], "shift": None}, "long": "x" * 7000}

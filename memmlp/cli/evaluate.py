@@ -30,7 +30,8 @@ def evaluate(
     from memmlp.cli.report import metrics_table
     from memmlp.data.dataset import Frames
     from memmlp.errors import InputError
-    from memmlp.runs import find_run, write_json
+    from memmlp.files import write_json
+    from memmlp.runs import find_run
 
     found = find_run(outputs, run)
     experiment = replace(build_experiment(config_of(found)), device=device_of(device))

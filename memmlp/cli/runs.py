@@ -60,7 +60,8 @@ def list_command(every: bool, outputs: Path) -> None:
 @outputs_option
 def show_command(run: str, config: bool, outputs: Path) -> None:
     """One run, by its id, the beginning of it, or its folder."""
-    from memmlp.runs import find_run, flatten
+    from memmlp.identity import flatten
+    from memmlp.runs import find_run
 
     found = find_run(outputs, run)
     changed = ", ".join(found.verify())

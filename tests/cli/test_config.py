@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from memmlp.cli import schema
 from memmlp.cli.shipped import shipped
 from memmlp.cli.train import composed
-from memmlp.runs import IGNORED, flatten
+from memmlp.identity import IGNORED, flatten
 
 GROUPS = {folder.name: sorted(p.stem for p in folder.glob("*.yaml")) for folder in shipped("conf").glob("*/")}
 OPTIONS = [f"{group}={name}" for group, names in GROUPS.items() for name in names]

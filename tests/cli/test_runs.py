@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from conftest import Memmlp, Ran, one_line
 
-from memmlp.runs import Run, write_json
+from memmlp.files import write_json
+from memmlp.runs import Run
 
 A, B, C = ("a" * 16, "b" * 16, "c" * 16)
 RESULTS = {
