@@ -131,7 +131,7 @@ def run(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
 
 
 def vqvae_id(experiment: Experiment, data: str) -> str | None:
-    """The identity of the VQ-VAE run that the experiment needs on data of that digest; None if it needs none."""
+    """The identity of the VQ-VAE run that the experiment needs on data of that digest, if it needs one."""
     if not experiment.architecture.uses_codes:
         return None
     return run_id("vqvae", experiment.vqvae_config, data=data, upstream=None)
@@ -201,7 +201,12 @@ def motion_run(
 
 
 def trained(
-    experiment: Experiment, run: Run, cache: Path, manifest: Manifest, upstream: Run | None, watch: Watch
+    experiment: Experiment,
+    run: Run,
+    cache: Path,
+    manifest: Manifest,
+    upstream: Run | None,
+    watch: Watch = unwatched,
 ) -> MemMLP:
     """The trained network, its training resumed where it was left."""
     architecture, device = experiment.architecture, experiment.device

@@ -169,7 +169,7 @@ class Run:
         atomic_write(self.config_path, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
         self.retry()
         started = self.manifest.get("started", now())
-        attempt = {"started": now(), "pid": os.getpid(), "host": host()}
+        attempt = {"started": now(), "pid": os.getpid(), "host": host(), "step": self.step}
         attempts = [*self.manifest.get("attempts", []), attempt]
         identity = {"id": self.id, "kind": kind, "data": data, "upstream": upstream, "recipe": RECIPE}
         times = {"started": started, "finished": None, "attempts": attempts}
@@ -202,6 +202,11 @@ class Run:
         entry = {"step": step, "phase": phase, "time": round(time.time(), 3), "values": dict(values)}
         with open(self.metrics_path, "ab", buffering=0) as file:
             file.write(json.dumps(plain(entry), allow_nan=False).encode() + b"\n")
+
+    @property
+    def step(self) -> int:
+        """The last step of training that is logged; 0 before the first."""
+        return max((entry.step for entry in self.metrics()), default=0)
 
     def repair(self) -> None:
         """Cut a torn last line of the metrics off."""

@@ -215,7 +215,8 @@ def unwatched(step: int, values: dict[str, float]) -> None:
 def train(task: Task, optim: Optim, run: Run, seed: int, description: str, watch: Watch = unwatched) -> None:
     """Train to `optim.steps`, from the run's checkpoint where there is one, and leave the last checkpoint.
 
-    `watch` is called after each validation with the step and its values, and may raise to stop. Raises TrainingDiverged, naming step, term and clips, where a term is NaN or Inf.
+    `watch` is called after each validation with the step and its values, and may raise to stop.
+    Raises TrainingDiverged, naming step, term and clips, where a term is NaN or Inf.
     """
     optimiser = optim.build(task.parameter_groups())
     start = resume(task, optimiser, run) if run.checkpoint.exists() else 0

@@ -70,7 +70,7 @@ class Sweep:
         name: the file's stem. title, notes: for the table. table: its number in the paper.
         base: overrides of all arms. seeds: of each arm.
         arms: the rows in order. reference: the label that the others are compared with.
-        metrics: the columns.
+        metrics: the columns. extra: overrides of the command line.
     """
 
     name: str
@@ -82,6 +82,7 @@ class Sweep:
     arms: tuple[Arm, ...]
     reference: str
     metrics: tuple[str, ...]
+    extra: tuple[str, ...] = ()
 
     def with_overrides(self, overrides: Sequence[str]) -> Sweep:
         """The same sweep, further overrides standing after its base and before its arms' differences.
@@ -91,14 +92,21 @@ class Sweep:
         seeds = [word.partition("=")[2] for word in overrides if word.startswith("seed=")]
         others = tuple(word for word in overrides if not word.startswith("seed="))
         chosen = _seeds(seeds[-1].split(","), "seed") if seeds else self.seeds
-        return replace(self, base=(*self.base, *others), seeds=chosen)
+        return replace(self, extra=(*self.extra, *others), seeds=chosen)
+
+    def overrides(self, arm: Arm) -> tuple[str, ...]:
+        """Those of an arm: the base's, the command line's, its own."""
+        return (*self.base, *self.extra, *(arm.overrides or ()))
+
+    def runnable(self) -> tuple[Arm, ...]:
+        """The arms that are not the paper's alone."""
+        return tuple(arm for arm in self.arms if arm.overrides is not None)
 
     def jobs(self) -> list[Job]:
         """What has to be run, arm by arm."""
         return [
-            Job(arm.label, seed, (*self.base, *arm.overrides, f"seed={seed}"))
-            for arm in self.arms
-            if arm.overrides is not None
+            Job(arm.label, seed, (*self.overrides(arm), f"seed={seed}"))
+            for arm in self.runnable()
             for seed in self.seeds
         ]
 

@@ -1,0 +1,164 @@
+"""From a sweep file to its plan: every arm composed, checked and given its run's identity.
+
+Composing takes a moment an arm, so a plan is kept and found again while the sweep, the configs and the
+data are what they were.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from memmlp.cli.shipped import shipped
+from memmlp.errors import InputError
+from memmlp.files import read_json, write_json
+from memmlp.identity import RECIPE
+from memmlp.sweep.plan import Entry, Plan, Task, unique
+from memmlp.sweep.spec import Sweep, load_sweep
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from memmlp.pipeline import Experiment
+
+
+def find_sweep(name: str) -> Sweep:
+    """The sweep of a path, of a shipped file's name, or of a table's number."""
+    if name.endswith((".yaml", ".yml")) or "/" in name:
+        return load_sweep(Path(name))
+    folder = shipped("sweeps")
+    stem = f"table{int(name):02d}" if name.isdecimal() else name
+    path = folder / f"{stem}.yaml"
+    if not path.is_file():
+        known = ", ".join(sorted(file.stem for file in folder.glob("*.yaml")))
+        raise InputError(f"sweep '{name}': no such sweep; allowed are a path ending in .yaml, or {known}")
+    return load_sweep(path)
+
+
+def sweep_folder(sweep: Sweep, outputs: Path) -> Path:
+    """Where a sweep with its command line's overrides keeps its plan and its workers' logs."""
+    key = f"-{_digest(sweep.extra)[:8]}" if sweep.extra else ""
+    return outputs / "sweeps" / f"{sweep.name}{key}"
+
+
+def planned(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
+    """The plan of a sweep; with `prepare` its data is brought into being first.
+
+    Entries whose data is not prepared have no identity yet and are left out. Raises InputError, naming arm
+    and key, where a config is wrong.
+    """
+    path = sweep_folder(sweep, outputs) / "planned.json"
+    stamp = _stamp(sweep)
+    kept = read_json(path)
+    if kept.get("stamp") == stamp and all(_fresh(data) for data in kept["data"]):
+        return Plan.load(path.with_name("plan.json"))
+    plan, data = _plan(sweep, outputs, prepare)
+    plan.save(path.with_name("plan.json"))
+    write_json(path, {"stamp": stamp if data is not None else None, "data": data or []})
+    _remember(sweep, plan, path.with_name("entries.json"))
+    return plan
+
+
+def orphans(sweep: Sweep, plan: Plan) -> list[Entry]:
+    """Runs of earlier versions of the sweep: of labels that are gone, or whose config is another now."""
+    recorded = read_json(sweep_folder(sweep, plan.outputs) / "entries.json").get("entries", [])
+    labels = {arm.label for arm in sweep.arms}
+    now = {(entry.label, entry.seed): entry.id for entry in plan.entries}
+    used = set(now.values())
+    entries = [Entry(**entry) for entry in recorded]
+    return [
+        entry
+        for entry in entries
+        if entry.id not in used
+        and (entry.label not in labels or now.get((entry.label, entry.seed), entry.id) != entry.id)
+    ]
+
+
+def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[str, Any]] | None]:
+    """The plan, and what it relies on of the data; None where some is not prepared."""
+    entries: list[Entry] = []
+    tasks: list[Task] = []
+    data: dict[str, dict[str, Any]] = {}
+    complete = True
+    for arm in sweep.runnable():
+        for seed, experiment in _experiments(sweep, arm.label, sweep.overrides(arm), outputs):
+            digest = _data_digest(experiment, prepare, data)
+            complete &= digest is not None
+            if digest is not None:
+                found = _tasks(experiment, digest)
+                entries.append(Entry(arm.label, seed, found[-1].id))
+                tasks += found
+    plan = Plan(sweep.name, outputs, tuple(entries), unique(tasks))
+    return plan, list(data.values()) if complete else None
+
+
+def _experiments(
+    sweep: Sweep, label: str, overrides: tuple[str, ...], outputs: Path
+) -> Iterable[tuple[int, Experiment]]:
+    """The checked experiments of an arm, seed by seed."""
+    from memmlp.cli.build import build_experiment
+    from memmlp.cli.train import composed
+
+    try:
+        cfg = composed(list(overrides))
+        for seed in sweep.seeds:
+            cfg.seed, cfg.paths.outputs = seed, str(outputs)
+            yield seed, build_experiment(cfg)
+    except InputError as error:
+        raise InputError(f"sweep {sweep.name}, arm '{label}': {error}") from None
+
+
+def _tasks(experiment: Experiment, digest: str) -> list[Task]:
+    """The runs of an experiment on data of that digest, the last one its own."""
+    from memmlp.pipeline import motion_id, vqvae_id
+
+    above = vqvae_id(experiment, digest)
+    upstream = [Task(above, "vqvae", experiment.config)] if above else []
+    return [*upstream, Task(motion_id(experiment, digest), "memmlp", experiment.config, above)]
+
+
+def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[str, Any]]) -> str | None:
+    """The digest of the experiment's prepared data; None where it isn't prepared."""
+    config = {"data": experiment.config["data"], "paths": experiment.config["paths"]}
+    key = _digest(config)
+    if key not in known:
+        digest = experiment.data.prepare()[1].digest if prepare else experiment.data.digest()
+        if digest is None:
+            return None
+        known[key] = {"config": config, "digest": digest}
+    return known[key]["digest"]
+
+
+def _fresh(data: dict[str, Any]) -> bool:
+    """Whether the data of a kept plan is what it was."""
+    from omegaconf import OmegaConf
+
+    from memmlp.cli.motion import build_motion
+
+    cfg: DictConfig = OmegaConf.create(data["config"])
+    try:
+        return build_motion(cfg).digest() == data["digest"]
+    except InputError:
+        return False
+
+
+def _stamp(sweep: Sweep) -> str:
+    """Digest of all that a plan follows from, but for the data: the sweep, the configs, the code that reads them."""
+    files = [*shipped("conf").rglob("*.yaml"), *Path(__file__).parent.glob("*.py")]
+    texts = [(file.name, file.read_text(encoding="utf-8")) for file in sorted(files)]
+    return _digest([RECIPE, asdict(sweep), texts])
+
+
+def _remember(sweep: Sweep, plan: Plan, path: Path) -> None:
+    """Add the plan's entries to those that the sweep ever had."""
+    before = read_json(path).get("entries", [])
+    every = {(e["label"], e["seed"], e["id"]): e for e in [*before, *map(asdict, plan.entries)]}
+    write_json(path, {"entries": list(every.values())})
+
+
+def _digest(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()

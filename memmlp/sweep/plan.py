@@ -1,0 +1,114 @@
+"""A plan: which runs a sweep's arms and seeds are, and how far they are. The run folders say the latter."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from memmlp.errors import InputError
+from memmlp.files import write_json
+from memmlp.runs import Run
+
+
+@dataclass(frozen=True)
+class Task:
+    """One run to be brought to its end.
+
+    Attributes:
+        id: of the run. kind: "vqvae" or "memmlp".
+        config: the resolved config of an experiment that needs it.
+        upstream: the run that must be done before; None for none.
+    """
+
+    id: str
+    kind: str
+    config: Mapping[str, Any]
+    upstream: str | None = None
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A cell of the sweep: the run of an arm with a seed."""
+
+    label: str
+    seed: int
+    id: str
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The entries of a sweep and the tasks they need, each once, upstream runs first.
+
+    Attributes:
+        name: of the sweep. outputs: folder of the runs' folder.
+        open: more tasks may come, so workers stay (a search); a sweep's plan is closed.
+        cancelled: ids that no worker shall go on with.
+    """
+
+    name: str
+    outputs: Path
+    entries: tuple[Entry, ...]
+    tasks: tuple[Task, ...]
+    open: bool = False
+    cancelled: tuple[str, ...] = ()
+
+    def run(self, label: str, seed: int) -> Run | None:
+        """The run of an arm with a seed, finished or not; None where its identity is not known."""
+        found = self._by_cell().get((label, seed))
+        return Run.of(self.outputs, found) if found else None
+
+    def _by_cell(self) -> dict[tuple[str, int], str]:
+        return {(entry.label, entry.seed): entry.id for entry in self.entries}
+
+    def run_of(self, task: Task | Entry) -> Run:
+        """The run of a task."""
+        return Run.of(self.outputs, task.id)
+
+    def states(self) -> dict[str, str]:
+        """The state of every task's run: its status, or "blocked" where its upstream run failed."""
+        states = {task.id: self.run_of(task).status for task in self.tasks}
+        for task in self.tasks:
+            if (
+                task.upstream
+                and states.get(task.upstream) in ("failed", "blocked")
+                and states[task.id] != "done"
+            ):
+                states[task.id] = "blocked"
+        return states
+
+    def left(self) -> list[Task]:
+        """The tasks that are neither done nor failed nor blocked nor cancelled."""
+        states = self.states()
+        ended = ("done", "failed", "blocked")
+        return [t for t in self.tasks if states[t.id] not in ended and t.id not in self.cancelled]
+
+    def counts(self) -> Counter[str]:
+        """How many tasks are in which state."""
+        return Counter(self.states().values())
+
+    def save(self, path: Path) -> None:
+        """Write the plan, whole or not at all."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, {**asdict(self), "outputs": str(self.outputs)})
+
+    @classmethod
+    def load(cls, path: Path) -> Plan:
+        """A saved plan. Raises InputError where the file is none."""
+        try:
+            content = json.loads(path.read_bytes())
+            content["entries"] = tuple(Entry(**entry) for entry in content["entries"])
+            content["tasks"] = tuple(Task(**task) for task in content["tasks"])
+            content["cancelled"] = tuple(content["cancelled"])
+            return cls(**{**content, "outputs": Path(content["outputs"])})
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path}: not a sweep's plan ({error}); start the sweep again") from None
+
+
+def unique(tasks: Iterable[Task]) -> tuple[Task, ...]:
+    """Each task once, upstream runs first, else in the order given."""
+    known = {task.id: task for task in tasks}
+    return tuple(sorted(known.values(), key=lambda task: task.upstream is not None or task.kind != "vqvae"))
