@@ -147,7 +147,7 @@ def _fresh(data: dict[str, Any]) -> bool:
 
 
 def _stamp(sweep: Sweep) -> str:
-    """Digest of all that a plan follows from, but for the data: the sweep, the configs, the code that reads them."""
+    """Digest of all that a plan follows from but the data: sweep, configs, the code that reads them."""
     files = [*shipped("conf").rglob("*.yaml"), *Path(__file__).parent.glob("*.py")]
     texts = [(file.name, file.read_text(encoding="utf-8")) for file in sorted(files)]
     return _digest([RECIPE, asdict(sweep), texts])

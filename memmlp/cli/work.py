@@ -10,18 +10,21 @@ from memmlp.sweep.worker import Cancelled, Presence
 from memmlp.sweep.worker import work as work_on
 
 
-def work(path: str, controller: str) -> None:
+def work(path: str, threads: int, controller: str) -> None:
     """Take tasks of the plan in that file while its controller's process lives."""
-    work_on(Path(path), partial(perform, Path(path)), lambda: Presence.of(Path(controller)))
+    work_on(Path(path), partial(perform, Path(path), threads), lambda: Presence.of(Path(controller)))
 
 
 def work_alone(path: str) -> None:
-    """Take tasks of the plan in that file until none is left: for clusters, where the controller may leave."""
-    work_on(Path(path), partial(perform, Path(path)))
+    """Take tasks of the plan in that file until none is left, whether or not the controller stays."""
+    work_on(Path(path), partial(perform, Path(path), 0))
 
 
-def perform(path: Path, plan: Plan, task: Task) -> None:
-    """Bring the task's run to its end; Cancelled if the plan no longer wants it."""
+def perform(path: Path, threads: int, plan: Plan, task: Task) -> None:
+    """Bring the task's run to its end; Cancelled if the plan no longer wants it.
+
+    threads: of torch, where the config leaves them open; 0 for torch's choice.
+    """
     import torch
     from omegaconf import OmegaConf
 
@@ -29,8 +32,8 @@ def perform(path: Path, plan: Plan, task: Task) -> None:
     from memmlp.cli.build import build_experiment
 
     experiment = build_experiment(OmegaConf.create(dict(task.config)))
-    if experiment.config["threads"]:
-        torch.set_num_threads(experiment.config["threads"])
+    if chosen := experiment.config["threads"] or threads:
+        torch.set_num_threads(chosen)
     if task.kind == "vqvae":
         pipeline.vqvae_run(experiment, *experiment.data.prepare())
     else:

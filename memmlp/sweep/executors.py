@@ -90,7 +90,7 @@ class Submitit:
 
     def describe(self) -> str:
         """The sbatch file of a worker, or where local ones leave their logs."""
-        inner = self.executor._executor
+        inner: Any = self.executor._executor
         if self.cluster != "slurm":
             return f"workers' logs: {self.folder}"
         return inner._make_submission_file_text("memmlp-worker", "")

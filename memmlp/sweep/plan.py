@@ -72,11 +72,7 @@ class Plan:
         """The state of every task's run: its status, or "blocked" where its upstream run failed."""
         states = {task.id: self.run_of(task).status for task in self.tasks}
         for task in self.tasks:
-            if (
-                task.upstream
-                and states.get(task.upstream) in ("failed", "blocked")
-                and states[task.id] != "done"
-            ):
+            if states[task.id] != "done" and states.get(task.upstream or "") == "failed":
                 states[task.id] = "blocked"
         return states
 

@@ -95,8 +95,9 @@ class Sweep:
         return replace(self, extra=(*self.extra, *others), seeds=chosen)
 
     def overrides(self, arm: Arm) -> tuple[str, ...]:
-        """Those of an arm: the base's, the command line's, its own."""
-        return (*self.base, *self.extra, *(arm.overrides or ()))
+        """Those of an arm: the base's, the command line's, its own; of two for one key the later one."""
+        words = (*self.base, *self.extra, *(arm.overrides or ()))
+        return tuple({word.partition("=")[0].lstrip("+~"): word for word in words}.values())
 
     def runnable(self) -> tuple[Arm, ...]:
         """The arms that are not the paper's alone."""

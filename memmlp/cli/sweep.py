@@ -1,0 +1,184 @@
+"""`memmlp sweep`: bring all runs of a table, or of a sweep of one's own, to their end."""
+
+from __future__ import annotations
+
+import os
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from memmlp.cli.options import outputs_option
+from memmlp.errors import InputError
+
+if TYPE_CHECKING:
+    from memmlp.sweep.executors import Executor
+    from memmlp.sweep.plan import Plan
+    from memmlp.sweep.spec import Sweep
+
+OPTIONS = ("partition", "time", "mem_gb", "cpus", "gpus", "account", "qos", "constraint", "setup")
+
+
+@click.command("sweep")
+@click.argument("name")
+@click.argument("overrides", nargs=-1)
+@click.option("--workers", default=None, type=click.IntRange(1), help="At once; as many as cores by default.")
+@click.option("--status", is_flag=True, help="Show how far it is, and do nothing.")
+@click.option("--dry-run", is_flag=True, help="Show what would be run, and do nothing.")
+@click.option("--retry", is_flag=True, help="Run again what failed.")
+@click.option("--yes", is_flag=True, hidden=True)
+@outputs_option
+def sweep(
+    name: str,
+    overrides: tuple[str, ...],
+    workers: int | None,
+    status: bool,
+    dry_run: bool,
+    retry: bool,
+    yes: bool,
+    outputs: Path,
+) -> None:
+    """Run what is missing of a sweep: NAME is a file's path, a shipped sweep, or a table's number.
+
+    OVERRIDES are those of `memmlp train`, for all arms; `seed=0,1` sets the seeds. The workers are processes
+    of this machine, Slurm jobs (`executor=slurm slurm.partition=P slurm.time=MINUTES slurm.mem_gb=16
+    slurm.cpus=4 slurm.gpus=1`) or tasks of Ray (`executor=ray`).
+    """
+    from memmlp.cli.plan import find_sweep, planned, sweep_folder
+
+    engine, options, rest = split_executor(overrides)
+    count = workers or os.cpu_count() or 1
+    chosen = find_sweep(name).with_overrides(rest)
+    outputs = outputs.absolute()
+    plan = planned(chosen, outputs, prepare=not (status or dry_run))
+    if status or dry_run:
+        show(chosen, plan)
+        if dry_run:
+            forecast(plan, count)
+            if engine != "local":
+                click.echo(executor(engine, options, sweep_folder(chosen, outputs)).describe())
+        return
+    if retry:
+        for task in plan.tasks:
+            plan.run_of(task).retry()
+    if plan.left():
+        bring_to_end(chosen, plan, engine, options, count)
+    report(chosen, plan)
+
+
+def split_executor(words: tuple[str, ...]) -> tuple[str, dict[str, str], tuple[str, ...]]:
+    """The executor, its options, and the words that are Hydra's overrides."""
+    engine, options, rest = "local", {}, []
+    for word in words:
+        key, _, value = word.partition("=")
+        if key == "executor":
+            engine = value
+        elif key.startswith("slurm."):
+            options[key.removeprefix("slurm.")] = value
+        else:
+            rest.append(word)
+    if engine not in ("local", "slurm", "ray", "debug"):
+        raise InputError(f"executor={engine}: allowed is local, slurm or ray")
+    for key in options:
+        if key not in OPTIONS:
+            raise InputError(f"slurm.{key}: no such key; allowed here: {', '.join(OPTIONS)}")
+    if options and engine != "slurm":
+        raise InputError(f"slurm.{next(iter(options))}: goes with executor=slurm")
+    return engine, options, tuple(rest)
+
+
+def executor(engine: str, options: dict[str, str], folder: Path) -> Executor:
+    """The executor of that name, its workers' logs below the sweep's folder."""
+    from memmlp.sweep.executors import Ray, Submitit
+
+    if engine == "ray":
+        return Ray()
+    return Submitit(engine, folder / "workers" / "%j", slurm_options(options) if engine == "slurm" else None)
+
+
+def slurm_options(options: dict[str, str]) -> dict[str, object]:
+    """submitit's parameters for ours."""
+    numbers = {"time": "slurm_time", "mem_gb": "mem_gb", "cpus": "cpus_per_task", "gpus": "gpus_per_node"}
+    words = {"account", "qos", "constraint", "partition"}
+    found: dict[str, object] = {}
+    for key, value in options.items():
+        if key in numbers:
+            if not value.isdecimal() or int(value) == 0:
+                raise InputError(f"slurm.{key}={value}: allowed is a whole number above 0")
+            found[numbers[key]] = int(value)
+        elif key in words:
+            found[f"slurm_{key}"] = value
+        else:
+            found["slurm_setup"] = [value]
+    return found
+
+
+def bring_to_end(chosen: Sweep, plan: Plan, engine: str, options: dict[str, str], workers: int) -> None:
+    """Start workers and wait for them."""
+    from memmlp.cli.plan import sweep_folder
+    from memmlp.cli.work import work, work_alone
+    from memmlp.sweep.board import Board
+    from memmlp.sweep.controller import Fleet, oversee
+    from memmlp.sweep.worker import Presence
+
+    folder = sweep_folder(chosen, plan.outputs)
+    path = str(folder / "plan.json")
+    presence = Presence(folder / "controllers" / f"{os.getpid()}.lock")
+    threads = max((os.cpu_count() or 1) // workers, 1) if engine == "local" else 0
+    local = partial(work, path, threads, str(presence.path))
+    task = local if engine == "local" else partial(work_alone, path)
+    oversee(plan, Fleet(executor(engine, options, folder), task, workers), Board())
+
+
+def show(chosen: Sweep, plan: Plan) -> None:
+    """The board once, and what earlier versions of the file left."""
+    from rich.console import Console
+
+    from memmlp.cli.plan import orphans
+    from memmlp.sweep.board import render
+
+    missing = len(chosen.jobs()) - len(plan.entries)
+    if plan.entries:
+        Console(highlight=False).print(render(plan, plan.states()))
+    if missing:
+        click.echo(f"{missing} runs wait for their data to be prepared, which the sweep does first")
+    for entry in orphans(chosen, plan):
+        click.echo(f"orphan: run {entry.id} was '{entry.label}' seed {entry.seed} in an earlier version")
+
+
+def forecast(plan: Plan, workers: int) -> None:
+    """How long what is left may take, from finished runs of the same size."""
+    left = plan.left()
+    known = [sum(seconds) for task in plan.tasks if (seconds := _seconds(plan, task.id))]
+    line = f"{len(left)} of {len(plan.tasks)} runs to do, {workers} at once"
+    if known and left:
+        minutes = len(left) * sum(known) / len(known) / workers / 60
+        line += f": about {minutes:.0f} min, by {len(known)} finished runs of it"
+    click.echo(line)
+
+
+def _seconds(plan: Plan, run_id: str) -> list[float]:
+    """What the stages of a finished Mem-MLP run took."""
+    from memmlp.runs import Run
+
+    seconds = Run.of(plan.outputs, run_id).manifest.get("seconds")
+    return list(seconds.values()) if isinstance(seconds, dict) else []
+
+
+def report(chosen: Sweep, plan: Plan) -> None:
+    """What is done, what failed, and the next command. Exits with 1 where something failed."""
+    from memmlp.cli.plan import orphans
+
+    states = plan.states()
+    failed = [task for task in plan.tasks if states[task.id] in ("failed", "blocked")]
+    click.echo(f"{sum(state == 'done' for state in states.values())} of {len(states)} runs done")
+    for entry in orphans(chosen, plan):
+        click.echo(f"orphan: run {entry.id} was '{entry.label}' seed {entry.seed} in an earlier version")
+    for task in failed:
+        reason = plan.run_of(task).failure or "its VQ-VAE failed"
+        click.echo(f"failed: run {task.id}: {reason}", err=True)
+    if failed:
+        click.echo("again with: --retry", err=True)
+        raise SystemExit(1)
+    click.echo(f"next: memmlp table {' '.join([chosen.name, *chosen.extra])}")

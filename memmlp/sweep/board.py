@@ -1,0 +1,140 @@
+"""The live table of a sweep: arm by seed, what is done, running and waiting, and why something failed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+
+from rich import box
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from memmlp.runs import Metrics, Run
+from memmlp.sweep.plan import Plan, Task
+
+COLOURS = {"done": "green", "running": "cyan", "failed": "red", "blocked": "red", "lost": "yellow"}
+WORDS = {"new": "waiting", "stopped": "waiting, begun", "lost": "lost, to be taken over"}
+
+
+class Board:
+    """Shows a plan's state: a table that changes on a terminal, elsewhere a line for every change."""
+
+    def __init__(self, console: Console | None = None):
+        self.console = console or Console(highlight=False, stderr=True)
+        self.live = Live(console=self.console, refresh_per_second=4, transient=False)
+        self.before: dict[str, str] | None = None
+
+    def __enter__(self) -> Board:
+        if self.console.is_terminal:
+            self.live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.console.is_terminal:
+            self.live.stop()
+
+    def update(self, plan: Plan) -> None:
+        """Show the plan as it is now."""
+        states = plan.states()
+        if self.console.is_terminal:
+            self.live.update(render(plan, states))
+        else:
+            self._lines(plan, states)
+        self.before = states
+
+    def _lines(self, plan: Plan, states: Mapping[str, str]) -> None:
+        """A line for each task whose state is another than before."""
+        done = sum(state == "done" for state in states.values())
+        for task in plan.tasks:
+            state = states[task.id]
+            if self.before is not None and self.before.get(task.id) != state:
+                reason = plan.run_of(task).failure if state == "failed" else None
+                what = f"{name(plan, task)}: {WORDS.get(state, state)}{f', {reason}' if reason else ''}"
+                self.console.print(f"{done} of {len(states)} done; {what}", soft_wrap=True)
+
+
+def name(plan: Plan, task: Task) -> str:
+    """The task as a person knows it."""
+    cells = [f"{entry.label} seed {entry.seed}" for entry in plan.entries if entry.id == task.id]
+    return cells[0] if cells else f"VQ-VAE {task.id}"
+
+
+def render(plan: Plan, states: Mapping[str, str]) -> Group:
+    """Arms by seeds, the VQ-VAEs, the counts, and the reasons of what failed."""
+    tasks = {task.id: task for task in plan.tasks}
+    seeds = sorted({entry.seed for entry in plan.entries})
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=f"sweep {plan.name}", title_justify="left")
+    table.add_column("arm", overflow="fold")
+    for seed in seeds:
+        table.add_column(f"seed {seed}", no_wrap=True)
+    for label in dict.fromkeys(entry.label for entry in plan.entries):
+        cells = {e.seed: cell(plan, tasks[e.id], states[e.id]) for e in plan.entries if e.label == label}
+        table.add_row(Text(label), *(cells.get(seed, Text("-")) for seed in seeds))
+    below = [_upstream(plan, task, states[task.id]) for task in plan.tasks if task.kind == "vqvae"]
+    below += [Text(_counts(states))]
+    below += [
+        Text(f"{name(plan, task)}: {plan.run_of(task).failure}", style="red")
+        for task in plan.tasks
+        if states[task.id] == "failed"
+    ]
+    return Group(table, *below)
+
+
+def cell(plan: Plan, task: Task, state: str) -> Text:
+    """A run in a few characters."""
+    run = plan.run_of(task)
+    if state == "running":
+        return Text(progress(run, total_steps(task)), style=COLOURS[state])
+    if state == "done":
+        return Text(f"done {result(run)}".rstrip(), style=COLOURS[state])
+    return Text(WORDS.get(state, state), style=COLOURS.get(state, ""))
+
+
+def _upstream(plan: Plan, task: Task, state: str) -> Text:
+    return Text(f"VQ-VAE {task.id}: ") + cell(plan, task, state)
+
+
+def result(run: Run) -> str:
+    """The stream-mode MPJPE of a finished run."""
+    value = run.results.get("stream", {}).get("rotation", {}).get("MPJPE")
+    return f"{value:.2f} cm" if isinstance(value, int | float) else ""
+
+
+def total_steps(task: Task) -> int:
+    """Steps of the task's training."""
+    return int(task.config["vqvae" if task.kind == "vqvae" else "optim"]["steps"])
+
+
+def progress(run: Run, total: int) -> str:
+    """Steps, time left and loss of a run in training."""
+    log = [entry for entry in run.metrics() if entry.phase == "train"]
+    if not log:
+        return "starting"
+    if log[-1].step >= total:
+        return "evaluating"
+    left = time_left(log, total)
+    if left is None:
+        eta = ""
+    else:
+        eta = f" {left / 60:.0f} min" if left >= 90 else f" {left:.0f} s"
+    return f"{log[-1].step}/{total}{eta} loss {log[-1].values['loss']:.3g}"
+
+
+def time_left(log: list[Metrics], total: int) -> float | None:
+    """Seconds to the end of training at the rate of the last entries; None where there is no rate yet."""
+    recent = log[-5:]
+    steps, seconds = recent[-1].step - recent[0].step, recent[-1].time - recent[0].time
+    if steps <= 0 or seconds <= 0:
+        return None
+    return max((total - recent[-1].step) * seconds / steps - (time.time() - recent[-1].time), 0.0)
+
+
+def _counts(states: Mapping[str, str]) -> str:
+    """How many runs are in which state."""
+    counts: dict[str, int] = {}
+    for state in states.values():
+        word = WORDS.get(state, state).partition(",")[0]
+        counts[word] = counts.get(word, 0) + 1
+    return ", ".join(f"{count} {word}" for word, count in counts.items())

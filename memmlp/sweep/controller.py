@@ -1,0 +1,65 @@
+"""The controller of a sweep: keeps workers going while there is work, and shows how far it is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from memmlp.sweep.board import Board
+from memmlp.sweep.executors import Executor, Handle
+from memmlp.sweep.plan import Plan
+
+LOOK = 0.5  # seconds between looks at the run folders
+QUICK = 20.0  # seconds within which a worker that ends has not begun to work
+PATIENCE = 5  # workers in a row that may end so
+
+
+class Fleet:
+    """As many workers as there is work for; those that died are replaced.
+
+    Args:
+        executor: starts them. work: what a worker does. size: how many at most.
+    """
+
+    def __init__(self, executor: Executor, work: Callable[[], None], size: int):
+        self.executor, self.work, self.size = executor, work, size
+        self.handles: list[tuple[Handle, float]] = []
+        self.stillborn = 0
+
+    def keep(self, wanted: int) -> None:
+        """Bring the number of living workers to `wanted`, or to the fleet's size.
+
+        Raises RuntimeError when one after another ends as soon as it is started.
+        """
+        ended = [started for handle, started in self.handles if not handle.alive()]
+        self.handles = [(handle, started) for handle, started in self.handles if handle.alive()]
+        now = time.monotonic()
+        for started in ended:
+            self.stillborn = self.stillborn + 1 if now - started < QUICK else 0
+        if self.stillborn >= PATIENCE * self.size:
+            raise RuntimeError(f"workers end as soon as they are started; {self.executor.describe()}")
+        for _ in range(min(wanted, self.size) - len(self.handles)):
+            self.handles.append((self.executor.submit(self.work), now))
+
+    def cancel(self) -> None:
+        """End all workers."""
+        for handle, _ in self.handles:
+            if handle.alive():
+                handle.cancel()
+
+
+def oversee(plan: Plan, fleet: Fleet, board: Board) -> None:
+    """Keep the fleet at the plan until nothing is left; when interrupted, end the workers.
+
+    Runs that other sweeps' workers are at are waited for.
+    """
+    try:
+        with board:
+            board.update(plan)
+            while left := plan.left():
+                fleet.keep(len(left))
+                time.sleep(LOOK)
+                board.update(plan)
+    except BaseException:
+        fleet.cancel()
+        raise
