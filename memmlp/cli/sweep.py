@@ -46,6 +46,7 @@ def sweep(
     slurm.cpus=4 slurm.gpus=1`) or tasks of Ray (`executor=ray`).
     """
     from memmlp.cli.plan import find_sweep, planned, sweep_folder
+    from memmlp.sweep.executors import sbatch
 
     engine, options, rest = split_executor(overrides)
     count = workers or os.cpu_count() or 1
@@ -56,8 +57,8 @@ def sweep(
         show(chosen, plan)
         if dry_run:
             forecast(plan, count)
-            if engine != "local":
-                click.echo(executor(engine, options, sweep_folder(chosen, outputs)).describe())
+            if engine == "slurm":
+                click.echo(sbatch(sweep_folder(chosen, outputs) / "workers" / "%j", slurm_options(options)))
         return
     if retry:
         for task in plan.tasks:
@@ -99,7 +100,7 @@ def executor(engine: str, options: dict[str, str], folder: Path) -> Executor:
 
 def slurm_options(options: dict[str, str]) -> dict[str, object]:
     """submitit's parameters for ours."""
-    numbers = {"time": "slurm_time", "mem_gb": "mem_gb", "cpus": "cpus_per_task", "gpus": "gpus_per_node"}
+    numbers = {"time": "timeout_min", "mem_gb": "mem_gb", "cpus": "cpus_per_task", "gpus": "gpus_per_node"}
     words = {"account", "qos", "constraint", "partition"}
     found: dict[str, object] = {}
     for key, value in options.items():
@@ -108,9 +109,9 @@ def slurm_options(options: dict[str, str]) -> dict[str, object]:
                 raise InputError(f"slurm.{key}={value}: allowed is a whole number above 0")
             found[numbers[key]] = int(value)
         elif key in words:
-            found[f"slurm_{key}"] = value
+            found[key] = value
         else:
-            found["slurm_setup"] = [value]
+            found[key] = [value]
     return found
 
 
@@ -128,7 +129,8 @@ def bring_to_end(chosen: Sweep, plan: Plan, engine: str, options: dict[str, str]
     threads = max((os.cpu_count() or 1) // workers, 1) if engine == "local" else 0
     local = partial(work, path, threads, str(presence.path))
     task = local if engine == "local" else partial(work_alone, path)
-    oversee(plan, Fleet(executor(engine, options, folder), task, workers), Board())
+    fleet = Fleet(executor(engine, options, folder), task, workers, folder / "workers")
+    oversee(plan, fleet, Board())
 
 
 def show(chosen: Sweep, plan: Plan) -> None:

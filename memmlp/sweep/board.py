@@ -115,11 +115,14 @@ def progress(run: Run, total: int) -> str:
     if log[-1].step >= total:
         return "evaluating"
     left = time_left(log, total)
-    if left is None:
-        eta = ""
-    else:
-        eta = f" {left / 60:.0f} min" if left >= 90 else f" {left:.0f} s"
-    return f"{log[-1].step}/{total}{eta} loss {log[-1].values['loss']:.3g}"
+    return f"{log[-1].step}/{total}{_words(left)} loss {log[-1].values['loss']:.3g}"
+
+
+def _words(seconds: float | None) -> str:
+    """A time left, to the minute where it is long."""
+    if seconds is None:
+        return ""
+    return f" {seconds / 60:.0f} min" if seconds >= 90 else f" {seconds:.0f} s"
 
 
 def time_left(log: list[Metrics], total: int) -> float | None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 
+from memmlp.errors import InputError
 from memmlp.sweep.board import Board
 from memmlp.sweep.executors import Executor, Handle
 from memmlp.sweep.plan import Plan
@@ -18,18 +20,18 @@ class Fleet:
     """As many workers as there is work for; those that died are replaced.
 
     Args:
-        executor: starts them. work: what a worker does. size: how many at most.
+        executor: starts them. work: what a worker does. size: how many at most. logs: where theirs are.
     """
 
-    def __init__(self, executor: Executor, work: Callable[[], None], size: int):
-        self.executor, self.work, self.size = executor, work, size
+    def __init__(self, executor: Executor, work: Callable[[], None], size: int, logs: Path):
+        self.executor, self.work, self.size, self.logs = executor, work, size, logs
         self.handles: list[tuple[Handle, float]] = []
         self.stillborn = 0
 
     def keep(self, wanted: int) -> None:
         """Bring the number of living workers to `wanted`, or to the fleet's size.
 
-        Raises RuntimeError when one after another ends as soon as it is started.
+        Raises InputError when one after another ends as soon as it is started.
         """
         ended = [started for handle, started in self.handles if not handle.alive()]
         self.handles = [(handle, started) for handle, started in self.handles if handle.alive()]
@@ -37,7 +39,7 @@ class Fleet:
         for started in ended:
             self.stillborn = self.stillborn + 1 if now - started < QUICK else 0
         if self.stillborn >= PATIENCE * self.size:
-            raise RuntimeError(f"workers end as soon as they are started; {self.executor.describe()}")
+            raise InputError(f"workers end as soon as they are started; the reason is in {self.logs}")
         for _ in range(min(wanted, self.size) - len(self.handles)):
             self.handles.append((self.executor.submit(self.work), now))
 

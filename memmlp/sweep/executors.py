@@ -34,9 +34,6 @@ class Executor(Protocol):
     def submit(self, work: Callable[[], None]) -> Handle:
         """Start a worker; `work` must be importable where it runs."""
 
-    def describe(self) -> str:
-        """What would be started, for a look before the start."""
-
 
 class Requeued:
     """Work that a preempted Slurm job does again: its runs go on from their checkpoints."""
@@ -71,29 +68,50 @@ class Submitted:
 
 
 class Submitit:
-    """submitit's executors: cluster "local" (processes), "slurm", or "debug" (in this process)."""
+    """submitit's executors.
+
+    Args:
+        cluster: "local" (processes of this machine), "slurm", or "debug" (in this process).
+        folder: of the workers' logs, with %j for a worker's number.
+        options: submitit's parameters, those of sbatch among them.
+    """
 
     def __init__(self, cluster: str, folder: Path, options: Mapping[str, Any] | None = None):
         import submitit
 
         logging.getLogger("submitit").setLevel(logging.ERROR)
-        self.cluster, self.folder = cluster, folder
+        kinds = {
+            "local": submitit.LocalExecutor,
+            "slurm": submitit.SlurmExecutor,
+            "debug": submitit.DebugExecutor,
+        }
         try:
-            self.executor = submitit.AutoExecutor(folder=str(folder), cluster=cluster)
-            self.executor.update_parameters(**{"timeout_min": FOREVER, "name": "memmlp", **(options or {})})
-        except (RuntimeError, TypeError, ValueError, AssertionError, NameError) as error:
+            self.executor: submitit.Executor = kinds[cluster](folder=folder)
+            self.executor.update_parameters(**_parameters(options))
+        except (RuntimeError, TypeError, ValueError, NameError) as error:
             raise InputError(f"executor={cluster}: {' '.join(str(error).split())}") from None
 
     def submit(self, work: Callable[[], None]) -> Submitted:
         """Start a worker."""
         return Submitted(self.executor.submit(Requeued(work)))
 
-    def describe(self) -> str:
-        """The sbatch file of a worker, or where local ones leave their logs."""
-        inner: Any = self.executor._executor
-        if self.cluster != "slurm":
-            return f"workers' logs: {self.folder}"
-        return inner._make_submission_file_text("memmlp-worker", "")
+
+def sbatch(folder: Path, options: Mapping[str, Any] | None = None) -> str:
+    """What sbatch would be given for a worker, on a machine with or without Slurm."""
+    import submitit
+
+    class Anywhere(submitit.SlurmExecutor):
+        @classmethod
+        def affinity(cls) -> int:
+            return 1
+
+    executor = Anywhere(folder=folder)
+    executor.update_parameters(**_parameters(options))
+    return executor._make_submission_file_text(executor._submitit_command_str, "worker")
+
+
+def _parameters(options: Mapping[str, Any] | None) -> dict[str, Any]:
+    return {"name": "memmlp", "timeout_min": FOREVER, **(options or {})}
 
 
 class RayTask:
@@ -132,10 +150,6 @@ class Ray:
         import ray
 
         return RayTask(ray.remote(**self.options)(_call).remote(work))
-
-    def describe(self) -> str:
-        """Ray's resources for a worker."""
-        return f"Ray tasks with {self.options}"
 
 
 def _call(work: Callable[[], None]) -> None:
