@@ -80,14 +80,14 @@ class Submitit:
         import submitit
 
         logging.getLogger("submitit").setLevel(logging.ERROR)
-        kinds = {
+        kinds: dict[str, type[submitit.Executor]] = {
             "local": submitit.LocalExecutor,
             "slurm": submitit.SlurmExecutor,
             "debug": submitit.DebugExecutor,
         }
         try:
-            self.executor: submitit.Executor = kinds[cluster](folder=folder)
-            self.executor.update_parameters(**_parameters(options))
+            self.executor = kinds[cluster](folder=folder)
+            _set(self.executor, options)
         except (RuntimeError, TypeError, ValueError, NameError) as error:
             raise InputError(f"executor={cluster}: {' '.join(str(error).split())}") from None
 
@@ -106,12 +106,14 @@ def sbatch(folder: Path, options: Mapping[str, Any] | None = None) -> str:
             return 1
 
     executor = Anywhere(folder=folder)
-    executor.update_parameters(**_parameters(options))
+    _set(executor, options)
     return executor._make_submission_file_text(executor._submitit_command_str, "worker")
 
 
-def _parameters(options: Mapping[str, Any] | None) -> dict[str, Any]:
-    return {"name": "memmlp", "timeout_min": FOREVER, **(options or {})}
+def _set(executor: submitit.Executor, options: Mapping[str, Any] | None) -> None:
+    """Give the executor its options under the names it knows them by."""
+    common = {"name": "memmlp", "timeout_min": FOREVER, **(options or {})}
+    executor.update_parameters(**executor._convert_parameters(common))
 
 
 class RayTask:
