@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import click
 
+from memmlp.cli.chaos import chaos
+
 
 @click.group("bench")
 def bench() -> None:
@@ -83,3 +85,6 @@ def stream(clips: int, frames: int, rounds: int, device: str, overrides: tuple[s
     click.echo(
         f"ratio {np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f} over {rounds} rounds)"
     )
+
+
+bench.add_command(chaos)

@@ -6,6 +6,7 @@ import os
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
+from uuid import uuid4
 
 import click
 
@@ -125,7 +126,7 @@ def bring_to_end(chosen: Sweep, plan: Plan, engine: str, options: dict[str, str]
 
     folder = sweep_folder(chosen, plan.outputs)
     path = str(folder / "plan.json")
-    presence = Presence(folder / "controllers" / f"{os.getpid()}.lock")
+    presence = Presence(folder / "controllers" / f"{uuid4().hex}.lock")
     threads = max((os.cpu_count() or 1) // workers, 1) if engine == "local" else 0
     local = partial(work, path, threads, str(presence.path))
     task = local if engine == "local" else partial(work_alone, path)

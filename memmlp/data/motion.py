@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from filelock import FileLock
+
 from memmlp.data.prepare import Manifest, Source, finished, prepare
 
 
@@ -33,7 +35,10 @@ class Motion:
     def prepare(self) -> tuple[Path, Manifest]:
         """The cache, made where it is missing or out of date, and its manifest."""
         if self.generate is not None and not self.source.root.exists():
-            self._generate(self.generate)
+            self.source.root.parent.mkdir(parents=True, exist_ok=True)
+            with FileLock(self.source.root.with_name(f".{self.source.root.name}.lock")):
+                if not self.source.root.exists():  # nobody else has made it while this process waited
+                    self._generate(self.generate)
         return self.cache, prepare(self.source, self.cache)
 
     def digest(self) -> str | None:
