@@ -1,0 +1,179 @@
+"""`memmlp sweep` as a person types it, on tiny runs."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from memmlp.cli.plan import find_sweep, orphans, planned
+from memmlp.cli.sweep import split_executor
+from memmlp.errors import InputError
+from memmlp.runs import Run, list_runs
+
+MAIN = [sys.executable, "-c", "from memmlp.cli.main import main; main()"]
+TINY = [
+    "profile=tiny",
+    "data.synth.minutes=0.8",
+    "tracker=none",
+    "threads=1",
+    "optim.steps=6",
+    "vqvae.steps=6",
+]
+ARMS = {"full": [], "none": ["memory=none"], "wild": ["optim.lr=1e30"]}
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory) -> Path:
+    """A folder where a sweep of three arms, one of which diverges, was run."""
+    folder = tmp_path_factory.mktemp("sweep")
+    write(folder, ARMS)
+    (folder / "first.txt").write_text(command(folder, code=1))
+    return folder
+
+
+def write(folder: Path, arms: dict) -> None:
+    (folder / "trial.yaml").write_text(yaml.safe_dump({"arms": arms, "reference": "full"}))
+
+
+def command(folder: Path, *arguments: str, code: int = 0) -> str:
+    line = [*MAIN, "sweep", "trial.yaml", *TINY, *arguments]
+    ran = subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False)
+    assert ran.returncode == code, ran.stdout + ran.stderr
+    return ran.stdout + ran.stderr
+
+
+def stamps(folder: Path) -> dict[str, int]:
+    return {run.id: run.marker.stat().st_mtime_ns for run in list_runs(folder / "outputs") if run.done}
+
+
+def test_what_can_be_done_is_done_once(home: Path):
+    said = (home / "first.txt").read_text()
+    assert "3 of 4 runs done" in said
+    assert "wild seed 0: failed, loss is nan" in said
+    runs = list_runs(home / "outputs")
+    assert sorted(run.manifest["kind"] for run in runs if run.done) == ["memmlp", "memmlp", "vqvae"]
+    before = stamps(home)
+    assert "3 of 4 runs done" in command(home, code=1)
+    assert stamps(home) == before
+
+
+def test_status_and_dry_run_show_and_do_nothing(home: Path):
+    before = stamps(home)
+    said = command(home, "--status")
+    assert "full" in said
+    assert "failed" in said
+    assert "3 done, 1 failed" in said
+    forecast = command(home, "seed=0,1", "--dry-run", "--workers", "2")
+    assert "3 of 7 runs to do, 2 at once: about" in forecast
+    slurm = command(
+        home, "--dry-run", "executor=slurm", "slurm.partition=gpu", "slurm.time=30", "slurm.mem_gb=8"
+    )
+    assert "#SBATCH --partition=gpu" in slurm
+    assert "#SBATCH --mem=8GB" in slurm
+    assert stamps(home) == before
+
+
+def test_an_edited_file_adds_arms_and_lists_orphans(home: Path):
+    try:
+        write(home, {"full": [], "depth": ["model.depth=9"]})
+        said = command(home, "--status")
+        assert "1 done, 1 waiting" in said.replace("2 done", "1 done")
+        assert said.count("orphan: run") == 2
+    finally:
+        write(home, ARMS)
+    assert "orphan" not in command(home, "--status")
+
+
+def test_retry_takes_failed_runs_up_again(home: Path):
+    failed = next(run for run in list_runs(home / "outputs") if run.failure)
+    attempts = len(failed.manifest["attempts"])
+    assert "3 of 4 runs done" in command(home, "--retry", code=1)
+    assert len(Run(failed.folder).manifest["attempts"]) == attempts + 1
+    assert failed.failure is not None
+
+
+def test_debug_mode_works_in_this_process(home: Path):
+    assert "3 of 4 runs done" in command(home, "executor=debug", code=1)
+
+
+def test_a_plan_is_kept_until_the_data_changes(home: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(home)
+    chosen = find_sweep("trial.yaml").with_overrides(TINY)
+    outputs = (home / "outputs").absolute()
+    kept = json.loads(next(outputs.glob("sweeps/trial-*/planned.json")).read_text())
+    assert kept["stamp"]
+    first = planned(chosen, outputs)
+    clip = next((home / "outputs" / "data").rglob("*.npz"))
+    os.utime(clip)
+    assert planned(chosen, outputs).entries == ()
+    assert [task.id for task in planned(chosen, outputs, prepare=True).tasks] == [t.id for t in first.tasks]
+    assert orphans(chosen, planned(chosen, outputs)) == []
+
+
+def test_an_interrupted_sweep_ends_its_workers_and_goes_on_later(tmp_path: Path):
+    write(tmp_path, {"none": ["memory=none"]})
+    line = [*MAIN, "sweep", "trial.yaml", *TINY, "optim.steps=100000"]
+    with subprocess.Popen(
+        line, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        wait_for(lambda: any(run.step for run in list_runs(tmp_path / "outputs")))
+        run = list_runs(tmp_path / "outputs")[0]
+        assert run.status == "running"
+        process.send_signal(signal.SIGINT)
+        said, _ = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert "interrupted" in said
+    wait_for(lambda: run.status == "stopped" or run.status == "lost")
+
+
+def wait_for(condition, seconds: float = 90) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it never came to that"
+        time.sleep(0.1)
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["nosuch"], "sweep 'nosuch': no such sweep"),
+        (["99"], "sweep '99': no such sweep"),
+        (["missing.yaml"], "missing.yaml: No such file"),
+        (["trial.yaml", "memory=nosuch"], "memory=nosuch"),
+        (["trial.yaml", "executor=cloud"], "executor=cloud: allowed is local, slurm or ray"),
+        (["trial.yaml", "slurm.partition=x"], "slurm.partition: goes with executor=slurm"),
+        (["trial.yaml", "executor=slurm", "slurm.nodes=2"], "slurm.nodes: no such key"),
+        (["trial.yaml", "executor=slurm", "slurm.time=1h", "--dry-run"], "slurm.time=1h: allowed is a whole"),
+        (["trial.yaml", "seed=a"], "seed: ['a']; allowed is a list of whole numbers"),
+        (["trial.yaml", "data=mocap"], "arm 'full': data.root: has no value"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path: Path, words: list[str], line: str):
+    write(tmp_path, ARMS)
+    ran = subprocess.run([*MAIN, "sweep", *words], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ran.returncode == 2, ran.stdout + ran.stderr
+    assert line in ran.stderr
+    assert len(ran.stderr.strip().splitlines()) == 1
+
+
+def test_executor_words_are_no_overrides_of_the_runs():
+    assert split_executor(("executor=slurm", "slurm.time=5", "model.depth=8")) == (
+        "slurm",
+        {"time": "5"},
+        ("model.depth=8",),
+    )
+    with pytest.raises(InputError, match="executor"):
+        split_executor(("executor=",))
+
+
+@pytest.mark.parametrize("name", ["14", "table14", "04", "4", "memory_control"])
+def test_shipped_sweeps_are_found_by_name_and_number(name: str):
+    assert find_sweep(name).name in ("table14", "table04", "memory_control")

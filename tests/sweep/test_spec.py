@@ -1,0 +1,115 @@
+"""Sweep files: what they say, and one line for what they must not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from memmlp.errors import InputError
+from memmlp.sweep.spec import load_sweep, parse_sweep
+
+ARMS = {"full": [], "none": {"overrides": ["memory=none"], "paper": {"MPJPE": 4.13}}}
+
+
+def test_jobs_are_arms_by_seeds_with_base_and_difference():
+    sweep = parse_sweep("s", {"base": ["profile=tiny"], "seeds": [0, 2], "arms": ARMS})
+    assert [(job.label, job.seed, job.overrides) for job in sweep.jobs()] == [
+        ("full", 0, ("profile=tiny", "seed=0")),
+        ("full", 2, ("profile=tiny", "seed=2")),
+        ("none", 0, ("profile=tiny", "memory=none", "seed=0")),
+        ("none", 2, ("profile=tiny", "memory=none", "seed=2")),
+    ]
+
+
+def test_the_command_line_stands_over_the_base_and_below_the_arm():
+    content = {"base": ["model.depth=8"], "arms": {"ten": ["model.depth=10"], "base": []}}
+    sweep = parse_sweep("s", content).with_overrides(["model.depth=4", "optim.lr=1"])
+    assert set(sweep.overrides(sweep.arms[0])) == {"model.depth=10", "optim.lr=1"}
+    assert set(sweep.overrides(sweep.arms[1])) == {"model.depth=4", "optim.lr=1"}
+
+
+def test_seeds_of_the_command_line_replace_the_files():
+    sweep = parse_sweep("s", {"seeds": [0, 1], "arms": ARMS}).with_overrides(["seed=5,6,7", "profile=tiny"])
+    assert sweep.seeds == (5, 6, 7)
+    assert sweep.extra == ("profile=tiny",)
+
+
+def test_axes_are_a_grid_over_every_arm():
+    axes = {"model.frames": [11, 21], "memory.layers": [[2], [2, 4]], "seed": [3, 4]}
+    sweep = parse_sweep("s", {"arms": {"a": ["loss=manual"]}, "axes": axes})
+    assert sweep.seeds == (3, 4)
+    assert len(sweep.arms) == 4
+    assert sweep.arms[1].label == "a, model.frames=11, memory.layers=[2,4]"
+    assert sweep.arms[1].overrides == ("loss=manual", "model.frames=11", "memory.layers=[2,4]")
+    alone = parse_sweep("s", {"axes": {"model.frames": [11, 21]}})
+    assert [arm.label for arm in alone.arms] == ["model.frames=11", "model.frames=21"]
+
+
+def test_rows_of_the_paper_alone_are_not_run():
+    sweep = parse_sweep("s", {"arms": {"AvatarPoser": {"overrides": None}, "ours": []}})
+    assert [job.label for job in sweep.jobs()] == ["ours"]
+    assert sweep.reference == "ours"
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "the file: nothing; allowed is a mapping"),
+        ({"arms": ARMS, "sedes": [0]}, "sedes: no such key; did you mean seeds?"),
+        ({"arms": {}}, "arms: none to run"),
+        ({"arms": {"a": {"overrides": None}}}, "arms: none to run"),
+        ({"arms": {"a": {"overides": []}}}, "arms.a.overides: no such key; did you mean overrides?"),
+        ({"arms": {"a": "memory=none"}}, "arms.a: 'memory=none'; allowed is a mapping"),
+        ({"arms": {"a": ["memory none"]}}, "arms.a: 'memory none'; allowed is KEY=VALUE"),
+        ({"arms": {"a": ["seed=1"]}}, "the seeds are set by the key seeds"),
+        ({"arms": {"a": {"branch": "hips"}}}, "arms.a.branch: 'hips'; allowed are rotation"),
+        ({"arms": {"a": {"paper": {"MPJPX": 1}}}}, "arms.a.paper.MPJPX: no such key"),
+        ({"arms": {"a": {"paper": {"MPJPE": "3"}}}}, "arms.a.paper.MPJPE: '3'; allowed is a number"),
+        ({"arms": ARMS, "seeds": [0, 0]}, "seeds: [0, 0]; allowed is a list of whole numbers, each once"),
+        ({"arms": ARMS, "seeds": [-1]}, "seeds: [-1]"),
+        ({"arms": ARMS, "reference": "half"}, "reference: 'half' is no arm; allowed are full, none"),
+        ({"arms": ARMS, "metrics": ["FID"]}, "metrics: 'FID'; allowed are MPJRE"),
+        ({"arms": ARMS, "table": "four"}, "table: 'four'"),
+        ({"arms": ARMS, "axes": {"model.frames": 11}}, "axes.model.frames: allowed is a list of values"),
+        ({"arms": {1: [], "1": []}}, "arms: two have the same label"),
+        ({"arms": ARMS, "title": 5}, "title: 5; allowed is text"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, content, words: str):
+    with pytest.raises(InputError) as error:
+        parse_sweep("s", content)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("text", [b"arms: [", b"\xff\xfe", b"a: b: c"])
+def test_a_file_that_is_no_yaml_is_named(tmp_path: Path, text: bytes):
+    path = tmp_path / "mine.yaml"
+    path.write_bytes(text)
+    with pytest.raises(InputError, match=r"mine\.yaml"):
+        load_sweep(path)
+    with pytest.raises(InputError, match=r"absent\.yaml"):
+        load_sweep(tmp_path / "absent.yaml")
+
+
+KEYS = st.sampled_from(
+    ["title", "table", "notes", "base", "seeds", "reference", "metrics", "arms", "axes", "x"]
+)
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(st.dictionaries(KEYS, VALUES, max_size=6))
+def test_whatever_stands_in_it_is_a_sweep_or_one_line(content):
+    try:
+        said = str(len(parse_sweep("s", content).jobs()))
+    except InputError as error:
+        said = str(error)
+    assert said not in ("", "0")

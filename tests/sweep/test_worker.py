@@ -1,0 +1,209 @@
+"""Workers: each run exactly once, whoever dies, on plans without any training."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from memmlp.errors import InputError, TrainingDiverged
+from memmlp.runs import Run
+from memmlp.sweep import worker
+from memmlp.sweep.plan import Entry, Plan, Task, unique
+from memmlp.sweep.worker import Cancelled, Presence, attempt, work
+
+CODES = Task("c" * 16, "vqvae", {})
+ONE, TWO, ALONE = (
+    Task(str(n) * 16, "memmlp", {}, above) for n, above in ((1, CODES.id), (2, CODES.id), (3, None))
+)
+
+
+def plan(outputs: Path, *tasks: Task, **changes) -> Plan:
+    entries = tuple(Entry(f"arm {task.id[0]}", 0, task.id) for task in tasks if task.kind == "memmlp")
+    return Plan("trial", outputs, entries, unique(tasks), **changes)
+
+
+def saved(outputs: Path, *tasks: Task, **changes) -> Path:
+    path = outputs / "plan.json"
+    plan(outputs, *tasks, **changes).save(path)
+    return path
+
+
+def finish(plan: Plan, task: Task) -> None:
+    run = plan.run_of(task)
+    run.begin(task.kind, {}, data="d", upstream=task.upstream)
+    run.results_path.write_text("{}")
+    run.finish(["results.json"])
+
+
+def test_upstream_runs_come_first_and_each_task_once(tmp_path: Path):
+    seen: list[str] = []
+
+    def perform(plan: Plan, task: Task) -> None:
+        assert task.upstream is None or Run.of(plan.outputs, task.upstream).done
+        seen.append(task.id)
+        finish(plan, task)
+
+    work(saved(tmp_path, ONE, TWO, CODES, ALONE, ONE), perform)
+    assert sorted(seen) == sorted([ONE.id, TWO.id, CODES.id, ALONE.id])
+    assert seen[0] == CODES.id
+    work(saved(tmp_path, ONE, TWO, CODES, ALONE), perform)
+    assert len(seen) == 4
+
+
+def test_a_failure_is_left_with_its_run_and_the_others_go_on(tmp_path: Path):
+    errors = {
+        ONE.id: InputError("a bad key"),
+        TWO.id: TrainingDiverged("loss is nan"),
+        ALONE.id: ValueError("a\nbug"),
+    }
+
+    def perform(plan: Plan, task: Task) -> None:
+        if task.id in errors:
+            raise errors[task.id]
+        finish(plan, task)
+
+    path = saved(tmp_path, CODES, ONE, TWO, ALONE)
+    work(path, perform)
+    now = Plan.load(path)
+    assert now.states() == {CODES.id: "done", ONE.id: "failed", TWO.id: "failed", ALONE.id: "failed"}
+    assert now.run_of(ONE).failure == "a bad key"
+    assert now.run_of(ALONE).failure == "ValueError: a bug"
+    assert now.left() == []
+    del errors[ONE.id]
+    now.run_of(ONE).retry()
+    work(path, perform)
+    assert now.states()[ONE.id] == "done"
+
+
+def test_what_needs_a_failed_run_is_blocked(tmp_path: Path):
+    def perform(plan: Plan, task: Task) -> None:
+        raise InputError("no")
+
+    path = saved(tmp_path, CODES, ONE, ALONE)
+    work(path, perform)
+    assert Plan.load(path).states() == {CODES.id: "failed", ONE.id: "blocked", ALONE.id: "failed"}
+
+
+def test_a_cancelled_run_is_left_as_it_is(tmp_path: Path):
+    def perform(plan: Plan, task: Task) -> None:
+        plan.run_of(task).begin("memmlp", {}, data="d", upstream=None)
+        saved(tmp_path, ALONE, cancelled=(ALONE.id,))
+        raise Cancelled
+
+    path = saved(tmp_path, ALONE)
+    work(path, perform)
+    assert Plan.load(path).run_of(ALONE).status == "stopped"
+    assert Plan.load(path).left() == []
+
+
+def test_a_worker_stays_while_its_plan_is_open_and_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(worker, "PAUSE", 0.01)
+    path = saved(tmp_path, open=True)
+    done: list[str] = []
+
+    def perform(plan: Plan, task: Task) -> None:
+        done.append(task.id)
+        finish(plan, task)
+
+    thread = threading.Thread(target=work, args=(path, perform))
+    thread.start()
+    time.sleep(0.05)
+    assert thread.is_alive()
+    saved(tmp_path, ALONE, open=True)
+    deadline = time.monotonic() + 10
+    while not done and time.monotonic() < deadline:
+        time.sleep(0.01)
+    saved(tmp_path, ALONE)
+    thread.join(10)
+    assert not thread.is_alive()
+    assert done == [ALONE.id]
+    work(saved(tmp_path, ONE, open=True), perform, wanted=lambda: False)
+    assert done == [ALONE.id]
+
+
+def test_a_run_whose_process_died_is_lost_then_taken_over(tmp_path: Path):
+    path = saved(tmp_path, ALONE)
+    code = (
+        "import sys, time; from pathlib import Path; from memmlp.sweep.worker import work\n"
+        "def perform(plan, task):\n"
+        "    plan.run_of(task).begin('memmlp', {}, data='d', upstream=None)\n"
+        "    print('at it', flush=True); time.sleep(60)\n"
+        "work(Path(sys.argv[1]), perform)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE) as victim:
+        assert victim.stdout is not None
+        victim.stdout.readline()
+        assert Plan.load(path).states()[ALONE.id] == "running"
+        assert not attempt(Plan.load(path), ALONE, finish)
+        victim.send_signal(signal.SIGKILL)
+        victim.wait()
+    assert Plan.load(path).states()[ALONE.id] == "lost"
+    work(path, finish)
+    run = Plan.load(path).run_of(ALONE)
+    assert run.status == "done"
+    assert len(run.manifest["attempts"]) == 2
+
+
+def test_a_run_that_kills_its_workers_fails_at_last(tmp_path: Path):
+    path = saved(tmp_path, ALONE)
+    run = Plan.load(path).run_of(ALONE)
+    for _ in range(worker.DEATHS - 1):
+        run.begin("memmlp", {}, data="d", upstream=None)
+    assert worker.deaths(run) == worker.DEATHS - 1
+    run.log(5, {"loss": 1.0})
+    assert worker.deaths(run) == 0
+    for _ in range(worker.DEATHS):
+        run.begin("memmlp", {}, data="d", upstream=None)
+    work(path, finish)
+    assert run.status == "failed"
+    assert "processes died at step 5" in str(run.failure)
+
+
+def test_many_workers_perform_each_task_exactly_once(tmp_path: Path):
+    tasks = [Task(f"{n:016x}", "memmlp", {}, CODES.id if n % 2 else None) for n in range(12)]
+    path = saved(tmp_path, CODES, *tasks)
+    code = (
+        "import os, sys, time; from pathlib import Path; from memmlp.sweep.worker import work\n"
+        "import memmlp.sweep.worker as w; w.PAUSE = 0.01\n"
+        "def perform(plan, task):\n"
+        "    with open(sys.argv[2], 'ab', buffering=0) as log: log.write((task.id + '\\n').encode())\n"
+        "    run = plan.run_of(task)\n"
+        "    run.begin(task.kind, {}, data='d', upstream=None); time.sleep(0.02)\n"
+        "    run.results_path.write_text('{}'); run.finish(['results.json'])\n"
+        "work(Path(sys.argv[1]), perform)"
+    )
+    log = tmp_path / "log"
+    workers = [subprocess.Popen([sys.executable, "-c", code, str(path), str(log)]) for _ in range(4)]
+    assert [process.wait(60) for process in workers] == [0] * 4
+    assert Counter(log.read_text().split()) == Counter([CODES.id, *(task.id for task in tasks)])
+    assert not list(tmp_path.glob("runs/*/.holder"))
+
+
+def test_presence_ends_with_its_process(tmp_path: Path):
+    path = tmp_path / "here.lock"
+    code = (
+        "import sys, time; from pathlib import Path; from memmlp.sweep.worker import Presence\n"
+        "here = Presence(Path(sys.argv[1])); print('here', flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        assert Presence.of(path)
+        os.kill(process.pid, signal.SIGKILL)
+    assert not Presence.of(path)
+
+
+def test_a_plan_that_is_none_is_one_line(tmp_path: Path):
+    path = tmp_path / "plan.json"
+    for text in ("", "[]", "{}", '{"entries": [{}], "tasks": [], "cancelled": []}'):
+        path.write_text(text)
+        with pytest.raises(InputError, match=r"plan\.json: not a sweep's plan"):
+            Plan.load(path)
