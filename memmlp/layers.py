@@ -21,7 +21,10 @@ class TimeMix(nn.Module):
 
     def forward(self, h: Tensor, newest: int = 0) -> Tensor:
         """(B, T, d) -> (B, T, d), or of the `newest` frames alone."""
-        return self.weight[-newest:] @ h + self.bias[-newest:]
+        weight = self.weight[-newest:].expand(len(h), -1, -1)
+        return torch.baddbmm(
+            self.bias[-newest:], weight, h
+        )  # the same numbers as weight @ h + bias, in one pass
 
 
 class MLPBlock(nn.Module):
