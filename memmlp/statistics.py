@@ -57,7 +57,7 @@ class Effects(NamedTuple):
 
 
 def paired_effects(differences: np.ndarray) -> Effects:
-    """Mean, 95 % interval and p-value of the differences (K, S, C) of K comparisons over S seeds and C clips."""
+    """Mean, 95 % interval and p-value of differences (K, S, C): K comparisons over S seeds and C clips."""
     mean = differences.mean((1, 2))
     error, freedom = standard_error(differences)
     low, high = _stretched(differences, mean, error, freedom)

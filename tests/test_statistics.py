@@ -20,7 +20,7 @@ def differences(seeds: int, clips: int, shares: tuple[float, float, float], sets
 
 
 def test_standard_error_by_hand():
-    # means 2, 4 over clips and over seeds: variance 2 each, so 2/2 + 2/2 with 2^2 / (1 + 1) degrees of freedom
+    # means 2, 4 over clips and over seeds: variances 2, so 2/2 + 2/2 with 2^2 / (1 + 1) degrees of freedom
     error, freedom = standard_error(np.array([[[1.0, 3.0], [3.0, 5.0]]]))
     assert error[0] ** 2 == pytest.approx(2)
     assert freedom[0] == pytest.approx(2)

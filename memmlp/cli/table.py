@@ -1,0 +1,133 @@
+"""`memmlp table`: what was measured beside what the paper prints."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from memmlp.cli.options import outputs_option
+from memmlp.errors import InputError
+
+if TYPE_CHECKING:
+    from memmlp.sweep.spec import Arm, Sweep
+    from memmlp.tables.collect import Find, Table
+
+MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", "window")}
+
+
+@click.command("table")
+@click.argument("name")
+@click.argument("overrides", nargs=-1)
+@click.option(
+    "--format", "form", type=click.Choice(["md", "tex", "json", "html"]), help="In place of the screen's."
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path, dir_okay=False), help="File; its ending tells the format."
+)
+@click.option(
+    "--mode", type=click.Choice(list(MODES)), default="both", show_default=True, help="Of evaluation."
+)
+@outputs_option
+def table(
+    name: str, overrides: tuple[str, ...], form: str | None, out: Path | None, mode: str, outputs: Path
+) -> None:
+    """The table of a sweep: NAME is a file's path, a shipped sweep, a table's number, or `all`.
+
+    OVERRIDES are those that the sweep was run with; they find its runs again.
+    """
+    tables = tables_of(name, overrides, outputs, MODES[mode])
+    if form is None and out is None:
+        _print(tables)
+        return
+    text = _formatted(tables, form or _form_of(out), alone=name != "all")
+    if out is None:
+        click.echo(text, nl=False)
+    else:
+        _write(out, text)
+
+
+def tables_of(name: str, overrides: Sequence[str], outputs: Path, modes: Sequence[str]) -> list[Table]:
+    """The tables that a name stands for.
+
+    A table of the paper whose config lacks something (where AMASS lies) shows the paper's values and says so.
+    Raises InputError where none can be composed with the command line's overrides.
+    """
+    from memmlp.tables.collect import collect, without_runs
+    from memmlp.tables.measured import load
+
+    read, tables, failures = functools.cache(load), [], []
+    for sweep, command in zip(*chosen(name, overrides), strict=True):
+        try:
+            tables.append(collect(sweep, finder(sweep, outputs), modes, command, read))
+        except InputError as error:
+            failures.append(error)
+            tables.append(without_runs(sweep, modes, f"nothing measured: {error}"))
+    if failures and (overrides or tables[0].number is None) and len(failures) == len(tables):
+        raise failures[0]
+    return tables
+
+
+def chosen(name: str, overrides: Sequence[str]) -> tuple[list[Sweep], list[str]]:
+    """The sweeps of a name, with the command line's overrides, and how each is called on a command line."""
+    from memmlp.cli.plan import find_sweep
+    from memmlp.cli.shipped import shipped
+
+    names = [name] if name != "all" else sorted(path.stem for path in shipped("sweeps").glob("table*.yaml"))
+    sweeps = [find_sweep(one).with_overrides(overrides) for one in names]
+    return sweeps, [" ".join(["memmlp sweep", one, *overrides]) for one in names]
+
+
+def finder(sweep: Sweep, outputs: Path) -> Find:
+    """What finds the sweep's runs. Raises InputError where its config is wrong."""
+    from memmlp.cli.plan import planned
+
+    plan = planned(sweep, outputs.absolute())
+    runs = {(entry.label, entry.seed): plan.run_of(entry) for entry in plan.entries}
+
+    def find(arm: Arm, seed: int):
+        return runs.get((arm.label, seed))
+
+    return find
+
+
+def _print(tables: Sequence[Table]) -> None:
+    from rich.console import Console
+
+    from memmlp.tables.render import show
+
+    console = Console(highlight=False, markup=False)
+    for one in tables:
+        show(one, console)
+
+
+def _formatted(tables: Sequence[Table], form: str, alone: bool) -> str:
+    """The tables' text; of JSON one object, or a list for `all`."""
+    from memmlp.tables.render import FORMATS
+
+    texts = [FORMATS[form](one) for one in tables]
+    if form == "json" and not alone:
+        return "[\n" + ",\n".join(text.rstrip() for text in texts) + "\n]\n"
+    return "\n".join(texts)
+
+
+def _form_of(out: Path | None) -> str:
+    """The format that a file's ending tells."""
+    from memmlp.tables.render import FORMATS
+
+    ending = out.suffix.removeprefix(".") if out else ""
+    if ending not in FORMATS:
+        raise InputError(f"--out {out}: allowed endings are {', '.join(FORMATS)}, or any with --format")
+    return ending
+
+
+def _write(out: Path, text: str) -> None:
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"--out {out}: {error.strerror or error}") from None
+    click.echo(str(out))

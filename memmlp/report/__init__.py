@@ -1,0 +1,1 @@
+"""One HTML page of a project's tables, figures and runs."""

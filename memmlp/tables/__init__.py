@@ -1,0 +1,1 @@
+"""Tables of a sweep's arms: what was measured beside what the paper prints."""

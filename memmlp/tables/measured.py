@@ -1,0 +1,103 @@
+"""What a finished run has to say to a table."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from memmlp.errors import InputError
+from memmlp.runs import Run
+
+Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # mode -> branch -> metric -> value
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a run was made from and on; runs of one table should agree in it.
+
+    Attributes:
+        code: commit, or the version where there is no checkout. changed: whether it had uncommitted changes.
+        data: digest of the prepared data. hardware: the processor.
+    """
+
+    code: str
+    changed: bool
+    data: str
+    hardware: str
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The results of a finished run.
+
+    Attributes:
+        run: where they lie.
+        means: the metrics' means over the test clips. clips: those of each clip by its name.
+        costs: GFLOP and ms of a streaming step, millions of parameters, MB of the ONNX file, frames a second.
+        origin: what the run was made from.
+    """
+
+    run: Run
+    means: Errors
+    clips: Mapping[str, Errors]
+    costs: Mapping[str, float]
+    origin: Origin
+
+    def value(self, mode: str, branch: str, metric: str) -> float | None:
+        """A metric's mean over clips, or a cost; None where the run has none."""
+        if metric in self.costs:
+            return self.costs[metric]
+        return _number(self.means, mode, branch, metric)
+
+    def by_clip(self, names: list[str], mode: str, branch: str, metric: str) -> np.ndarray:
+        """A metric of these clips (C,); NaN where the run has none."""
+        numbers = [_number(self.clips[name], mode, branch, metric) for name in names]
+        return np.array([np.nan if number is None else number for number in numbers])
+
+
+def load(folder: Path) -> Measured:
+    """Read a finished run. Raises InputError, naming the file that is damaged."""
+    run = Run(folder)
+    results, manifest = _read(run.results_path, dict), _read(run.manifest_path, dict)
+    clips = {clip["name"]: clip for clip in _read(run.clips, list)}
+    return Measured(run, results, clips, _costs(results.get("latency", {})), _origin(manifest))
+
+
+def _read(path: Path, kind: type) -> Any:
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        content = None
+    if not isinstance(content, kind):
+        raise InputError(f"{path}: cannot be read; do the run again with force=true, or remove its folder")
+    return content
+
+
+def _costs(latency: Mapping[str, float]) -> dict[str, float]:
+    """The costs that the measurement has, in the tables' units."""
+    costs = {
+        "FLOPs": latency.get("flops", np.nan) / 1e9,
+        "parameters": latency.get("parameters", np.nan) / 1e6,
+        "size": latency.get("onnx_bytes", np.nan) / 1e6,
+        "ms": latency.get("median_ms", np.nan),
+        "FPS": 1000 / latency.get("median_ms", np.nan),
+    }
+    return {name: float(cost) for name, cost in costs.items() if not np.isnan(cost)}
+
+
+def _origin(manifest: Mapping[str, Any]) -> Origin:
+    git = manifest.get("git") or {}
+    code = git["commit"][:7] if git else f"version {manifest.get('version', '?')}"
+    data, hardware = str(manifest.get("data", "?"))[:8], str(manifest.get("cpu", "?"))
+    return Origin(code, bool(git.get("dirty")), data, hardware)
+
+
+def _number(errors: Errors, mode: str, branch: str, metric: str) -> float | None:
+    """A value of nested errors; files hold NaN as a word."""
+    value = errors.get(mode, {}).get(branch, {}).get(metric)
+    return None if value is None else float(value)

@@ -1,0 +1,201 @@
+"""A table as Markdown, LaTeX, HTML, JSON, or on a terminal."""
+
+from __future__ import annotations
+
+import html
+import itertools
+import json
+import re
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from rich.console import Console
+
+from memmlp.files import plain
+from memmlp.tables.collect import Table
+from memmlp.tables.grid import MINUS, Grid, Line, caption, grids, legend
+
+GAP = "  "  # between columns
+LABEL = 18  # characters of the arms' column on a terminal, at most
+TEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
+    "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", MINUS: "$-$",
+    "↓": r"$\downarrow$", "↑": r"$\uparrow$", "✓": r"$\checkmark$", "✗": r"$\times$",
+    "²": r"\textsuperscript{2}", "³": r"\textsuperscript{3}", "<": r"$<$", ">": r"$>$",
+}  # fmt: skip
+
+
+def markdown(table: Table) -> str:
+    """GitHub's Markdown."""
+    parts = [f"### {_md(caption(table))}"]
+    for grid in grids(table):
+        rows = [list(map(_md, grid.header)), ["---", ":---:", *["---:"] * len(table.metrics)]]
+        rows += [[_md(word) for word in (*line.head, *map(" ".join, line.cells))] for line in _all(grid)]
+        text = "\n".join(f"| {' | '.join(row)} |" for row in rows)
+        parts.append(f"**{grid.mode}**\n\n{text}" if grid.mode else text)
+    remarks = "\n".join(f"- {_md(line)}" for line in _remarks(table))
+    return "\n\n".join([*parts, remarks] if remarks else parts) + "\n"
+
+
+def latex(table: Table) -> str:
+    """A LaTeX table for the packages booktabs and amssymb."""
+    lines = ["% needs \\usepackage{booktabs,amssymb}", r"\begin{table}", r"\centering", r"\small"]
+    lines.append(rf"\caption{{{_tex(caption(table))}}}")
+    lines.append(rf"\begin{{tabular}}{{ll{'r' * len(table.metrics)}}}")
+    lines.append(r"\toprule")
+    for number, grid in enumerate(grids(table)):
+        columns = len(grid.header)
+        lines += [r"\midrule"] if number else []
+        lines += [rf"\multicolumn{{{columns}}}{{l}}{{\emph{{{grid.mode} mode}}}} \\"] if grid.mode else []
+        lines += [" & ".join(map(_tex, grid.header)) + r" \\", r"\midrule"]
+        lines += [_tex_line(line) for line in _all(grid)]
+    lines += [r"\bottomrule", r"\end{tabular}"]
+    lines += [rf"\par\smallskip\raggedright\footnotesize {_tex(line)}." for line in _remarks(table)]
+    return "\n".join([*lines, r"\end{table}"]) + "\n"
+
+
+def as_json(table: Table) -> str:
+    """All there is, with the values of each seed."""
+    return json.dumps(plain(_with_summaries(table)), indent=2, ensure_ascii=False) + "\n"
+
+
+def as_html(table: Table) -> str:
+    """A section to put into a page."""
+    parts = [f'<section class="result" id="{_html(table.name)}"><h3>{_html(caption(table))}</h3>']
+    for grid in grids(table):
+        title = f"<caption>{_html(grid.mode)} mode</caption>" if grid.mode else ""
+        head = "".join(f'<th scope="col">{_html(word)}</th>' for word in grid.header)
+        body = "".join(f"<tbody>{''.join(map(_html_line, group))}</tbody>" for group in grid.groups)
+        parts.append(f'<div class="scroll"><table>{title}<thead><tr>{head}</tr></thead>{body}</table></div>')
+    remarks = "".join(f"<li>{_html(line)}</li>" for line in _remarks(table))
+    return "\n".join([*parts, f'<ul class="remarks">{remarks}</ul>' if remarks else "", "</section>"])
+
+
+def show(table: Table, console: Console) -> None:
+    """Print on a terminal, the columns that do not fit in further blocks below."""
+    console.print(caption(table), style="bold", soft_wrap=True)
+    for grid in grids(table):
+        if grid.mode:
+            console.print(f"{grid.mode} mode", style="italic")
+        for columns in _fitting(grid, console.width):
+            console.out("\n".join(_lined(grid, columns)), "", sep="\n", highlight=False)
+    for line in _remarks(table):
+        console.print(f"- {line}")
+    console.print()
+
+
+FORMATS: dict[str, Callable[[Table], str]] = {
+    "md": markdown, "tex": latex, "json": as_json, "html": as_html
+}  # fmt: skip
+
+
+def _all(grid: Grid) -> Iterator[Line]:
+    return (line for group in grid.groups for line in group)
+
+
+def _remarks(table: Table) -> list[str]:
+    """What stands below a table."""
+    return [*legend(table), *table.flags, *table.notes]
+
+
+def _md(text: str) -> str:
+    return re.sub(r"([\\`*_|<>\[\]#])", r"\\\1", text)
+
+
+def _tex(text: str) -> str:
+    return "".join(TEX.get(letter, letter) for letter in text)
+
+
+def _tex_line(line: Line) -> str:
+    words = [*line.head, *map(" ".join, line.cells)]
+    return " & ".join(map(_tex, words)) + r" \\"
+
+
+def _html(text: str | None) -> str:
+    return html.escape(text or "")
+
+
+def _html_line(line: Line) -> str:
+    """A row; the arm's label heads it."""
+    label, seeds = line.head
+    head = f'<th scope="row">{_html(label)}</th><td class="seeds">{_html(seeds)}</td>'
+    cells = "".join(f"<td>{'<br>'.join(map(_html_mark, cell))}</td>" for cell in line.cells)
+    return f'<tr class="{line.kind}">{head}{cells}</tr>'
+
+
+def _html_mark(text: str) -> str:
+    """A part of a cell, its sign of agreement or significance set off."""
+    marks = {"✓": "same", "✗": "opposite", "*": "significant"}
+    escaped = _html(text)
+    for mark, name in marks.items():
+        escaped = escaped.replace(mark, f'<span class="{name}">{mark}</span>')
+    return escaped
+
+
+def _fitting(grid: Grid, width: int) -> list[list[int]]:
+    """The metrics' columns in groups of about one size that fit beside the arms'."""
+    columns = range(2, len(grid.header))
+    widths = [
+        _width(block[column] for block in _blocks(grid)) + len(GAP) for column in range(len(grid.header))
+    ]
+    for groups in range(1, len(columns) + 1):
+        size = -(-len(columns) // groups)
+        fits = [list(columns[i : i + size]) for i in range(0, len(columns), size)]
+        if all(sum(widths[:2]) + sum(widths[i] for i in group) <= width for group in fits):
+            break
+    return fits
+
+
+def _lined(grid: Grid, columns: Sequence[int]) -> Iterator[str]:
+    """Some columns of a grid in lines. (Hundreds of arms would take rich's table seconds.)"""
+    blocks = [[block[i] for i in (0, 1, *columns)] for block in _blocks(grid)]
+    widths = [_width(block[i] for block in blocks) for i in range(len(columns) + 2)]
+    for number, block in enumerate(blocks):
+        for words in itertools.zip_longest(*block, fillvalue=""):
+            padded = [
+                word.ljust(widths[i]) if i < 2 else word.rjust(widths[i]) for i, word in enumerate(words)
+            ]
+            yield GAP.join(padded).rstrip()
+        if number == 0:
+            yield "─" * (sum(widths) + len(GAP) * (len(widths) - 1))
+        elif len(block[1]) > 1:
+            yield ""
+
+
+def _width(parts: Iterable[Sequence[str]]) -> int:
+    return max(len(word) for part in parts for word in part)
+
+
+def _blocks(grid: Grid) -> list[list[Sequence[str]]]:
+    """The head and each arm, as the lines of each of their columns."""
+    return [[*map(_header, grid.header)], *map(_block, grid.groups)]
+
+
+def _block(group: Sequence[Line]) -> list[Sequence[str]]:
+    """An arm's columns, the label folded beside its lines."""
+    columns: list[list[str]] = [[] for _ in (0, *group[0].cells)]
+    for line in group:
+        height = max(map(len, line.cells))
+        for column, parts in zip(columns, [(line.head[1],), *line.cells], strict=True):
+            column += [*parts, *[""] * (height - len(parts))]
+    return [textwrap.wrap(group[0].head[0], LABEL), *columns]
+
+
+def _header(name: str) -> list[str]:
+    """A column's head in two lines: name and direction, unit."""
+    metric, _, rest = name.partition(" [")
+    unit, _, arrow = rest.partition("] ")
+    return [f"{metric} {arrow}", unit] if rest else [name]
+
+
+def _with_summaries(table: Table) -> dict[str, Any]:
+    """The table's fields, each cell with its mean, sd and agreement."""
+    fields = asdict(table)
+    for row, words in zip(table.rows, fields["rows"], strict=True):
+        for mode, cells in row.cells.items():
+            for metric, cell in cells.items():
+                summary = {"mean": cell.mean, "sd": cell.sd, "agrees": cell.agrees}
+                words["cells"][mode][metric] |= summary
+    return fields

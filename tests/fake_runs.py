@@ -1,0 +1,120 @@
+"""Finished runs made of random numbers, for tests of tables and pages. Nothing was trained."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from memmlp.runs import Run
+from memmlp.sweep.spec import Arm, Sweep
+from memmlp.tables.collect import Find
+
+BASE = {
+    "MPJRE": 4.15, "geodesic": 6.9, "MPJPE": 6.5, "Hand PE": 2.1, "Upper PE": 3.3, "Lower PE": 9.6,
+    "Root PE": 5.0, "MPJVE": 38.0, "Jitter": 11.0, "GT Jitter": 7.1,
+}  # fmt: skip
+NO_POSITIONS = ("MPJRE", "geodesic")
+CLIPS = ("salsa/02", "salsa/09", "salsa/17", "kicks/24")
+ORIGIN = {
+    "version": "0.3.0", "git": {"commit": "0123456789abcdef", "dirty": False}, "data": "d" * 64,
+    "cpu": "A processor", "cores": 2, "host": "h" * 12,
+}  # fmt: skip
+
+
+def fake_run(
+    outputs: Path,
+    name: str,
+    seed: int = 0,
+    factor: float = 1.0,
+    clips: Sequence[str] = CLIPS,
+    branches: Sequence[str] = ("rotation", "position", "combined"),
+    origin: Mapping[str, Any] | None = None,
+    config: Mapping[str, Any] | None = None,
+    log: bool = False,
+) -> Run:
+    """A finished run whose errors are `factor` times the usual ones, with effects of seed, clip and both."""
+    run = Run.of(outputs, hashlib.sha256(f"{name} {seed}".encode()).hexdigest()[:16])
+    run.folder.mkdir(parents=True)
+    rows = [_clip(clip, seed, factor, run.id, branches) for clip in clips]
+    latency = {"median_ms": 0.8 * factor, "parameters": 356_798, "flops": 26_000_000, "onnx_bytes": 1_900_000}
+    means = {mode: _means([row[mode] for row in rows]) for mode in ("window", "stream")}
+    manifest = {"id": run.id, "kind": "memmlp", "seconds": {"train": 300.0, "evaluate": 20.0}, **ORIGIN}
+    manifest |= {"started": "2026-01-02T03:04:05+00:00", **(origin or {})}
+    files = {
+        run.clips: rows,
+        run.results_path: means | {"latency": latency},
+        run.manifest_path: manifest,
+        run.config_path: {"seed": seed, "memory": {"layers": [2, 4]}, **(config or {})},
+        run.marker: {"id": run.id, "artifacts": {"results.json": "0"}},
+    }
+    for path, content in files.items():
+        path.write_text(json.dumps(content))
+    if log:
+        _log(run, factor)
+    return run
+
+
+def fake_sweep(
+    outputs: Path, sweep: Sweep, effects: Mapping[str, float] | None = None, **settings: Any
+) -> Find:
+    """Runs of all arms and seeds; `effects` are factors on the errors by label. Returns what finds them."""
+    runs = {
+        (arm.label, seed): fake_run(
+            outputs,
+            f"{sweep.name} {arm.label}",
+            seed,
+            (effects or {}).get(arm.label, 1.0),
+            config={"overrides": list(arm.overrides or ())},
+            **settings,
+        )
+        for arm in sweep.runnable()
+        for seed in sweep.seeds
+    }
+
+    def find(arm: Arm, seed: int) -> Run | None:
+        return runs.get((arm.label, seed))
+
+    return find
+
+
+def _draw(*words: object) -> np.random.Generator:
+    digest = hashlib.sha256(" ".join(map(str, words)).encode()).digest()
+    return np.random.default_rng(int.from_bytes(digest[:8], "big"))
+
+
+def _clip(clip: str, seed: int, factor: float, name: str, branches: Sequence[str]) -> dict[str, Any]:
+    """A row of clips.json: the clip's difficulty and the seed's luck, the same for every run, and noise."""
+    level = factor * np.exp(0.2 * _draw(clip).normal() + 0.01 * _draw(seed).normal())
+    noise = _draw(name, clip)
+    row: dict[str, Any] = {"name": clip, "frames": 600}
+    for mode, jumps in (("window", 1.3), ("stream", 1.0)):
+        row[mode] = {branch: {} for branch in branches}
+        for branch in branches:
+            for metric, base in BASE.items():
+                if branch == "position" and metric in NO_POSITIONS:
+                    continue
+                value = base * level * (jumps if metric == "Jitter" else 1) * np.exp(0.01 * noise.normal())
+                row[mode][branch][metric] = round(float(value), 6)
+    return row
+
+
+def _means(rows: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+    return {
+        branch: {metric: float(np.mean([row[branch][metric] for row in rows])) for metric in values}
+        for branch, values in rows[0].items()
+    }
+
+
+def _log(run: Run, factor: float) -> None:
+    """A metrics log that falls from far above to the run's level."""
+    noise = _draw(run.id)
+    for step in range(0, 2001, 100):
+        loss = factor * (1 + 4 * np.exp(-step / 300)) * float(np.exp(0.05 * noise.normal()))
+        run.log(step, {"loss": loss, "lr": 1e-3})
+        if step % 500 == 0:
+            run.log(step, {"rotation MPJPE": 6.5 * loss, "rotation MPJRE": 4.1 * loss}, "val")
