@@ -64,7 +64,7 @@ def planned(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
 
 
 def orphans(sweep: Sweep, plan: Plan) -> list[Entry]:
-    """Runs of earlier versions of the sweep: of labels that are gone, or whose config is another now."""
+    """Runs of earlier versions of the sweep that were begun: of labels gone, or with another config now."""
     recorded = read_json(sweep_folder(sweep, plan.outputs) / "entries.json").get("entries", [])
     labels = {arm.label for arm in sweep.arms}
     now = {(entry.label, entry.seed): entry.id for entry in plan.entries}
@@ -74,6 +74,7 @@ def orphans(sweep: Sweep, plan: Plan) -> list[Entry]:
         entry
         for entry in entries
         if entry.id not in used
+        and plan.run_of(entry).manifest
         and (entry.label not in labels or now.get((entry.label, entry.seed), entry.id) != entry.id)
     ]
 
