@@ -7,7 +7,7 @@ import logging
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -37,11 +37,17 @@ class Tracker(Protocol):
     def project(self, run: Run) -> None:
         """Show the run as its folder is now; a second call changes nothing more."""
 
+    def group(self, sweep: str, labels: Mapping[str, str]) -> None:
+        """Show the runs of these ids as a sweep's, each with its arm's label."""
+
 
 class NoTracker:
     """Shows nothing."""
 
     def project(self, run: Run) -> None:
+        """Nothing."""
+
+    def group(self, sweep: str, labels: Mapping[str, str]) -> None:
         """Nothing."""
 
 
@@ -77,6 +83,30 @@ class MLflowTracker:
                     client.log_artifact(name, str(run.folder / artifact))
             if run.done:
                 client.set_terminated(name, "FINISHED", _milliseconds(run.manifest["finished"]))
+
+    def group(self, sweep: str, labels: Mapping[str, str]) -> None:
+        """Make a sweep the parent of its runs.
+
+        A run that several sweeps share stays the first one's child; a tag for each sweep has its label there.
+
+        Args:
+            sweep: its name. labels: run id -> the arm's label, of projected runs.
+        """
+        with _quiet(), FileLock(self.outputs / ".mlflow.lock"):
+            from mlflow import MlflowClient
+
+            client = MlflowClient(tracking_uri=self.store())
+            experiment = self._experiment(client)
+            parents = client.search_runs([experiment], f"tags.`memmlp.sweep` = '{sweep}'")
+            parent = parents[0] if parents else None
+            if parent is None:
+                parent = client.create_run(experiment, tags={"memmlp.sweep": sweep}, run_name=sweep)
+            for run_id, label in labels.items():
+                for child in client.search_runs([experiment], f"tags.`memmlp.run_id` = '{run_id}'"):
+                    client.set_tag(child.info.run_id, f"memmlp.arm.{sweep}", label)
+                    if "mlflow.parentRunId" not in child.data.tags:
+                        client.set_tag(child.info.run_id, "mlflow.parentRunId", parent.info.run_id)
+            client.set_terminated(parent.info.run_id, "FINISHED")
 
     def store(self) -> str:
         """Where MLflow keeps its runs."""
@@ -123,11 +153,18 @@ class MLflowTracker:
 
 def project_safely(tracker: Tracker, run: Run) -> None:
     """Project a run; a failure is one line on stderr and nothing more, for the folder has it all."""
-    try:
+    with harmless(f"run {run.id}"):
         tracker.project(run)
+
+
+@contextlib.contextmanager
+def harmless(what: str) -> Iterator[None]:
+    """Turn a tracker's failure into a warning of one line."""
+    try:
+        yield
     except Exception as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        print(f"memmlp: warning: run {run.id} is not shown by the tracker: {reason}", file=sys.stderr)
+        print(f"memmlp: warning: {what} is not shown by the tracker: {reason}", file=sys.stderr)
 
 
 def _tags(run: Run) -> dict[str, str]:

@@ -12,9 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 
+from memmlp.cli.track import track
 from memmlp.files import write_json
 from memmlp.runs import Run
+from memmlp.sweep.plan import Entry, Plan
 from memmlp.tracking import MLflowTracker, NoTracker, project_safely
 
 CONFIG = {"seed": 0, "memory": {"layers": [2, 4], "shift": None}, "long": "x" * 7000}
@@ -203,3 +206,34 @@ def test_no_tracker_needs_no_mlflow(tmp_path: Path):
 def test_no_tracker_leaves_nothing(tmp_path: Path):
     NoTracker().project(a_run(tmp_path))
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
+def test_a_sweep_is_the_parent_of_its_runs_and_a_shared_run_has_one_parent(tmp_path: Path):
+    tracker = MLflowTracker(None, tmp_path)
+    for name in ("a" * 16, "b" * 16):
+        tracker.project(a_run(tmp_path, name))
+    for _ in range(2):
+        tracker.group("table04", {"a" * 16: "full", "b" * 16: "none"})
+        tracker.group("table11", {"a" * 16: "with VQ-VAE"})
+    runs = {run.info.run_name: run for run in shown(tmp_path)}
+    assert set(runs) == {"a" * 16, "b" * 16, "table04", "table11"}
+    shared, other = runs["a" * 16].data.tags, runs["b" * 16].data.tags
+    assert shared["mlflow.parentRunId"] == other["mlflow.parentRunId"] == runs["table04"].info.run_id
+    assert (shared["memmlp.arm.table04"], shared["memmlp.arm.table11"]) == ("full", "with VQ-VAE")
+    assert "memmlp.arm.table11" not in other
+
+
+def test_sync_rebuilds_the_view_and_changes_nothing_the_second_time(tmp_path: Path):
+    run = a_run(tmp_path)
+    run.finish(["results.json"])
+    Plan("mine", tmp_path, (Entry("full", 0, run.id),), ()).save(tmp_path / "sweeps" / "mine" / "plan.json")
+    views = []
+    for _ in range(2):
+        said = CliRunner().invoke(track, ["sync", "--outputs", str(tmp_path)])
+        assert said.exit_code == 0, said.output
+        assert "1 runs and 1 sweeps" in said.output
+        views.append(
+            sorted((r.info.run_name, len(r.data.metrics), len(r.data.tags)) for r in shown(tmp_path))
+        )
+    assert views[0] == views[1]
+    assert [name for name, *_ in views[0]] == ["0" * 16, "mine"]

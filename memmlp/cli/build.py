@@ -18,6 +18,7 @@ from memmlp.errors import InputError
 from memmlp.features import Heading, HeadRelative, World
 from memmlp.memory import Memory
 from memmlp.runs import Run
+from memmlp.tracking import Tracker
 from memmlp.training import Optim
 from memmlp.vqvae import VQVAE
 
@@ -55,10 +56,14 @@ def build_experiment(cfg: DictConfig) -> pipeline.Experiment:
         evaluation_batch=cfg.evaluation.batch,
         latency_steps=cfg.export.latency_steps,
         save_predictions=Path(cfg.save_predictions) if cfg.save_predictions else None,
-        tracker=instantiate(cfg.tracker, outputs=outputs)
-        if "uri" in cfg.tracker
-        else instantiate(cfg.tracker),
+        tracker=build_tracker(cfg),
     )
+
+
+def build_tracker(cfg: DictConfig) -> Tracker:
+    """What shows the config's runs elsewhere."""
+    places = {"outputs": Path(cfg.paths.outputs)} if "uri" in cfg.tracker else {}
+    return instantiate(cfg.tracker, **places)
 
 
 def device(name: str) -> torch.device:

@@ -31,6 +31,8 @@ COMMANDS = {
     "table": Command("table", "table", "The paper's tables beside measured numbers."),
     "report": Command("page", "page", "All tables and figures as one HTML page."),
     "runs": Command("runs", "runs", "List, show and compare runs."),
+    "track": Command("track", "track", "Show run folders in MLflow."),
+    "ui": Command("track", "ui", "MLflow's page on the tracked runs."),
     "eval": Command("evaluate", "evaluate", "Metrics and predictions of a finished run."),
     "export": Command("export", "export", "ONNX file of a finished run."),
     "bench": Command("bench", "bench", "Measure this machine: preparation, streaming."),

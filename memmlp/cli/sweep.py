@@ -66,6 +66,7 @@ def sweep(
             plan.run_of(task).retry()
     if plan.left():
         bring_to_end(chosen, plan, engine, options, count)
+        track(plan)
     report(chosen, plan)
 
 
@@ -132,6 +133,20 @@ def bring_to_end(chosen: Sweep, plan: Plan, engine: str, options: dict[str, str]
     task = local if engine == "local" else partial(work_alone, path)
     fleet = Fleet(executor(engine, options, folder), task, workers, folder / "workers")
     oversee(plan, fleet, Board())
+
+
+def track(plan: Plan) -> None:
+    """Show the runs as the sweep's, where they are tracked."""
+    from omegaconf import OmegaConf
+
+    from memmlp.cli.build import build_tracker
+    from memmlp.tracking import harmless
+
+    labels = {entry.id: entry.label for entry in plan.entries if plan.run_of(entry).done}
+    if labels:
+        config = next(task.config for task in plan.tasks if task.id in labels)
+        with harmless(f"sweep {plan.name}"):
+            build_tracker(OmegaConf.create(dict(config))).group(plan.name, labels)
 
 
 def show(chosen: Sweep, plan: Plan) -> None:

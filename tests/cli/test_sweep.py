@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import signal
@@ -162,6 +163,12 @@ def test_bad_input_is_one_line(tmp_path: Path, words: list[str], line: str):
     assert ran.returncode == 2, ran.stdout + ran.stderr
     assert line in ran.stderr
     assert len(ran.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (memmlp[ray])")
+def test_a_sweep_on_a_local_ray(tmp_path: Path):
+    write(tmp_path, {"none": ["memory=none"]})
+    assert "1 of 1 runs done" in command(tmp_path, "executor=ray")
 
 
 def test_executor_words_are_no_overrides_of_the_runs():

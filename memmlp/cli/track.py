@@ -1,0 +1,56 @@
+"""`memmlp track` and `memmlp ui`: MLflow as a view of the run folders."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import click
+
+from memmlp.cli.options import outputs_option
+from memmlp.errors import InputError
+
+
+@click.group("track")
+def track() -> None:
+    """Show run folders in MLflow."""
+
+
+@track.command("sync")
+@click.option("--uri", default=None, help="MLflow's store, if not MLFLOW_TRACKING_URI or sqlite in OUTPUTS.")
+@outputs_option
+def sync(uri: str | None, outputs: Path) -> None:
+    """Bring MLflow's store up to date with all finished runs and sweeps; again as often as you like."""
+    from memmlp.progress import track as bar
+    from memmlp.runs import list_runs
+    from memmlp.sweep.plan import Plan
+    from memmlp.tracking import MLflowTracker
+
+    tracker = MLflowTracker(uri, outputs)
+    finished = [run for run in list_runs(outputs) if run.done]
+    for run in bar(finished, "runs"):
+        tracker.project(run)
+    known = {run.id for run in finished}
+    plans = [Plan.load(path) for path in sorted(outputs.glob("sweeps/*/plan.json"))]
+    for plan in plans:
+        tracker.group(plan.name, {e.id: e.label for e in plan.entries if e.id in known})
+    click.echo(f"{len(finished)} runs and {len(plans)} sweeps are in {tracker.store()}")
+
+
+@click.command("ui")
+@click.option("--port", default=5000, show_default=True)
+@outputs_option
+def ui(port: int, outputs: Path) -> None:
+    """MLflow's page on the tracked runs (needs pip install 'memmlp[ui]')."""
+    from memmlp.tracking import MLflowTracker
+
+    store = MLflowTracker(None, outputs).store()
+    program = shutil.which("mlflow")
+    try:
+        import mlflow.server  # noqa: F401  (mlflow-skinny has none)
+    except ImportError:
+        program = None
+    if program is None:
+        raise InputError("ui: MLflow's page is not installed; pip install 'memmlp[ui]'")
+    os.execv(program, [program, "ui", "--backend-store-uri", store, "--port", str(port)])
