@@ -39,7 +39,7 @@ def fake_run(
 ) -> Run:
     """A finished run whose errors are `factor` times the usual ones, with effects of seed, clip and both."""
     run = Run.of(outputs, hashlib.sha256(f"{name} {seed}".encode()).hexdigest()[:16])
-    run.folder.mkdir(parents=True)
+    run.folder.mkdir(parents=True, exist_ok=True)
     rows = [_clip(clip, seed, factor, run.id, branches) for clip in clips]
     latency = {"median_ms": 0.8 * factor, "parameters": 356_798, "flops": 26_000_000, "onnx_bytes": 1_900_000}
     means = {mode: _means([row[mode] for row in rows]) for mode in ("window", "stream")}
