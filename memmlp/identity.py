@@ -29,6 +29,14 @@ IGNORED = (
 """Config keys that cannot change a run's result, and so are no part of its identity."""
 
 
+NEUTRAL: Mapping[str, Any] = {
+    "evaluation.ik": "off",
+    "evaluation.ik_iterations": 15,
+}
+"""Keys that came after the first release, with the value that stands for what was before: at it they are no
+part of the identity, so that runs made before them stay known."""
+
+
 def run_id(kind: str, config: Mapping[str, Any], *, data: str, upstream: str | None) -> str:
     """The identity of a run: 16 hex digits over all that can change its result.
 
@@ -48,7 +56,8 @@ def relevant(config: Mapping[str, Any]) -> dict[str, Any]:
     def counts(key: str) -> bool:
         return not any(key == ignored or key.startswith(f"{ignored}.") for ignored in IGNORED)
 
-    return {key: _canonical(value) for key, value in flatten(config).items() if counts(key)}
+    flat = {key: _canonical(value) for key, value in flatten(config).items() if counts(key)}
+    return {key: value for key, value in flat.items() if key not in NEUTRAL or value != NEUTRAL[key]}
 
 
 def _canonical(value: Any) -> Any:

@@ -71,6 +71,12 @@ def test_a_key_that_begins_like_an_ignored_one_counts():
     assert identity(CONFIG | {"database": 1}) != identity()
 
 
+def test_a_key_that_came_later_does_not_count_at_the_value_of_before():
+    later = {**CONFIG, "evaluation": {"ik": "off", "ik_iterations": 15}}
+    assert identity(later) == identity()
+    assert identity({**CONFIG, "evaluation": {"ik": "lbfgs"}}) != identity()
+
+
 def test_equal_numbers_and_orders_are_one_identity():
     same = {"optim": {"log_every": 5, "lr": 0.001}, "model": {"layers": (2.0, 4), "width": 16.0}, "seed": 0}
     assert identity(same) == identity()
