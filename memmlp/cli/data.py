@@ -52,7 +52,7 @@ def import_(
     source: Path, out: Path, skeleton: str | None, fps: tuple[str, ...], body: str, strict: bool
 ) -> None:
     """Import BVH files (a folder or one file) as AMASS npz on the 22-joint tree."""
-    from memmlp.data.retarget import import_folder
+    from memmlp.data.importing import import_folder
 
     rates = dict(map(_rate, fps))
     report = import_folder(source, out, skeleton=skeleton, fps=rates, body=body, strict=strict)
@@ -75,7 +75,7 @@ def verify(source: Path, skeleton: str | None, body: str) -> None:
     Millimetres: of any mapped joint, on the clip's own bones. Degrees: of upper arms, forearms, thighs and
     shins on the body.
     """
-    from memmlp.data.retarget import verify_folder
+    from memmlp.data.fidelity import verify_folder
 
     rows = verify_folder(source, skeleton=skeleton, body=body)
     table = Table("clip", "skeleton")

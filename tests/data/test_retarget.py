@@ -19,19 +19,10 @@ from scipy.spatial.transform import Rotation
 from memmlp.body import JOINTS, builtin_rest_joints
 from memmlp.data.bvh import Bvh, read_bvh
 from memmlp.data.clip import Clip, read_clip
-from memmlp.data.retarget import (
-    FOLLOWERS,
-    LIMBS,
-    SKELETONS,
-    find_skeleton,
-    fit,
-    import_folder,
-    load_skeleton,
-    retarget,
-    shipped_skeletons,
-    verify,
-    verify_folder,
-)
+from memmlp.data.fidelity import verify, verify_folder
+from memmlp.data.importing import import_folder
+from memmlp.data.retarget import FOLLOWERS, fit, retarget
+from memmlp.data.skeleton import LIMBS, SKELETONS, find_skeleton, load_skeleton, shipped_skeletons
 from memmlp.errors import InputError
 from memmlp.geometry import axis_angle_to_matrix, forward_kinematics
 
@@ -129,7 +120,7 @@ def test_verify_notices_a_wrong_import(tmp_path: Path, monkeypatch: pytest.Monke
         return clip
 
     path = write(tmp_path, person("cmu_daz", 10, 5).text())
-    monkeypatch.setattr("memmlp.data.retarget.retarget", bent)
+    monkeypatch.setattr("memmlp.data.fidelity.retarget", bent)
     assert verify(path).worst_mm > 1
     assert verify(path).worst_joint == "left_wrist"
     assert verify(path).worst_degrees > 1
@@ -140,7 +131,7 @@ def test_verify_reads_the_npz(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         clip = read_clip(path, name)
         return replace(clip, trans=clip.trans + 0.01)
 
-    monkeypatch.setattr("memmlp.data.retarget.read_clip", shifted)
+    monkeypatch.setattr("memmlp.data.fidelity.read_clip", shifted)
     assert verify(write(tmp_path, person("cmu_daz", 10, 5).text())).worst_mm > 10
 
 
@@ -291,7 +282,7 @@ def test_unknown_skeleton_lists_joints_and_maps(tmp_path: Path) -> None:
 def test_a_file_of_two_skeletons_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("one", "two"):
         (tmp_path / f"{name}.yaml").write_text((SKELETONS / "cmu_daz.yaml").read_text())
-    monkeypatch.setattr("memmlp.data.retarget.SKELETONS", tmp_path)
+    monkeypatch.setattr("memmlp.data.skeleton.SKELETONS", tmp_path)
     with refuse(tmp_path, "more than one"):
         find_skeleton(read(tmp_path, "cmu_daz"))
 
