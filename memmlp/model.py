@@ -52,9 +52,9 @@ class MemMLP(nn.Module):
 
     def true_state(self, frames: Tensor) -> State:
         """The state after world frames [X | Theta] (B, length, 252), with the truth as history."""
-        sparse = frames[..., :SPARSE_DIM]
-        motion = self.frame.encode(frames)[..., SPARSE_DIM:]
-        return self.running_state(sparse) | self.memory.true_state(motion)
+        encoded = self.frame.encode(frames)
+        true = self.memory.true_state(encoded[..., :SPARSE_DIM], encoded[..., SPARSE_DIM:])
+        return self.running_state(frames[..., :SPARSE_DIM]) | true
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Take the newest frames in.
@@ -72,17 +72,20 @@ class MemMLP(nn.Module):
         inputs = torch.cat([before, sparse], 1)
         place = self.frame.place(inputs)
         encoded = self.frame.encode_sparse(inputs, place)
-        past = self.memory.recall(encoded[:, : before.shape[1]], state, new)
+        past = self.memory.recall(encoded, state, new)
         h = self.stem(encoded[:, -self.frames :])
         for block in self.blocks:
             h = block(h, past)
         wanted = self.frames if newest is None else newest
         made = max(wanted, self.memory.needed(new))
-        motion = self.predictor(h, inputs[:, -self.frames :], self.frame, made)
+        motion = self.predictor(h, past, inputs[:, -self.frames :], self.frame, made)
         kept = {"sparse": inputs[:, -self.memory.length :], "started": state["started"].clamp_min(1)}
-        kept |= self.memory.remember(motion, state, new)
+        kept |= self.memory.remember(motion, past, state, new)
         return self.frame.decode_motion(motion[:, -wanted:], place[:, -wanted:]), kept
 
     def count_parameters(self) -> int:
-        """Trainable parameters (the frozen VQ-VAE apart), the number that the tables call #Params."""
+        """Trainable parameters, the number that the tables call #Params.
+
+        A frozen VQ-VAE is not counted; one that is trained with the network is, its decoder included.
+        """
         return sum(p.numel() for p in self.parameters() if p.requires_grad)

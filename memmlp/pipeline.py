@@ -34,6 +34,7 @@ from memmlp.vqvae import VQVAE
 
 VALIDATION_PIECE = 240  # frames: validation streams through pieces of clips of 4 s
 PICTURE_FRAMES = 600  # the picture shows the first 10 s of the first test clip
+VQVAE_SETTINGS = ("codes", "width", "encoder_depth", "decoder_depth", "commitment", "decay", "codebook")
 MOTION_ARTIFACTS = ("model.safetensors", "clips.json", "results.json", "step.onnx", "latency.json")
 
 
@@ -49,13 +50,15 @@ class Architecture:
     vqvae: Callable[[], VQVAE]
     memory: Callable[..., Memory]
     uses_codes: bool
+    trains_codes: bool
     predictor: Callable[..., Predictor]
 
     def build(self, frame: Frame, codes: VQVAE | None) -> MemMLP:
         """The network with fresh weights."""
         sizes = {"hidden": self.hidden, "frames": self.frames}
         memory = self.memory(codes=codes, depth=self.depth, **sizes)
-        return MemMLP(frame, memory, self.predictor(**sizes), depth=self.depth, **sizes)
+        predictor = self.predictor(memory_block=memory.memory_block, **sizes)
+        return MemMLP(frame, memory, predictor, depth=self.depth, **sizes)
 
     def frame(self, manifest: Manifest, frames: Tensor) -> Frame:
         """World <-> network space, with the statistics of the training frames (F, 252) where asked."""
@@ -139,8 +142,10 @@ def vqvae_id(experiment: Experiment, data: str) -> str | None:
 
 def motion_id(experiment: Experiment, data: str) -> str:
     """The identity of the experiment's run on data of that digest."""
-    # the VQ-VAE's own identity stands for its config
+    # A frozen VQ-VAE's own identity stands for its config; a joint one is not trained by that stage's keys.
     own = {key: value for key, value in experiment.config.items() if key != "vqvae"}
+    if experiment.architecture.trains_codes:
+        own["vqvae"] = {key: experiment.config["vqvae"][key] for key in VQVAE_SETTINGS}
     return run_id("memmlp", own, data=data, upstream=vqvae_id(experiment, data))
 
 

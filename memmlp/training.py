@@ -18,16 +18,16 @@ from rich.progress import Progress, TaskID
 from torch import Tensor, nn
 
 from memmlp import checkpoint
-from memmlp.body import ROTATION, SPARSE_DIM
+from memmlp.body import SPARSE_DIM
 from memmlp.data.dataset import Frames, WindowSampler
 from memmlp.errors import TrainingDiverged
 from memmlp.features import Frame
-from memmlp.losses import MotionLoss, l1
+from memmlp.losses import MotionLoss
 from memmlp.model import MemMLP
 from memmlp.progress import progress
 from memmlp.rollout import Rollout
 from memmlp.runs import Run
-from memmlp.vqvae import VQVAE
+from memmlp.vqvae import VQVAE, rotation_error
 
 SCHEDULES: dict[str, Callable[[float, float, float], float]] = {
     # (progress in [0, 1), final rate / first rate, where the step falls) -> factor
@@ -128,9 +128,8 @@ class VQVAETask:
         """The loss on a batch of single frames."""
         clips, end = self.sampler.draw(step)
         frames = self.frame.encode(self.frames.segments(clips, end, 1))[:, 0]
-        rotations, quantised = self.model.reconstruct(frames)
-        self.used = torch.bincount(quantised.indices, minlength=len(self.used)).float()
-        terms = {"rotation": self._eq1(rotations, frames), "codebook": quantised.loss}
+        terms, indices = self.model.loss_terms(frames, self.frame)
+        self.used = torch.bincount(indices, minlength=len(self.used)).float()
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)
 
     def report(self) -> dict[str, float]:
@@ -143,13 +142,8 @@ class VQVAETask:
         frames = self.frame.encode(self.validation.frames)
         vectors, index = self.model.codebook(self.model.encoder(frames))
         used = torch.bincount(index, minlength=len(self.used)).float()
-        error = self._eq1(self.model.decoder(vectors), frames)
+        error = rotation_error(self.model.decoder(vectors), frames, self.frame)
         return {"rotation": float(error), "perplexity": perplexity(used)}
-
-    def _eq1(self, rotations: Tensor, frames: Tensor) -> Tensor:
-        """Eq. 1 in the world's units, for rotations (B, 132) and frames (B, 252) of network space."""
-        error = (rotations - frames[:, SPARSE_DIM:][:, ROTATION]) * self.frame.std[SPARSE_DIM:][ROTATION]
-        return l1(error[:, None])
 
 
 class MotionTask:
@@ -183,7 +177,8 @@ class MotionTask:
         self.rollout.keep(state)
         sparse, truth = call.truth[..., :SPARSE_DIM], call.truth[..., SPARSE_DIM:]
         loss, terms = self.loss(motion, truth, sparse, self.model.frame)
-        return StepResult(loss, terms, call.clips)
+        own = self.model.memory.terms(call.truth, self.model.frame)
+        return StepResult(sum(own.values(), loss), terms | own, call.clips)
 
     def report(self) -> dict[str, float]:
         """The weights of the loss terms."""

@@ -12,7 +12,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from memmlp.body import FRAME_DIM, ROTATION
+from memmlp.body import FRAME_DIM, ROTATION, SPARSE_DIM
+from memmlp.features import Frame
 
 
 class Quantised(NamedTuple):
@@ -21,6 +22,11 @@ class Quantised(NamedTuple):
     codes: Tensor
     indices: Tensor
     loss: Tensor
+
+
+def straight_through(latent: Tensor, codes: Tensor) -> Tensor:
+    """The codes (..., width), their gradient that of the latents (..., width)."""
+    return latent + (codes - latent).detach()
 
 
 class Codebook(nn.Module):
@@ -136,8 +142,23 @@ class VQVAE(nn.Module):
         """Rotations (B, 132) of frames (B, 252), with the straight-through gradient; the codebook learns."""
         latent = self.encoder(frames)
         quantised: Quantised = self.codebook.learn(latent)
-        straight = latent + (quantised.codes - latent).detach()
-        return self.decoder(straight), quantised
+        return self.decoder(straight_through(latent, quantised.codes)), quantised
+
+    def loss_terms(self, frames: Tensor, frame: Frame) -> tuple[dict[str, Tensor], Tensor]:
+        """Eq. 1 of the reconstruction and the codebook's loss, and the chosen indices (B,); it learns.
+
+        Args:
+            frames: (B, 252) in the network space of `frame`.
+        """
+        rotations, quantised = self.reconstruct(frames)
+        terms = {"rotation": rotation_error(rotations, frames, frame), "codebook": quantised.loss}
+        return terms, quantised.indices
+
+
+def rotation_error(rotations: Tensor, frames: Tensor, frame: Frame) -> Tensor:
+    """Eq. 1 in the world's units, for rotations (B, 132) and frames (B, 252) of network space."""
+    error = (rotations - frames[:, SPARSE_DIM:][:, ROTATION]) * frame.std[SPARSE_DIM:][ROTATION]
+    return error.abs().sum(-1).mean()
 
 
 def _blocks(width: int, depth: int) -> list[nn.Module]:

@@ -8,9 +8,9 @@ from torch import nn
 from memmlp.body import MOTION_DIM, ROTATION, SPARSE_DIM, builtin_rest_joints
 from memmlp.evaluation import stream
 from memmlp.features import Frame, Heading, HeadRelative, World
-from memmlp.memory import CodeMemory, NoCodesMemory, NoMemory
+from memmlp.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory
 from memmlp.model import MemMLP
-from memmlp.predictor import RotationOnly, TwoBranch
+from memmlp.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
 from memmlp.vqvae import VQVAE
 
 MEMORIES = [
@@ -21,6 +21,9 @@ MEMORIES = [
     (CodeMemory, {"shift": "window", "history": "first"}),
     (CodeMemory, {"shift": "window", "history": "latest"}),
     (CodeMemory, {"fusion": "plain"}),
+    (JointCodeMemory, {}),
+    (LSTMMemory, {}),
+    (GRUMemory, {"fusion": "plain"}),
 ]  # fmt: skip
 SPARSE = tiny.clip(40)[None, :, :SPARSE_DIM]
 
@@ -115,8 +118,9 @@ def test_latest_history_is_the_last_output():
 @torch.no_grad()
 def test_the_stream_is_causal_and_remembers():
     """A later input changes no earlier output; an input older than the window still counts with a memory."""
-    for kind, remembers in ((NoMemory, False), (CodeMemory, True)):
-        model = tiny.model(kind, shift="frame") if kind is CodeMemory else tiny.model(kind)
+    cases = [(NoMemory, {}, False), (CodeMemory, {"shift": "frame"}, True), (LSTMMemory, {}, True)]
+    for kind, changes, remembers in cases:
+        model = tiny.model(kind, **changes)
         changed = SPARSE.clone()
         changed[:, 10] += 0.5
         before, after = run(model, SPARSE), run(model, changed)
@@ -140,6 +144,9 @@ def variant(**changes) -> torch.Tensor:
     [
         {"kind": NoMemory},
         {"kind": NoCodesMemory},
+        {"kind": LSTMMemory},
+        {"kind": GRUMemory},
+        {"predictor": TwoBranchMemory},
         {"shift": "frame"},
         {"history": "latest"},
         {"fusion": "plain"},
@@ -149,6 +156,7 @@ def variant(**changes) -> torch.Tensor:
         {"blend": 1.0},
         {"blend": "sampled"},
         {"predictor": RotationOnly},
+        {"predictor": RotationOnlyMemory},
         {"coordinates": World()},
         {"coordinates": Heading()},
     ],
@@ -189,10 +197,12 @@ def test_rotation_only_positions_are_forward_kinematics():
     assert motion.shape[-1] == MOTION_DIM
 
 
-@pytest.mark.parametrize("predictor", [TwoBranch, RotationOnly])
+@pytest.mark.parametrize("predictor", [TwoBranch, RotationOnly, TwoBranchMemory])
 @pytest.mark.parametrize(("kind", "changes"), MEMORIES)
 @torch.no_grad()
 def test_the_newest_frames_alone_are_the_same_numbers(kind, changes, predictor):
+    if kind is NoMemory and predictor is TwoBranchMemory:
+        return
     model = tiny.model(kind, predictor, **changes)
     whole = part = model.initial_state(1)
     for sparse in SPARSE.split(1, 1):

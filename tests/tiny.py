@@ -10,9 +10,9 @@ import torch
 from memmlp.body import FRAME_DIM, builtin_rest_joints
 from memmlp.data.dataset import Frames
 from memmlp.features import Frame, HeadRelative, World, motion_frames
-from memmlp.memory import CodeMemory, NoCodesMemory, NoMemory
+from memmlp.memory import CodeMemory, JointCodeMemory, Memory, NoMemory, RecurrentMemory
 from memmlp.model import MemMLP
-from memmlp.predictor import RotationOnly, TwoBranch
+from memmlp.predictor import Predictor, TwoBranch
 from memmlp.vqvae import VQVAE
 
 SIZES = {"hidden": 16, "frames": 7}
@@ -54,19 +54,23 @@ def vqvae() -> VQVAE:
     return model.eval()
 
 
-def memory(kind: type = CodeMemory, **changes) -> NoMemory | NoCodesMemory:
+def memory(kind: type[Memory] = CodeMemory, **changes) -> Memory:
     """A memory for the tiny network, with changed settings."""
     if kind is NoMemory:
         return NoMemory(depth=DEPTH, **SIZES)
-    settings = {"layers": (2, 4), "width": 6, "shift": "window", "history": "first", "fusion": "residual"}
-    settings |= {"blend": 0.5} | changes
-    codes = vqvae() if kind is CodeMemory else None
-    return kind(**settings, codes=codes, depth=DEPTH, **SIZES)
+    settings = {"layers": (2, 4), "width": 6, "fusion": "residual"}
+    if not issubclass(kind, RecurrentMemory):
+        settings |= {"shift": "window", "history": "first", "blend": 0.5}
+    if kind is CodeMemory:
+        settings |= {"codes": vqvae()}
+    if kind is JointCodeMemory:
+        settings |= {"vqvae": vqvae}
+    return kind(**settings | changes, depth=DEPTH, **SIZES)
 
 
 def model(
-    kind: type = CodeMemory,
-    predictor: type = TwoBranch,
+    kind: type[Memory] = CodeMemory,
+    predictor: type[Predictor] = TwoBranch,
     coordinates: World | None = None,
     seed: int = 0,
     **changes,
@@ -75,5 +79,5 @@ def model(
     torch.manual_seed(seed)
     slot = memory(kind, **changes)
     torch.manual_seed(seed)
-    head: TwoBranch | RotationOnly = predictor(1, **SIZES)
+    head = predictor(1, memory_block=slot.memory_block, **SIZES)
     return MemMLP(frame(coordinates), slot, head, depth=DEPTH, **SIZES).eval()

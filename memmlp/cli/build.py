@@ -75,16 +75,18 @@ def device(name: str) -> torch.device:
 
 def build_architecture(cfg: DictConfig) -> pipeline.Architecture:
     """The network of a checked config."""
-    own = ("codes", "width", "encoder_depth", "decoder_depth", "commitment", "decay", "codebook")
+    vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in pipeline.VQVAE_SETTINGS})
+    memory, kind = instantiate(cfg.memory, _convert_="all"), memory_class(cfg)
     return pipeline.Architecture(
         coordinates=COORDINATES[cfg.frame.coordinates](),
         normalize=cfg.frame.normalize,
         frames=cfg.model.frames,
         hidden=cfg.model.width,
         depth=cfg.model.depth,
-        vqvae=partial(VQVAE, **{name: cfg.vqvae[name] for name in own}),
-        memory=instantiate(cfg.memory, _convert_="all"),
-        uses_codes=memory_class(cfg).uses_codes,
+        vqvae=vqvae,
+        memory=partial(memory, vqvae=vqvae) if kind.trains_codes else memory,
+        uses_codes=kind.uses_codes,
+        trains_codes=kind.trains_codes,
         predictor=instantiate(cfg.predictor),
     )
 

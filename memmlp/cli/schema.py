@@ -274,6 +274,18 @@ class RotationOnly(Predictor):
 
 
 @dataclass
+class TwoBranchMemory(Predictor):
+    _target_: str = target("memmlp.predictor.TwoBranchMemory")
+    depth: int = at_least(1)
+
+
+@dataclass
+class RotationOnlyMemory(Predictor):
+    _target_: str = target("memmlp.predictor.RotationOnlyMemory")
+    depth: int = at_least(1)
+
+
+@dataclass
 class Memory:
     _target_: str = MISSING
     _partial_: bool = True
@@ -298,6 +310,28 @@ class NoCodesMemory(Memory):
 @dataclass
 class CodeMemory(NoCodesMemory):
     _target_: str = target("memmlp.memory.CodeMemory")
+
+
+@dataclass
+class JointCodeMemory(NoCodesMemory):
+    _target_: str = target("memmlp.memory.JointCodeMemory")
+
+
+@dataclass
+class RecurrentMemory(Memory):
+    layers: list[int] = key(EachOf(Within(1)))
+    width: int = at_least(1)
+    fusion: str = one_of("residual", "plain")
+
+
+@dataclass
+class LSTMMemory(RecurrentMemory):
+    _target_: str = target("memmlp.memory.LSTMMemory")
+
+
+@dataclass
+class GRUMemory(RecurrentMemory):
+    _target_: str = target("memmlp.memory.GRUMemory")
 
 
 @dataclass
@@ -458,10 +492,15 @@ SCHEMAS: dict[str, type] = {
     "frame": Frame,
     "model": Model,
     "predictor_two_branch": TwoBranch,
+    "predictor_two_branch_memory": TwoBranchMemory,
     "predictor_rotation_only": RotationOnly,
+    "predictor_rotation_only_memory": RotationOnlyMemory,
     "memory_none": NoMemory,
     "memory_no_codes": NoCodesMemory,
     "memory_vq": CodeMemory,
+    "memory_vq_joint": JointCodeMemory,
+    "memory_lstm": LSTMMemory,
+    "memory_gru": GRUMemory,
     "vqvae": VQVAE,
     "rollout_teacher_forcing": TeacherForcing,
     "rollout_own_predictions": OwnPredictions,
@@ -544,9 +583,15 @@ def _check_combinations(cfg: DictConfig) -> None:
         raise InputError(f"memory.layers={layers}: allowed is up to model.depth={cfg.model.depth}")
     if cfg.optim.final_lr > cfg.optim.lr:
         raise InputError(f"optim.final_lr={cfg.optim.final_lr}: allowed is at most optim.lr={cfg.optim.lr}")
-    if cfg.hand._target_.endswith("HandPosition") and cfg.predictor._target_.endswith("RotationOnly"):
+    predictor = cfg.predictor._target_.rsplit(".", 1)[-1]
+    if cfg.hand._target_.endswith("HandPosition") and predictor.startswith("RotationOnly"):
         raise InputError(
             "hand=position needs the positions of predictor=two_branch: allowed is hand=fk or hand=off"
+        )
+    if predictor.endswith("Memory") and not layers:
+        raise InputError(
+            "predictor with memory blocks needs a memory, and memory=none is none: "
+            "allowed is another memory, predictor=two_branch or predictor=rotation_only"
         )
     if "streams" in cfg.rollout and cfg.rollout.streams < cfg.optim.batch:
         raise InputError(

@@ -30,6 +30,7 @@ def needed(tmp_path: Path) -> dict[str, list[str]]:
         "data=amass_s2": [root],
         "data=amass_s3": [root],
         "predictor=rotation_only": ["hand=fk"],
+        "predictor=rotation_only_memory": ["hand=fk"],
     }
 
 
@@ -125,7 +126,7 @@ BAD = [
     (["model.width=${profile.schedule}"], ["model.width", "Integer"]),
     # unknown options
     (["model=big"], ["model=big", "mem_mlp"]),
-    (["memory=lstm"], ["memory=lstm", "no_codes, none, vq"]),
+    (["memory=mamba"], ["memory=mamba", "gru, lstm, no_codes, none, vq, vq_joint"]),
     (["experiment=papr"], ["experiment=papr", "did you mean paper?"]),
     (["profile=tinny"], ["profile=tinny", "did you mean tiny?"]),
     (["lauss=manual"], ["lauss", "did you mean loss?"]),
@@ -191,7 +192,7 @@ BAD = [
     # sweeps: the second job is bad, and the first must not start
     (["-m", "model.width=16,-1"], ["model.width=-1", "at least 1"]),
     (["model.width=16,x", "--multirun"], ["model.width=x", "an integer"]),
-    (["-m", "memory=vq,lstm"], ["memory=lstm", "no_codes, none, vq"]),
+    (["-m", "memory=vq,mamba"], ["memory=mamba", "no_codes, none, vq"]),
     (["-m", "model.width=range(1,"], ["model.width=range(1,", "KEY=VALUE"]),
 ]
 
