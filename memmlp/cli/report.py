@@ -23,12 +23,14 @@ def show(outcome: Outcome) -> None:
     measured = results["latency"]
     console.print(
         f"a frame on one CPU core: {measured['median_ms']:.2f} ms median, {measured['p95_ms']:.2f} ms p95 "
-        f"({measured['ratio_to_reference']:.2f} x the reference network)"
+        f"({measured['ratio_to_reference']:.2f} x the reference network)",
+        soft_wrap=True,
     )
     console.print(
         f"{measured['parameters'] / 1e6:.2f} M parameters "
         f"({measured['parameters_with_vqvae'] / 1e6:.2f} M with the frozen VQ-VAE), "
-        f"{measured['macs'] / 1e6:.0f} MMAC a frame, ONNX {measured['onnx_bytes'] / 1e6:.1f} MB"
+        f"{measured['macs'] / 1e6:.0f} MMAC a frame, ONNX {measured['onnx_bytes'] / 1e6:.1f} MB",
+        soft_wrap=True,
     )
     console.print(f"run      {run.folder}", soft_wrap=True)
     console.print(f"picture  {run.folder / 'poses.png'}", soft_wrap=True)

@@ -48,7 +48,7 @@ def list_command(every: bool, outputs: Path) -> None:
         table.add_column(column, justify="right", no_wrap=True)
     for run in found if every else found[:NEWEST]:
         numbers = (_number(run.results, path) for path in SHOWN.values())
-        table.add_row(run.id, run.manifest.get("kind", "-"), _status(run), _age(run), *numbers)
+        table.add_row(run.id, run.manifest.get("kind", "-"), run.status, _age(run), *numbers)
     _console().print(table)
     if len(found) > NEWEST and not every:
         click.echo(f"{len(found) - NEWEST} older ones: memmlp runs list --all")
@@ -65,7 +65,7 @@ def show_command(run: str, config: bool, outputs: Path) -> None:
 
     found = find_run(outputs, run)
     changed = ", ".join(found.verify())
-    facts = {"run": found.id, "folder": found.folder, "status": _status(found)} | flatten(found.manifest)
+    facts = {"run": found.id, "folder": found.folder, "status": found.status} | flatten(found.manifest)
     if changed:
         facts["changed since"] = changed
     facts.pop("id", None)
@@ -130,10 +130,6 @@ def _number(results: Mapping[str, Any], path: tuple[str, ...]) -> str:
     for key in path:
         value = value.get(key) if isinstance(value, Mapping) else None
     return f"{value:.2f}" if isinstance(value, int | float) else "-"
-
-
-def _status(run: Run) -> str:
-    return "done" if run.done else "incomplete"
 
 
 def _age(run: Run) -> str:

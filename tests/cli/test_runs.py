@@ -48,7 +48,7 @@ def test_list_lines_up(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.Monkey
     rows = {line.split()[0]: line.split() for line in ran.out.splitlines() if line.strip()[:1] in set("abc")}
     assert rows[A][1:3] == ["memmlp", "done"]
     assert rows[A][-4:] == ["6.51", "7.00", "-", "1.50"]
-    assert rows[C][2] == "incomplete"
+    assert rows[C][2] == "stopped"
     assert rows[C][-4:] == ["-"] * 4
 
 
@@ -80,7 +80,7 @@ def test_show_tells_of_changed_artifacts(memmlp: Memmlp, outputs: Path):
 
 
 def test_show_an_unfinished_run(memmlp: Memmlp, outputs: Path):
-    assert "incomplete" in memmlp("runs", "show", C).out
+    assert "stopped" in memmlp("runs", "show", C).out
 
 
 @pytest.mark.parametrize("width", [80, 120])

@@ -1,0 +1,60 @@
+"""Sweeps under SIGKILLs: the short form of `memmlp bench chaos`, and that its judge can say no."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from memmlp.cli.chaos import check, compare
+from memmlp.files import write_json
+from memmlp.runs import Run
+
+MAIN = [sys.executable, "-c", "from memmlp.cli.main import main; main()"]
+
+
+def test_a_sweep_under_kills_ends_as_an_undisturbed_one():
+    words = ["--runs", "2", "--kills", "4", "--controllers", "2", "data.synth.minutes=0.8"]
+    ran = subprocess.run([*MAIN, "bench", "chaos", *words], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert "with 4 kills" in ran.stdout
+    assert "as undisturbed: 0 differences" in ran.stdout
+
+
+def finished(outputs: Path, name: str, weights: bytes = b"w") -> Run:
+    run = Run.of(outputs, name * 16)
+    run.begin("memmlp", {}, data="d", upstream=None)
+    run.model.write_bytes(weights)
+    run.finish(["model.safetensors"])
+    return run
+
+
+def test_every_kind_of_difference_is_found(tmp_path: Path):
+    calm, stormy = tmp_path / "calm", tmp_path / "stormy"
+    for name in "abcde":
+        finished(calm, name)
+    shutil.copytree(calm, stormy)
+    assert compare(calm, stormy) == []
+    shutil.rmtree(Run.of(stormy, "a" * 16).folder)
+    finished(stormy, "f")
+    finished(stormy, "b", b"other")
+    Run.of(stormy, "c" * 16).marker.unlink()
+    write_json(Run.of(stormy, "d" * 16).folder / ".holder", {"pid": 0, "host": "elsewhere"})
+    Run.of(stormy, "e" * 16).model.write_bytes(b"damaged")
+    said = "\n".join(compare(calm, stormy))
+    for line in (
+        f"run {'a' * 16} is missing",
+        f"run {'f' * 16} should not be",
+        f"run {'b' * 16}: other weights",
+        f"run {'c' * 16}: stopped, not done",
+        f"run {'d' * 16}: a holder is left",
+        f"run {'e' * 16}: artifact model.safetensors is missing or changed",
+    ):
+        assert line in said
+
+
+def test_a_run_that_was_begun_again_after_its_end_is_found(tmp_path: Path):
+    run = finished(tmp_path, "a")
+    run.write_manifest({"attempts": [{"started": "2999-01-01T00:00:00+00:00"}]})
+    assert check(run.folder) == ["begun again after it was finished"]
