@@ -41,7 +41,10 @@ def fake_run(
     run = Run.of(outputs, hashlib.sha256(f"{name} {seed}".encode()).hexdigest()[:16])
     run.folder.mkdir(parents=True, exist_ok=True)
     rows = [_clip(clip, seed, factor, run.id, branches) for clip in clips]
-    latency = {"median_ms": 0.8 * factor, "parameters": 356_798, "flops": 26_000_000, "onnx_bytes": 1_900_000}
+    latency = {
+        "median_ms": 0.8 * factor, "p95_ms": 1.1 * factor, "ratio_to_reference": 0.6, "parameters": 356_798,
+        "macs": 13_000_000, "flops": 26_000_000, "onnx_bytes": 1_900_000,
+    }  # fmt: skip
     means = {mode: _means([row[mode] for row in rows]) for mode in ("window", "stream")}
     manifest = {"id": run.id, "kind": "memmlp", "seconds": {"train": 300.0, "evaluate": 20.0}, **ORIGIN}
     manifest |= {"started": "2026-01-02T03:04:05+00:00", **(origin or {})}

@@ -20,6 +20,7 @@ from memmlp.runs import Run
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.spec import Sweep, load_sweep, parse_sweep
 from memmlp.tables.collect import Effect, Table, collect, without_runs
+from memmlp.tables.grid import heading
 from memmlp.tables.measured import load
 from memmlp.tables.render import FORMATS, show
 
@@ -229,6 +230,15 @@ def test_only_costs_need_one_block(tmp_path: Path):
     assert len(table.modes) == 1
     assert "mode" not in printed(table, 100)
     assert table.flags == ()
+
+
+def test_heads_tell_unit_and_direction():
+    assert [heading(name) for name in ("Jitter", "ms", "FPS")] == ["Jitter [10² m/s³] ↓", "ms ↓", "FPS ↑"]
+
+
+def test_long_labels_fold_so_that_four_metrics_fit(tmp_path: Path):
+    sweep = load_sweep(SHIPPED / "table04.yaml")
+    assert printed(collect(sweep, fake_sweep(tmp_path, sweep)), 100).count("Jitter ↓") == 2
 
 
 @pytest.mark.parametrize("width", [80, 100])

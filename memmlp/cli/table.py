@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
@@ -13,9 +13,12 @@ from memmlp.cli.options import outputs_option
 from memmlp.errors import InputError
 
 if TYPE_CHECKING:
+    from memmlp.runs import Run
     from memmlp.sweep.spec import Arm, Sweep
     from memmlp.tables.collect import Find, Table
+    from memmlp.tables.measured import Measured
 
+    Read = Callable[[Path], Measured]
 MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", "window")}
 
 
@@ -39,7 +42,10 @@ def table(
 
     OVERRIDES are those that the sweep was run with; they find its runs again.
     """
-    tables = tables_of(name, overrides, outputs, MODES[mode])
+    from memmlp.tables.measured import load
+
+    found = gathered([name], overrides, outputs, MODES[mode], functools.cache(load))
+    tables = [one.table for one in found]
     if form is None and out is None:
         _print(tables)
         return
@@ -47,38 +53,52 @@ def table(
     if out is None:
         click.echo(text, nl=False)
     else:
-        _write(out, text)
+        write(out, text)
 
 
-def tables_of(name: str, overrides: Sequence[str], outputs: Path, modes: Sequence[str]) -> list[Table]:
-    """The tables that a name stands for.
+class Found(NamedTuple):
+    """A sweep with what finds its runs, and its table."""
+
+    sweep: Sweep
+    find: Find
+    table: Table
+
+
+def gathered(
+    names: Sequence[str], overrides: Sequence[str], outputs: Path, modes: Sequence[str], read: Read
+) -> list[Found]:
+    """The tables that some names stand for.
 
     A table of the paper whose config lacks something (where AMASS lies) shows the paper's values and says so.
     Raises InputError where none can be composed with the command line's overrides.
     """
-    from memmlp.tables.collect import collect, without_runs
-    from memmlp.tables.measured import load
+    from memmlp.tables.collect import collect, nothing, without_runs
 
-    read, tables, failures = functools.cache(load), [], []
-    for sweep, command in zip(*chosen(name, overrides), strict=True):
+    found, failures = [], []
+    for sweep, command in chosen(names, overrides):
         try:
-            tables.append(collect(sweep, finder(sweep, outputs), modes, command, read))
+            find = finder(sweep, outputs)
+            found.append(Found(sweep, find, collect(sweep, find, modes, command, read)))
         except InputError as error:
             failures.append(error)
-            tables.append(without_runs(sweep, modes, f"nothing measured: {error}"))
-    if failures and (overrides or tables[0].number is None) and len(failures) == len(tables):
+            table = without_runs(sweep, modes, f"nothing measured: {error}")
+            found.append(Found(sweep, nothing, table))
+    if failures and (overrides or found[0].sweep.table is None) and len(failures) == len(found):
         raise failures[0]
-    return tables
+    return found
 
 
-def chosen(name: str, overrides: Sequence[str]) -> tuple[list[Sweep], list[str]]:
-    """The sweeps of a name, with the command line's overrides, and how each is called on a command line."""
+def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
+    """The sweeps of some names, with the command line's overrides, and the commands that run them."""
     from memmlp.cli.plan import find_sweep
     from memmlp.cli.shipped import shipped
 
-    names = [name] if name != "all" else sorted(path.stem for path in shipped("sweeps").glob("table*.yaml"))
-    sweeps = [find_sweep(one).with_overrides(overrides) for one in names]
-    return sweeps, [" ".join(["memmlp sweep", one, *overrides]) for one in names]
+    tables = sorted(path.stem for path in shipped("sweeps").glob("table*.yaml"))
+    every = [one for name in names for one in (tables if name == "all" else [name])]
+    return [
+        (find_sweep(one).with_overrides(overrides), " ".join(["memmlp sweep", one, *overrides]))
+        for one in every
+    ]
 
 
 def finder(sweep: Sweep, outputs: Path) -> Find:
@@ -88,7 +108,7 @@ def finder(sweep: Sweep, outputs: Path) -> Find:
     plan = planned(sweep, outputs.absolute())
     runs = {(entry.label, entry.seed): plan.run_of(entry) for entry in plan.entries}
 
-    def find(arm: Arm, seed: int):
+    def find(arm: Arm, seed: int) -> Run | None:
         return runs.get((arm.label, seed))
 
     return find
@@ -124,7 +144,8 @@ def _form_of(out: Path | None) -> str:
     return ending
 
 
-def _write(out: Path, text: str) -> None:
+def write(out: Path, text: str) -> None:
+    """Write a file that the command line asks for, and say where."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text, encoding="utf-8")

@@ -157,7 +157,7 @@ def collect(
     """
     read = read or functools.cache(load)
     shown = tuple(modes) if set(sweep.metrics) - set(COSTS) else tuple(modes)[:1]
-    runs = {arm.label: _finished(arm, sweep.seeds, find, read) for arm in sweep.runnable()}
+    runs = finished(sweep, find, read)
     effects = _effects(sweep, runs, shown)
     compared = sum(effect.p is not None for effect in effects.values())
     return Table(
@@ -174,15 +174,27 @@ def collect(
     )
 
 
+def nothing(arm: Arm, seed: int) -> Run | None:
+    """Finds no run."""
+    return None
+
+
 def without_runs(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
     """The table of a sweep whose runs cannot be known: the paper's values, and why there is no more."""
-    table = collect(sweep, lambda arm, seed: None, modes)
+    table = collect(sweep, nothing, modes)
     return replace(table, flags=(reason,))
 
 
-def _finished(arm: Arm, seeds: Sequence[int], find: Find, read: Callable[[Path], Measured]) -> Runs:
-    found = {seed: find(arm, seed) for seed in seeds}
-    return {seed: read(run.folder) for seed, run in found.items() if run is not None and run.done}
+def finished(sweep: Sweep, find: Find, read: Callable[[Path], Measured]) -> dict[str, Runs]:
+    """The finished runs of each arm, by seed."""
+    return {
+        arm.label: {
+            seed: read(run.folder)
+            for seed in sweep.seeds
+            if (run := find(arm, seed)) is not None and run.done
+        }
+        for arm in sweep.runnable()
+    }
 
 
 def _row(

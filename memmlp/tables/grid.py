@@ -78,9 +78,10 @@ def legend(table: Table) -> list[str]:
         )
     agreeing, known, surely, sure = table.signs
     if known:
+        among = f", {surely} of {sure} of the significant ones" if sure else ""
         lines.append(
             "paper's value (its difference; ✓ ours has the same sign, ✗ the opposite): "
-            f"{agreeing} of {known} signs as in the paper, {surely} of {sure} of the significant ones"
+            f"{agreeing} of {known} signs as in the paper{among}"
         )
     return lines
 
@@ -105,7 +106,7 @@ def _value(cell: Cell, metric: str) -> str:
     """Mean ± sd."""
     if cell.mean is None:
         return MISSING
-    if metric in COSTS and metric not in ("ms", "FPS"):
+    if metric in COSTS and (metric != "ms" or cell.sd is None):
         return f"{cell.mean:.3g}" if cell.mean < 1000 else f"{cell.mean:.0f}"
     sd = "" if cell.sd is None else f" ± {cell.sd:.2f}"
     return f"{cell.mean:.2f}{sd}"

@@ -66,8 +66,8 @@ def as_html(table: Table) -> str:
     parts = [f'<section class="result" id="{_html(table.name)}"><h3>{_html(caption(table))}</h3>']
     for grid in grids(table):
         title = f"<caption>{_html(grid.mode)} mode</caption>" if grid.mode else ""
-        head = "".join(f'<th scope="col">{_html(word)}</th>' for word in grid.header)
-        body = "".join(f"<tbody>{''.join(map(_html_line, group))}</tbody>" for group in grid.groups)
+        head = "".join(f'<th scope="col">{_html_head(word)}</th>' for word in grid.header)
+        body = "".join(map(_html_group, grid.groups))
         parts.append(f'<div class="scroll"><table>{title}<thead><tr>{head}</tr></thead>{body}</table></div>')
     remarks = "".join(f"<li>{_html(line)}</li>" for line in _remarks(table))
     return "\n".join([*parts, f'<ul class="remarks">{remarks}</ul>' if remarks else "", "</section>"])
@@ -117,12 +117,26 @@ def _html(text: str | None) -> str:
     return html.escape(text or "")
 
 
+def _html_head(name: str) -> str:
+    """A column's head, the unit below."""
+    metric, *unit = map(_html, _header(name))
+    return "<br>".join([metric, *(f"<small>{word}</small>" for word in unit)])
+
+
+def _html_group(group: Sequence[Line]) -> str:
+    """An arm's rows, headed by its label."""
+    label = f'<th scope="rowgroup" rowspan="{len(group)}">{_html(group[0].head[0])}</th>'
+    heads = [label, *[""] * (len(group) - 1)]
+    rows = [
+        f'<tr class="{line.kind}">{head}{_html_line(line)}</tr>'
+        for head, line in zip(heads, group, strict=True)
+    ]
+    return f"<tbody>{''.join(rows)}</tbody>"
+
+
 def _html_line(line: Line) -> str:
-    """A row; the arm's label heads it."""
-    label, seeds = line.head
-    head = f'<th scope="row">{_html(label)}</th><td class="seeds">{_html(seeds)}</td>'
     cells = "".join(f"<td>{'<br>'.join(map(_html_mark, cell))}</td>" for cell in line.cells)
-    return f'<tr class="{line.kind}">{head}{cells}</tr>'
+    return f'<td class="seeds">{_html(line.head[1])}</td>{cells}'
 
 
 def _html_mark(text: str) -> str:

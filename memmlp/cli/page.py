@@ -1,0 +1,62 @@
+"""`memmlp report`: all tables and figures as one HTML page."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from memmlp.cli.options import outputs_option
+
+if TYPE_CHECKING:
+    from memmlp.report.page import Chapter
+
+EVERY = ("all", "memory_control")
+
+
+@click.command("report")
+@click.argument("words", nargs=-1, metavar="[NAMES]... [OVERRIDES]...")
+@click.option(
+    "--out", type=click.Path(path_type=Path, dir_okay=False), help="[default: report.html in --outputs]"
+)
+@outputs_option
+def page(words: tuple[str, ...], out: Path | None, outputs: Path) -> None:
+    """One page of tables, effects, accuracy against latency, training curves and runs; needs no network.
+
+    NAMES are those of `memmlp table`; all tables of the paper and the controls without any. OVERRIDES find the
+    runs again that were made with them.
+    """
+    from memmlp.cli.shipped import shipped
+    from memmlp.cli.table import write
+    from memmlp.environment import environment
+    from memmlp.report.page import page as written
+    from memmlp.report.page import published
+    from memmlp.sweep.spec import load_sweep
+
+    names = [word for word in words if "=" not in word and not word.startswith("~")] or [
+        "all",
+        "memory_control",
+    ]
+    chapters = chapters_of(names, [word for word in words if word not in names], outputs)
+    folder = shipped("sweeps")
+    systems = published(load_sweep(folder / "table01.yaml"), load_sweep(folder / "table17.yaml"))
+    git = environment()["git"] or {}
+    code = f"{git.get('commit', environment()['version'])[:7]}{' with changes' if git.get('dirty') else ''}"
+    when = datetime.now(UTC).strftime("Generated %Y-%m-%d %H:%M UTC")
+    write(out or outputs / "report.html", written(chapters, systems, when, code))
+
+
+def chapters_of(names: Sequence[str], overrides: Sequence[str], outputs: Path) -> list[Chapter]:
+    """The tables of some names with the finished runs behind them, each run read once."""
+    from memmlp.cli.table import MODES, gathered
+    from memmlp.report.page import Chapter
+    from memmlp.tables.collect import finished
+    from memmlp.tables.measured import load
+
+    read = functools.cache(load)
+    found = gathered(names, overrides, outputs, MODES["both"], read)
+    return [Chapter(sweep, table, finished(sweep, find, read)) for sweep, find, table in found]
