@@ -18,6 +18,7 @@ from memmlp.body import N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.data.dataset import Frames
 from memmlp.features import Frame
 from memmlp.geometry import sixd_to_matrix
+from memmlp.ik import IK, NoIK
 from memmlp.memory import State
 from memmlp.progress import track
 
@@ -75,10 +76,13 @@ def window(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
 MODES: dict[str, Callable[[Network, Sequence[Tensor]], list[Tensor]]] = {"window": window, "stream": stream}
 
 
-def evaluate(network: Network, frames: Frames, modes: Sequence[str], batch: int) -> dict[str, Any]:
+def evaluate(
+    network: Network, frames: Frames, modes: Sequence[str], batch: int, ik: IK | None = None
+) -> dict[str, Any]:
     """Metrics of a split: `{"mean": {mode: {branch: {metric: value}}}, "clips": [...]}`.
 
-    The mean is over clips of each clip's mean over frames. At most `batch` clips stand side by side.
+    The mean is over clips of each clip's mean over frames. At most `batch` clips stand side by side. What
+    `ik` makes of the two branches is a branch more.
     """
     clips = [frames.clip(i) for i in range(len(frames.names))]
     rows: list[dict[str, Any]] = [
@@ -86,7 +90,7 @@ def evaluate(network: Network, frames: Frames, modes: Sequence[str], batch: int)
     ]
     for mode in modes:
         for row, clip, motion in zip(rows, clips, predict(network, clips, mode, batch), strict=True):
-            row[mode] = clip_report(network.frame, motion, clip)
+            row[mode] = clip_report(network.frame, motion, clip, ik)
     return {"mean": {mode: _mean([row[mode] for row in rows]) for mode in modes}, "clips": rows}
 
 
@@ -96,13 +100,22 @@ def predict(network: Network, clips: Sequence[Tensor], mode: str, batch: int) ->
     return [motion for group in groups for motion in MODES[mode](network, group)]
 
 
-def clip_report(frame: Frame, motion: Tensor, truth: Tensor) -> dict[str, dict[str, float]]:
-    """Metrics of both branches for motion (N, 198) and true frames (N, 252)."""
+def clip_report(
+    frame: Frame, motion: Tensor, truth: Tensor, ik: IK | None = None
+) -> dict[str, dict[str, float]]:
+    """Metrics of both branches and of what `ik` makes of them, for motion (N, 198) and truth (N, 252)."""
     sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
-    positions = joint_positions(target)
-    rotation = metrics.rotations_report(local_rotations(motion), local_rotations(target))
-    rotation |= metrics.positions_report(frame.pose(motion, sparse), positions)
-    return {"rotation": rotation, "position": metrics.positions_report(joint_positions(motion), positions)}
+    position = metrics.positions_report(joint_positions(motion), joint_positions(target))
+    report = {"rotation": rotations_report(frame, motion, truth), "position": position}
+    solved = (ik or NoIK()).solutions(frame, motion, sparse)
+    return report | {name: rotations_report(frame, result, truth) for name, result in solved.items()}
+
+
+def rotations_report(frame: Frame, motion: Tensor, truth: Tensor) -> dict[str, float]:
+    """Metrics of the rotations of motion (N, 198), their joints by forward kinematics; truth (N, 252)."""
+    sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
+    report = metrics.rotations_report(local_rotations(motion), local_rotations(target))
+    return report | metrics.positions_report(frame.pose(motion, sparse), joint_positions(target))
 
 
 def local_rotations(motion: Tensor) -> Tensor:

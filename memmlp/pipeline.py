@@ -21,6 +21,7 @@ from memmlp.export import TOLERANCE, export, parity
 from memmlp.features import Frame, World
 from memmlp.files import write_json
 from memmlp.identity import run_id
+from memmlp.ik import IK
 from memmlp.losses import Hand, MotionLoss, Weighting
 from memmlp.memory import Memory
 from memmlp.model import MemMLP
@@ -96,6 +97,7 @@ class Experiment:
     optim: Optim
     modes: Sequence[str]
     evaluation_batch: int
+    ik: IK
     latency_steps: int
     save_predictions: Path | None
     tracker: Tracker
@@ -191,7 +193,7 @@ def motion_run(
     seconds["train"], started = time.monotonic() - started, time.monotonic()
     test = Frames.open(cache, "test")
     results = evaluation.evaluate(
-        model, test.to(experiment.device), experiment.modes, experiment.evaluation_batch
+        model, test.to(experiment.device), experiment.modes, experiment.evaluation_batch, experiment.ik
     )
     write_json(run.clips, results["clips"])
     picture(model, test, run)
@@ -264,13 +266,14 @@ def save_predictions(experiment: Experiment, model: MemMLP, cache: Path) -> None
         for name, clip, motion in zip(test.names, clips, motions, strict=True):
             path = experiment.save_predictions / mode / f"{name}.npz"
             path.parent.mkdir(parents=True, exist_ok=True)
-            np.savez(path, allow_pickle=False, **prediction_arrays(model.frame, clip, motion))
+            np.savez(path, allow_pickle=False, **prediction_arrays(model.frame, clip, motion, experiment.ik))
 
 
-def prediction_arrays(frame: Frame, clip: Tensor, motion: Tensor) -> dict[str, np.ndarray]:
+def prediction_arrays(frame: Frame, clip: Tensor, motion: Tensor, ik: IK) -> dict[str, np.ndarray]:
     """What a prediction file holds: metres in the world, local rotation matrices, float32.
 
-    `predicted_positions` are those of the rotation branch by forward kinematics, the head on its tracker.
+    `predicted_positions` are those of the rotation branch by forward kinematics, the head on its tracker;
+    what inverse kinematics makes of the branches follows as `combined_positions` and `combined_rotations`.
     """
     sparse, truth = clip[:, :SPARSE_DIM], clip[:, SPARSE_DIM:]
     arrays = {
@@ -280,4 +283,7 @@ def prediction_arrays(frame: Frame, clip: Tensor, motion: Tensor) -> dict[str, n
         "predicted_rotations": evaluation.local_rotations(motion),
         "true_rotations": evaluation.local_rotations(truth),
     }
+    for name, solved in ik.solutions(frame, motion, sparse).items():
+        arrays[f"{name}_positions"] = frame.pose(solved, sparse)
+        arrays[f"{name}_rotations"] = evaluation.local_rotations(solved)
     return {name: tensor.cpu().numpy() for name, tensor in arrays.items()}

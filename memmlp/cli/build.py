@@ -16,6 +16,7 @@ from memmlp.cli.report import show
 from memmlp.cli.schema import Config, check
 from memmlp.errors import InputError
 from memmlp.features import Heading, HeadRelative, World
+from memmlp.ik import IK, LBFGS, NoIK
 from memmlp.memory import Memory
 from memmlp.runs import Run
 from memmlp.tracking import Tracker
@@ -54,6 +55,7 @@ def build_experiment(cfg: DictConfig) -> pipeline.Experiment:
         optim=Optim(**config["optim"]),
         modes=list(cfg.evaluation.modes),
         evaluation_batch=cfg.evaluation.batch,
+        ik=build_ik(cfg),
         latency_steps=cfg.export.latency_steps,
         save_predictions=Path(cfg.save_predictions) if cfg.save_predictions else None,
         tracker=build_tracker(cfg),
@@ -89,6 +91,13 @@ def build_architecture(cfg: DictConfig) -> pipeline.Architecture:
         trains_codes=kind.trains_codes,
         predictor=instantiate(cfg.predictor),
     )
+
+
+def build_ik(cfg: DictConfig) -> IK:
+    """The inverse kinematics of a checked config; off in a run from before there was any."""
+    if cfg.evaluation.get("ik", "off") == "off":
+        return NoIK()
+    return LBFGS(cfg.evaluation.ik_iterations)
 
 
 def memory_class(cfg: DictConfig) -> type[Memory]:

@@ -433,6 +433,8 @@ class Optim:
 class Evaluation:
     modes: list[str] = key(EachOf(OneOf(("window", "stream"))))
     batch: int = at_least(1)
+    ik: str = one_of("off", "lbfgs")
+    ik_iterations: int = at_least(1)
 
 
 @dataclass
@@ -592,6 +594,11 @@ def _check_combinations(cfg: DictConfig) -> None:
         raise InputError(
             "predictor with memory blocks needs a memory, and memory=none is none: "
             "allowed is another memory, predictor=two_branch or predictor=rotation_only"
+        )
+    if cfg.evaluation.ik != "off" and predictor.startswith("RotationOnly"):
+        raise InputError(
+            f"evaluation.ik={cfg.evaluation.ik} needs the positions of predictor=two_branch: "
+            "allowed is evaluation.ik=off"
         )
     if "streams" in cfg.rollout and cfg.rollout.streams < cfg.optim.batch:
         raise InputError(
