@@ -6,6 +6,8 @@ import functools
 import io
 import json
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -316,6 +318,13 @@ def test_collect_reads_each_run_once(sweep: Sweep, tmp_path: Path):
 
     collect(many, find, read=functools.cache(counted))
     assert len(opened) == len(set(opened)) == 80
+
+
+def test_tables_need_no_torch():
+    """Nor scipy.stats or matplotlib: together seconds to import, more than two thousand runs take."""
+    code = "import sys, memmlp.cli.table, memmlp.tables.render as r; print(*sys.modules)"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"torch", "scipy.stats", "matplotlib", "hydra"} & set(ran.stdout.split())
 
 
 def test_without_runs_the_papers_values_and_the_reason_are_shown():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+import gc
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -44,7 +46,8 @@ def table(
     """
     from memmlp.tables.measured import load
 
-    found = gathered([name], overrides, outputs, MODES[mode], functools.cache(load))
+    with _uncollected():
+        found = gathered([name], overrides, outputs, MODES[mode], functools.cache(load))
     tables = [one.table for one in found]
     if form is None and out is None:
         _print(tables)
@@ -54,6 +57,16 @@ def table(
         click.echo(text, nl=False)
     else:
         write(out, text)
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """No garbage collection: what is read of thousands of runs is all kept, and searching it takes a second."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
 
 
 class Found(NamedTuple):
