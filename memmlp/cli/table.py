@@ -61,7 +61,7 @@ def table(
 
 @contextmanager
 def _uncollected() -> Iterator[None]:
-    """No garbage collection: what is read of thousands of runs is all kept, and searching it takes a second."""
+    """No garbage collection: what is read of the runs is all kept, and searching it takes a second."""
     gc.disable()
     try:
         yield
