@@ -27,8 +27,8 @@ EVERY = ("all", "memory_control")
 def page(words: tuple[str, ...], out: Path | None, outputs: Path) -> None:
     """One page of tables, effects, accuracy against latency, training curves and runs; needs no network.
 
-    NAMES are those of `memmlp table`; without any, all tables of the paper and the memory's controls. OVERRIDES
-    find the runs again that were made with them.
+    NAMES are those of `memmlp table`; without any, all tables of the paper and the memory's controls.
+    OVERRIDES find the runs again that were made with them.
     """
     from memmlp.cli.shipped import shipped
     from memmlp.cli.table import write
