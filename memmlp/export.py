@@ -10,6 +10,8 @@ from __future__ import annotations
 import json
 import logging
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ from torch import Tensor, nn
 
 from memmlp import __version__
 from memmlp.body import FPS, JOINTS, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
+from memmlp.memory import Blend
 from memmlp.model import MemMLP
 
 OPSET = 18
@@ -47,6 +50,20 @@ class StreamStep(nn.Module):
         return rotation, position, *(new[name] for name in self.names)
 
 
+@contextmanager
+def deterministic(model: MemMLP) -> Iterator[None]:
+    """No draws, which torch and ONNX Runtime could not share: a sampled m (reading 7) is its mean."""
+    sampled = [module for module in model.modules() if isinstance(module, Blend) and module.sampled]
+    values = [blend.value for blend in sampled]
+    try:
+        for blend in sampled:
+            blend.value = Blend.MEAN
+        yield
+    finally:
+        for blend, value in zip(sampled, values, strict=True):
+            blend.value = value
+
+
 def export(model: MemMLP, path: Path, run_id: str) -> None:
     """Write the model's streaming step, on the CPU in float32, as one ONNX file with its metadata."""
     step = StreamStep(model.cpu().eval())
@@ -56,7 +73,7 @@ def export(model: MemMLP, path: Path, run_id: str) -> None:
     level = quiet.level
     quiet.setLevel(logging.ERROR)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), deterministic(model):
             warnings.simplefilter("ignore")  # the exporter's own deprecations are no news to our users
             program = torch.onnx.export(
                 step,
@@ -115,9 +132,10 @@ def parity(model: MemMLP, path: Path, clip: Tensor) -> float:
     """Largest difference between torch and ONNX Runtime, each with its own history, over a clip (N, 252)."""
     model = model.cpu().eval()
     onnx_stream, state, worst = OnnxStream(path), model.initial_state(1), 0.0
-    for sparse in clip[:, None, None, :SPARSE_DIM].cpu():
-        motion, state = model.advance(sparse, state)
-        rotation, position = onnx_stream.step(sparse[:, 0].numpy())
-        ours = np.concatenate([rotation.reshape(-1), position.reshape(-1)])
-        worst = max(worst, float(np.abs(ours - motion[0, -1].numpy()).max()))
+    with deterministic(model):
+        for sparse in clip[:, None, None, :SPARSE_DIM].cpu():
+            motion, state = model.advance(sparse, state)
+            rotation, position = onnx_stream.step(sparse[:, 0].numpy())
+            ours = np.concatenate([rotation.reshape(-1), position.reshape(-1)])
+            worst = max(worst, float(np.abs(ours - motion[0, -1].numpy()).max()))
     return worst

@@ -49,12 +49,19 @@ class Projection(nn.Module):
 class Blend(nn.Module):
     """The coefficient m (reading 7): U[0, 1] per frame and channel in training, `value` at inference.
 
-    value: a number in [0, 1], or "sampled" to draw at inference as in training.
+    value: a number in [0, 1], or "sampled" to draw at inference as in training. ONNX has the mean of draws.
     """
+
+    MEAN = 0.5
 
     def __init__(self, value: float | str):
         super().__init__()
         self.value = value
+
+    @property
+    def sampled(self) -> bool:
+        """Whether m is drawn at inference."""
+        return isinstance(self.value, str)
 
     def forward(self, like: Tensor) -> Tensor | float:
         """m, broadcastable to (B, T, k)."""
