@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from memmlp.pipeline import Experiment
 
 
+CODE = ("build", "motion", "plan", "schema")  # what turns a config into an experiment
+
+
 def find_sweep(name: str) -> Sweep:
     """The sweep of a path, of a shipped file's name, or of a table's number."""
     if name.endswith((".yaml", ".yml")) or "/" in name:
@@ -149,7 +152,8 @@ def _fresh(data: dict[str, Any]) -> bool:
 
 def _stamp(sweep: Sweep) -> str:
     """Digest of all that a plan follows from but the data: sweep, configs, the code that reads them."""
-    files = [*shipped("conf").rglob("*.yaml"), *Path(__file__).parent.glob("*.py")]
+    here = Path(__file__).parent
+    files = [*shipped("conf").rglob("*.yaml"), *(here / f"{name}.py" for name in CODE)]
     texts = [(file.name, file.read_text(encoding="utf-8")) for file in sorted(files)]
     return _digest([RECIPE, asdict(sweep), texts])
 

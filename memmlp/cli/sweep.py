@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -67,7 +68,7 @@ def sweep(
     if plan.left():
         bring_to_end(chosen, plan, engine, options, count)
         track(plan)
-    report(chosen, plan)
+    report(chosen, plan, [name, *rest])
 
 
 def split_executor(words: tuple[str, ...]) -> tuple[str, dict[str, str], tuple[str, ...]]:
@@ -184,7 +185,7 @@ def _seconds(plan: Plan, run_id: str) -> list[float]:
     return list(seconds.values()) if isinstance(seconds, dict) else []
 
 
-def report(chosen: Sweep, plan: Plan) -> None:
+def report(chosen: Sweep, plan: Plan, words: Sequence[str]) -> None:
     """What is done, what failed, and the next command. Exits with 1 where something failed."""
     from memmlp.cli.plan import orphans
 
@@ -199,4 +200,4 @@ def report(chosen: Sweep, plan: Plan) -> None:
     if failed:
         click.echo("again with: --retry", err=True)
         raise SystemExit(1)
-    click.echo(f"next: memmlp table {' '.join([chosen.name, *chosen.extra])}")
+    click.echo(f"next: memmlp table {' '.join(words)}")

@@ -6,6 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -58,9 +59,10 @@ class Plan:
 
     def run(self, label: str, seed: int) -> Run | None:
         """The run of an arm with a seed, finished or not; None where its identity is not known."""
-        found = self._by_cell().get((label, seed))
+        found = self._by_cell.get((label, seed))
         return Run.of(self.outputs, found) if found else None
 
+    @cached_property
     def _by_cell(self) -> dict[tuple[str, int], str]:
         return {(entry.label, entry.seed): entry.id for entry in self.entries}
 
