@@ -208,7 +208,7 @@ def refused(options: tuple[str, str]) -> str:
     """What the one line names where a pair is refused, or nothing."""
     rotation_only = any(option.startswith("predictor=rotation_only") for option in options)
     of_memory = next((o.split("=")[0] for o in options if o.startswith("memory.")), "")
-    if rotation_only and "hand=fk" not in options and "hand=off" not in options:
+    if rotation_only and "hand=position" in options:
         return "hand=position"
     if rotation_only and "evaluation.ik=lbfgs" in options:
         return "evaluation.ik=lbfgs"
@@ -255,14 +255,21 @@ def test_all_pairs_of_options_of_different_groups_go_together():
         assert network(["profile=tiny", *row]).count_parameters() > 0
 
 
-@pytest.mark.parametrize("start", range(3))
-def test_the_pairs_that_cannot_go_together_are_refused_in_one_line(start):
-    for pair in [pair for pair in PAIRS if refused(pair)][start::6]:
-        with pytest.raises(InputError) as stop:
-            composed(["profile=tiny", *pair])
-        assert refused(pair) in str(stop.value)
-        assert "allowed" in str(stop.value)
-        assert "\n" not in str(stop.value)
+REFUSED = [(list(pair), refused(pair)) for pair in PAIRS if refused(pair)]
+REFUSED += [(["predictor=two_branch_memory", "predictor.depth=0"], "predictor.depth=0")]
+
+
+@pytest.mark.parametrize(("overrides", "word"), REFUSED, ids=[" ".join(options) for options, _ in REFUSED])
+def test_what_cannot_go_together_is_refused_in_one_line(overrides, word):
+    rotation_only = any(option.startswith("predictor=rotation_only") for option in overrides)
+    hand = (
+        ["hand=fk"] if rotation_only and not any(option.startswith("hand=") for option in overrides) else []
+    )
+    with pytest.raises(InputError) as stop:
+        composed(["profile=tiny", *overrides, *hand])
+    assert word in str(stop.value)
+    assert "allowed" in str(stop.value)
+    assert "\n" not in str(stop.value)
 
 
 @pytest.mark.parametrize("name", ["s1", "s2", "s3"])

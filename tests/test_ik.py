@@ -1,5 +1,6 @@
 """Inverse kinematics: its objective, its optimiser, and its place in evaluation."""
 
+import numpy as np
 import pytest
 import tiny
 import torch
@@ -10,6 +11,7 @@ from memmlp.body import HEAD, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.evaluation import clip_report, evaluate, local_rotations, stream
 from memmlp.geometry import axis_angle_to_matrix, matrix_to_sixd
 from memmlp.ik import LBFGS, JointDistance, NoIK, minimise
+from memmlp.pipeline import prediction_arrays
 
 FRAME = tiny.frame()
 TRUTH = tiny.clip(40)
@@ -155,3 +157,15 @@ def test_the_combined_report_is_of_the_solved_rotations():
     assert report["combined"]["MPJPE"] == float(metrics.position_error(positions, truth))
     torch.testing.assert_close(positions[:, HEAD], truth[:, HEAD], atol=1e-5, rtol=0)
     assert ROTATION.stop == 132
+
+
+def test_prediction_files_hold_the_solved_pose():
+    motion = perturbed(0.2)
+    plain = prediction_arrays(FRAME, TRUTH, motion, NoIK())
+    arrays = prediction_arrays(FRAME, TRUTH, motion, LBFGS(5))
+    assert set(arrays) - set(plain) == {"combined_positions", "combined_rotations"}
+    assert arrays["combined_rotations"].shape == (40, N_JOINTS, 3, 3)
+    target = arrays["predicted_positions_of_position_branch"]
+    distances = [np.abs(arrays[f"{name}_positions"] - target).mean() for name in ("combined", "predicted")]
+    assert distances[0] < distances[1] / 2
+    assert all(np.array_equal(arrays[name], plain[name]) for name in plain)

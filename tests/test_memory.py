@@ -10,7 +10,7 @@ from memmlp import latency
 from memmlp.body import SPARSE_DIM
 from memmlp.data.dataset import WindowSampler
 from memmlp.errors import InputError
-from memmlp.losses import HandPosition, MotionLoss, Uncertainty
+from memmlp.losses import HandPosition, MotionLoss, Uncertainty, l1
 from memmlp.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory
 from memmlp.model import MemMLP
 from memmlp.predictor import RotationOnlyMemory, TwoBranchMemory
@@ -158,6 +158,24 @@ def test_joint_codes_are_entries_of_the_codebook_and_a_frozen_copy_gives_the_sam
     sparse, motion = torch.randn(2, 7, 54), torch.randn(2, 7, 198)
     codes = joint.memory.code_vectors(sparse, motion)
     assert (codes[..., None, :] == joint.memory.codes.codebook.vectors).all(-1).any(-1).all()
+
+
+@torch.no_grad()
+def test_the_vqvaes_terms_are_eq_1_in_the_worlds_units_and_the_codebooks_loss():
+    model = tiny.vqvae()
+    frames = tiny.frame().encode(tiny.clip(20))
+    latent = model.encoder(frames)
+    nearest = torch.cdist(latent, model.codebook.vectors).argmin(-1)
+    model.codebook.started.fill_(True)
+    rotations = model.decoder(model.codebook.vectors[nearest])
+    std, mean = (tensor[54:186] for tensor in (tiny.frame().std, tiny.frame().mean))
+    place = tiny.frame().place(tiny.clip(20)[:, :54])
+    truth = tiny.frame().coordinates.motion_in(tiny.clip(20)[:, 54:], place)[:, :132]
+    expected = l1((rotations * std + mean - truth)[:, None])
+    terms, indices = model.loss_terms(frames, tiny.frame())
+    torch.testing.assert_close(terms["rotation"], expected, rtol=1e-5, atol=0)
+    assert torch.equal(indices, nearest)
+    assert set(terms) == {"rotation", "codebook"}
 
 
 def test_parameters_count_a_joint_vqvae_and_not_a_frozen_one():
