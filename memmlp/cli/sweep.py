@@ -127,8 +127,10 @@ def bring_to_end(chosen: Sweep, plan: Plan, engine: str, options: dict[str, str]
     from memmlp.sweep.worker import Presence
 
     folder = sweep_folder(chosen, plan.outputs)
-    path = str(folder / "plan.json")
-    presence = Presence(folder / "controllers" / f"{uuid4().hex}.lock")
+    own = folder / "controllers" / uuid4().hex  # the plan of these workers, whatever others plan meanwhile
+    path = str(own.with_suffix(".json"))
+    plan.save(Path(path))
+    presence = Presence(own.with_suffix(".lock"))
     threads = max((os.cpu_count() or 1) // workers, 1) if engine == "local" else 0
     local = partial(work, path, threads, str(presence.path))
     task = local if engine == "local" else partial(work_alone, path)

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from memmlp.errors import InputError
 from memmlp.sweep.plan import Plan, Task
 from memmlp.sweep.worker import Cancelled, Presence
 from memmlp.sweep.worker import work as work_on
+
+if TYPE_CHECKING:
+    from memmlp.pipeline import Experiment
 
 
 def work(path: str, threads: int, controller: str) -> None:
@@ -32,12 +37,23 @@ def perform(path: Path, threads: int, plan: Plan, task: Task) -> None:
     from memmlp.cli.build import build_experiment
 
     experiment = build_experiment(OmegaConf.create(dict(task.config)))
+    check_identity(experiment, task)
     if chosen := experiment.config["threads"] or threads:
         torch.set_num_threads(chosen)
     if task.kind == "vqvae":
         pipeline.vqvae_run(experiment, *experiment.data.prepare())
     else:
         pipeline.run(experiment, partial(check_wanted, path, task.id))
+
+
+def check_identity(experiment: Experiment, task: Task) -> None:
+    """Raise InputError where this code takes the task's config for another run than the plan does."""
+    from memmlp.pipeline import motion_id, vqvae_id
+
+    digest = experiment.data.prepare()[1].digest
+    found = vqvae_id(experiment, digest) if task.kind == "vqvae" else motion_id(experiment, digest)
+    if found != task.id:
+        raise InputError(f"run {task.id}: the data or the code changed since the sweep began; start it again")
 
 
 def check_wanted(path: Path, run_id: str, step: int, values: dict[str, float]) -> None:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ import yaml
 
 from memmlp.cli.plan import find_sweep, orphans, planned
 from memmlp.cli.sweep import split_executor
+from memmlp.cli.work import perform
 from memmlp.errors import InputError
 from memmlp.runs import Run, list_runs
 
@@ -184,3 +186,12 @@ def test_executor_words_are_no_overrides_of_the_runs():
 @pytest.mark.parametrize("name", ["14", "table14", "04", "4", "memory_control"])
 def test_shipped_sweeps_are_found_by_name_and_number(name: str):
     assert find_sweep(name).name in ("table14", "table04", "memory_control")
+
+
+def test_a_worker_of_other_code_or_data_leaves_the_run_alone(home: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(home)
+    plan = planned(find_sweep("trial.yaml").with_overrides(TINY), (home / "outputs").absolute())
+    other = replace(next(task for task in plan.tasks if task.kind == "memmlp"), id="0" * 16)
+    with pytest.raises(InputError, match="the data or the code changed since the sweep began"):
+        perform(home / "plan.json", 1, plan, other)
+    assert not plan.run_of(other).folder.exists()
