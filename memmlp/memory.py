@@ -372,7 +372,8 @@ class Recurrence(nn.Module):
 
     def forward(self, sparse: Tensor, carried: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
         """Inputs (B, n, 54) and states (B, k) -> features (B, n, k) and the states after them."""
-        output, states = self.run(self.norm(sparse), [state.contiguous()[None] for state in carried])
+        with torch.autocast(sparse.device.type, enabled=False):  # not every CPU has an LSTM in bfloat16
+            output, states = self.run(self.norm(sparse), [state.contiguous()[None] for state in carried])
         return F.silu(output), [state[0] for state in states]
 
     def run(self, x: Tensor, states: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
@@ -468,7 +469,8 @@ class RecurrentMemory(FeatureMemory):
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
         """Hidden states from the last of inputs (B, length, 54)."""
-        return {"hidden": torch.stack([layer.begin(sparse[:, -1]) for layer in self._layers()], 1)}
+        hidden = torch.stack([layer.begin(sparse[:, -1]) for layer in self._layers()], 1)
+        return {"hidden": hidden.float()}
 
     def recall(self, sparse: Tensor, state: State, new: int) -> Recurred:
         """The layers' features, those of the `new` frames made now."""

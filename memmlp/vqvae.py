@@ -70,17 +70,22 @@ class EMACodebook(Codebook):
 
     def learn(self, latent: Tensor) -> Quantised:
         """Quantise latents (B, width) and move the code-vectors towards them."""
-        detached = latent.detach().float()
-        if not self.started:
-            self._restart(torch.ones_like(self.counts, dtype=torch.bool), detached)
-            self.started.fill_(True)
-        codes, index = self(detached)
-        chosen = F.one_hot(index, len(self.counts)).to(detached.dtype)
-        self.counts.lerp_(chosen.sum(0), 1 - self.decay)
-        self.sums.lerp_(chosen.T @ detached, 1 - self.decay)
-        self._restart(self.counts < self.DEAD, detached)
-        self.vectors.copy_(self.sums / self.counts[:, None])
+        with torch.autocast(latent.device.type, enabled=False):  # running means need float32
+            codes, index = self._follow(latent.detach().float())
         return Quantised(codes, index, self.commitment * F.mse_loss(latent, codes))
+
+    def _follow(self, latent: Tensor) -> tuple[Tensor, Tensor]:
+        """Codes and indices of latents, after which the code-vectors move."""
+        if not self.started:
+            self._restart(torch.ones_like(self.counts, dtype=torch.bool), latent)
+            self.started.fill_(True)
+        codes, index = self(latent)
+        chosen = F.one_hot(index, len(self.counts)).to(latent.dtype)
+        self.counts.lerp_(chosen.sum(0), 1 - self.decay)
+        self.sums.lerp_(chosen.T @ latent, 1 - self.decay)
+        self._restart(self.counts < self.DEAD, latent)
+        self.vectors.copy_(self.sums / self.counts[:, None])
+        return codes, index
 
     def _restart(self, dead: Tensor, latent: Tensor) -> None:
         """Put dead codes onto random latents of the batch."""

@@ -15,7 +15,8 @@ from memmlp.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, No
 from memmlp.model import MemMLP
 from memmlp.predictor import RotationOnlyMemory, TwoBranchMemory
 from memmlp.rollout import OwnPredictions, PersistentStreams, TeacherForcing
-from memmlp.training import MotionTask, Optim
+from memmlp.runs import Run
+from memmlp.training import MotionTask, Optim, train
 from memmlp.vqvae import VQVAE
 
 RECURRENT = [LSTMMemory, GRUMemory]
@@ -108,6 +109,20 @@ def test_the_recurrence_costs_one_step_a_frame(kind, gates):
     extra = latency.macs(model) - latency.macs(plain)
     width, fused = 6, 2 * model.frames * 6 * model.hidden
     assert extra == fused + 2 * gates * width * (SPARSE_DIM + width)
+
+
+@pytest.mark.parametrize("rollout", [TeacherForcing, lambda: PersistentStreams(6)])
+@pytest.mark.parametrize("kind", [*RECURRENT, JointCodeMemory])
+def test_every_memory_trains_in_bfloat16(kind, rollout, tmp_path):
+    model, made = tiny.model(kind), rollout()
+    if isinstance(made, PersistentStreams):
+        made.build(model)
+    loss = MotionLoss(Uncertainty(), HandPosition(), model.predictor.branches)
+    optim = Optim(steps=3, batch=3, lr=1e-3, precision="bf16", log_every=1)
+    task = MotionTask(model, loss, made, SPLIT, optim, 0, validate=lambda model: {})
+    train(task, optim, Run(tmp_path), 0, "bf16")
+    assert len(Run(tmp_path).metrics()) >= 3
+    assert all(torch.isfinite(p).all() for p in model.parameters())
 
 
 def joint_task(codebook: str = "ema") -> MotionTask:
