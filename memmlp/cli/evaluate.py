@@ -42,7 +42,8 @@ def evaluate(
         )
     model = experiment.architecture.load(found).to(experiment.device)
     frames = Frames.open(cache, "test").to(experiment.device)
-    results = evaluation.evaluate(model, frames, experiment.modes, experiment.evaluation_batch)
+    modes, batch = experiment.modes, experiment.evaluation_batch
+    results = evaluation.evaluate(model, frames, modes, batch, experiment.ik)
     Console(highlight=False).print(metrics_table(results["mean"]))
     if json_path is not None:
         write_json(json_path, json.loads(json.dumps(results)))

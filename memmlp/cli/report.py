@@ -10,7 +10,8 @@ from rich.table import Table
 from memmlp.pipeline import Outcome
 from memmlp.units import UNITS
 
-COLUMNS = [("stream", "rotation"), ("stream", "position"), ("window", "rotation"), ("window", "position")]
+BRANCHES = ("rotation", "position", "combined")
+COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHES]
 
 
 def show(outcome: Outcome) -> None:
@@ -38,7 +39,7 @@ def show(outcome: Outcome) -> None:
 
 def metrics_table(results: dict[str, Any]) -> Table:
     """The test metrics by mode and branch."""
-    columns = [(mode, branch) for mode, branch in COLUMNS if mode in results]
+    columns = [(mode, branch) for mode, branch in COLUMNS if branch in results.get(mode, {})]
     table = Table(title="test clips", title_justify="left")
     table.add_column("metric")
     table.add_column("unit")

@@ -161,7 +161,7 @@ def test_cfg_job_prints_the_config(memmlp: Memmlp, jobs: list[DictConfig]):
 
 
 def test_help_says_what_can_be_chosen(memmlp: Memmlp):
-    assert "memory: no_codes, none, vq" in memmlp("train", "--help").out
+    assert "memory: gru, lstm, no_codes, none, vq, vq_joint" in memmlp("train", "--help").out
 
 
 def test_info_says_where_configs_are_sought(tmp_path: Path):
@@ -182,7 +182,7 @@ def test_hydras_environment_is_left_as_it_was(memmlp: Memmlp, jobs: list[DictCon
         ("memmlp train memory=n", {"memory=no_codes", "memory=none"}),
         ("memmlp train memory=none optim.preci", {"optim.precision="}),
         ("memmlp train memory=none memory.wid", set()),
-        ("memmlp tr", {"train"}),
+        ("memmlp tr", {"train", "track"}),
         ("memmlp ", set(COMMANDS)),
         ("memmlp runs sh", set()),
     ],
