@@ -43,7 +43,7 @@ class MemMLP(nn.Module):
             "started": torch.zeros(batch, 1),
         }
         state |= self.memory.initial_state(batch)
-        return {name: tensor.to(self.stem.weight.device) for name, tensor in state.items()}
+        return {name: tensor.to(self.stem.weight) for name, tensor in state.items()}
 
     def running_state(self, sparse: Tensor) -> State:
         """A state after world inputs (B, length, 54) that carries no history of motion yet."""
