@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from memmlp.cli.chaos import chaos
+from memmlp.cli.chaos import chaos, chaos_tune
 
 
 @click.group("bench")
@@ -88,3 +88,4 @@ def stream(clips: int, frames: int, rounds: int, device: str, overrides: tuple[s
 
 
 bench.add_command(chaos)
+bench.add_command(chaos_tune)

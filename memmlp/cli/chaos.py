@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import random
@@ -10,16 +11,24 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import click
 import yaml
 
 from memmlp.files import file_digest
-from memmlp.runs import list_runs
+from memmlp.runs import Run, list_runs
 
 OVERRIDES = ["profile=tiny", "data.synth.minutes=1", "tracker=none", "threads=1"]
+PAUSES = (0.5, 3.0)  # seconds between kills of a sweep's processes
+LONG_PAUSES = (3.0, 9.0)  # of a search's: one controller, which has to come to its feet in between
+
+ENDS = ("complete", "pruned")  # of trials whose runs can't fail
+
+Launch = Callable[[], subprocess.Popen[bytes]]
 
 
 @click.command("chaos")
@@ -37,47 +46,71 @@ def chaos(runs: int, kills: int, controllers: int, seed: int, overrides: tuple[s
         sweep = Path(folder) / "chaos.yaml"
         arms = {"vq": [], "none": ["memory=none"]}
         sweep.write_text(yaml.safe_dump({"arms": arms, "seeds": list(range((runs + 1) // 2))}))
-        words = [*OVERRIDES, *overrides]
+        words = ["sweep", str(sweep), *OVERRIDES, *overrides]
         calm, stormy = Path(folder) / "calm", Path(folder) / "stormy"
         started = time.monotonic()
-        assert start(sweep, calm, words, workers=2).wait() == 0, "the undisturbed sweep failed"
+        assert start(words, calm, workers=2).wait() == 0, "the undisturbed sweep failed"
         click.echo(f"undisturbed: {time.monotonic() - started:.0f} s")
         started = time.monotonic()
-        killed = storm(sweep, stormy, words, kills, controllers, random.Random(seed))
+        launch = partial(start, words, stormy, workers=1)
+        killed = storm([launch] * controllers, stormy, kills, PAUSES, random.Random(seed))
         click.echo(f"with {killed} kills: {time.monotonic() - started:.0f} s")
         problems = compare(calm, stormy)
+    judge(problems, "as undisturbed")
+
+
+@click.command("chaos-tune")
+@click.option("--trials", default=10, show_default=True, help="search.n_trials.")
+@click.option("--kills", default=8, show_default=True, help="SIGKILLs of the controller and of workers.")
+@click.option("--seed", default=0, show_default=True, help="Of the killer.")
+@click.argument("overrides", nargs=-1)
+def chaos_tune(trials: int, kills: int, seed: int, overrides: tuple[str, ...]) -> None:
+    """A search whose controller and workers are killed at random.
+
+    It must end with exactly the trials it should have, none repeated, none lost. Exits with 1 otherwise.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        outputs = Path(folder) / "outputs"
+        words = ["tune", *OVERRIDES, f"search.n_trials={trials}", "search.prune_after=3", *overrides]
+        started = time.monotonic()
+        launch = partial(start, words, outputs, workers=2)
+        killed = storm([launch], outputs, kills, LONG_PAUSES, random.Random(seed))
+        click.echo(f"{trials} trials with {killed} kills: {time.monotonic() - started:.0f} s")
+        problems = examine(outputs, trials)
+    judge(problems, "all trials as they should be")
+
+
+def judge(problems: Sequence[str], what: str) -> None:
+    """Say what is wrong; exits with 1 where something is."""
     for problem in problems:
         click.echo(problem)
-    click.echo(f"{'as' if not problems else 'NOT as'} undisturbed: {len(problems)} differences")
+    click.echo(f"{'' if not problems else 'NOT '}{what}: {len(problems)} differences")
     if problems:
         raise SystemExit(1)
 
 
-def start(sweep: Path, outputs: Path, words: Sequence[str], workers: int) -> subprocess.Popen[bytes]:
-    """A `memmlp sweep` process."""
-    line = [sys.executable, "-c", "from memmlp.cli.main import main; main()", "sweep", str(sweep), *words]
+def start(words: Sequence[str], outputs: Path, workers: int) -> subprocess.Popen[bytes]:
+    """A `memmlp` process that works on a sweep or search."""
+    line = [sys.executable, "-c", "from memmlp.cli.main import main; main()", *words]
     line += ["--workers", str(workers), "--outputs", str(outputs)]
     return subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
 def storm(
-    sweep: Path, outputs: Path, words: Sequence[str], kills: int, controllers: int, dice: random.Random
+    launches: Sequence[Launch], outputs: Path, kills: int, pauses: tuple[float, float], dice: random.Random
 ) -> int:
-    """Bring the sweep to its end while killing; how many kills there were."""
-    processes = [start(sweep, outputs, words, workers=1) for _ in range(controllers)]
+    """Keep the processes at their work to its end, killing on the way; how many kills there were."""
+    processes = [launch() for launch in launches]
     killed = 0
-    while any(process.poll() is None for process in processes) or killed < kills:
-        time.sleep(dice.uniform(0.5, 3.0))
+    while killed < kills or any(process.poll() != 0 for process in processes):
+        time.sleep(dice.uniform(*pauses))
         if killed < kills and (victim := choose(processes, outputs, dice)) is not None:
             os.kill(victim, signal.SIGKILL)
             killed += 1
-        for index, process in enumerate(processes):
-            finished = process.poll() == 0 and killed >= kills
-            if process.poll() is not None and not finished and not all_done(outputs, killed >= kills):
-                processes[index] = start(sweep, outputs, words, workers=1)
-        if all_done(outputs, True) and all(process.poll() is not None for process in processes):
-            break
-    assert start(sweep, outputs, words, workers=1).wait() == 0, "the last call failed"
+        for index, launch in enumerate(launches):
+            code = processes[index].poll()
+            if code not in (None, 0) or (code == 0 and killed < kills):
+                processes[index] = launch()
     return killed
 
 
@@ -101,12 +134,6 @@ def _exists(pid: int) -> bool:
     return True
 
 
-def all_done(outputs: Path, strict: bool) -> bool:
-    """Whether all runs that were begun are done; never before the killer has had enough."""
-    runs = list_runs(outputs)
-    return strict and bool(runs) and all(run.done for run in runs)
-
-
 def compare(calm: Path, stormy: Path) -> list[str]:
     """What is not as it should be in the disturbed sweep's outputs."""
     expected, found = ({run.id: run for run in list_runs(outputs)} for outputs in (calm, stormy))
@@ -122,8 +149,6 @@ def compare(calm: Path, stormy: Path) -> list[str]:
 
 def check(folder: Path) -> list[str]:
     """What is wrong with a run that should have been finished exactly once."""
-    from memmlp.runs import Run
-
     run = Run(folder)
     if run.status != "done":
         return [f"{run.status}, not done"]
@@ -133,4 +158,32 @@ def check(folder: Path) -> list[str]:
         problems.append("begun again after it was finished")
     if (folder / ".holder").exists():
         problems.append("a holder is left")
+    return problems
+
+
+def examine(outputs: Path, trials: int) -> list[str]:
+    """What is not as it should be with a search's trials and runs."""
+    (folder,) = (outputs / "tune").iterdir()
+    with open(folder / "trials.csv", encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    problems = [] if len(rows) == trials else [f"{len(rows)} trials, not {trials}"]
+    problems += [f"trial {row['trial']}: {row['state']}" for row in rows if row["state"] not in ENDS]
+    ids = Counter(row["run"] for row in rows)
+    problems += [f"run {name}: of {count} trials" for name, count in ids.items() if count > 1]
+    runs = {run.id: run for run in list_runs(outputs) if run.manifest.get("kind") != "vqvae"}
+    problems += [f"run {name}: of no trial" for name in runs.keys() - ids.keys()]
+    for row in rows:
+        if row["state"] == "complete":
+            problems += _examine(row, runs.get(row["run"]))
+    return problems
+
+
+def _examine(row: dict[str, str], run: Run | None) -> list[str]:
+    """What is wrong with a complete trial."""
+    if run is None:
+        return [f"trial {row['trial']}: its run {row['run']} is missing"]
+    problems = [f"run {run.id}: {problem}" for problem in check(run.folder)]
+    last = [entry for entry in run.metrics() if entry.phase == "val"][-1]
+    if float(row["MPJPE"]) != last.values["rotation MPJPE"]:
+        problems.append(f"trial {row['trial']}: not the value of its run")
     return problems

@@ -28,6 +28,7 @@ COMMANDS = {
     "train": Command("train", "command", "Train, evaluate, export and time one configuration (Hydra)."),
     "data": Command("data", "data", "Make, import, prepare and inspect motion data."),
     "sweep": Command("sweep", "sweep", "Run what is missing of a table or of a sweep of your own."),
+    "tune": Command("tune", "tune", "Search loss weights, or other keys, by the errors on validation."),
     "table": Command("table", "table", "The paper's tables beside measured numbers."),
     "report": Command("page", "page", "All tables and figures as one HTML page."),
     "runs": Command("runs", "runs", "List, show and compare runs."),

@@ -44,7 +44,7 @@ def find_sweep(name: str) -> Sweep:
 
 def sweep_folder(sweep: Sweep, outputs: Path) -> Path:
     """Where a sweep with its command line's overrides keeps its plan and its workers' logs."""
-    key = f"-{_digest(sweep.extra)[:8]}" if sweep.extra else ""
+    key = f"-{digest(sweep.extra)[:8]}" if sweep.extra else ""
     return outputs / "sweeps" / f"{sweep.name}{key}"
 
 
@@ -90,10 +90,10 @@ def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[s
     complete = True
     for arm in sweep.runnable():
         for seed, experiment in _experiments(sweep, arm.label, sweep.overrides(arm), outputs):
-            digest = _data_digest(experiment, prepare, data)
-            complete &= digest is not None
-            if digest is not None:
-                found = _tasks(experiment, digest)
+            known = _data_digest(experiment, prepare, data)
+            complete &= known is not None
+            if known is not None:
+                found = tasks_of(experiment, known)
                 entries.append(Entry(arm.label, seed, found[-1].id))
                 tasks += found
     plan = Plan(sweep.name, outputs, tuple(entries), unique(tasks))
@@ -116,24 +116,24 @@ def _experiments(
         raise InputError(f"sweep {sweep.name}, arm '{label}': {error}") from None
 
 
-def _tasks(experiment: Experiment, digest: str) -> list[Task]:
-    """The runs of an experiment on data of that digest, the last one its own."""
+def tasks_of(experiment: Experiment, data: str) -> list[Task]:
+    """The runs of an experiment on prepared data of that digest, the last one its own."""
     from memmlp.pipeline import motion_id, vqvae_id
 
-    above = vqvae_id(experiment, digest)
+    above = vqvae_id(experiment, data)
     upstream = [Task(above, "vqvae", experiment.config)] if above else []
-    return [*upstream, Task(motion_id(experiment, digest), "memmlp", experiment.config, above)]
+    return [*upstream, Task(motion_id(experiment, data), "memmlp", experiment.config, above)]
 
 
 def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[str, Any]]) -> str | None:
     """The digest of the experiment's prepared data; None where it isn't prepared."""
     config = {"data": experiment.config["data"], "paths": experiment.config["paths"]}
-    key = _digest(config)
+    key = digest(config)
     if key not in known:
-        digest = experiment.data.prepare()[1].digest if prepare else experiment.data.digest()
-        if digest is None:
+        found = experiment.data.prepare()[1].digest if prepare else experiment.data.digest()
+        if found is None:
             return None
-        known[key] = {"config": config, "digest": digest}
+        known[key] = {"config": config, "digest": found}
     return known[key]["digest"]
 
 
@@ -155,7 +155,7 @@ def _stamp(sweep: Sweep) -> str:
     here = Path(__file__).parent
     files = [*shipped("conf").rglob("*.yaml"), *(here / f"{name}.py" for name in CODE)]
     texts = [(file.name, file.read_text(encoding="utf-8")) for file in sorted(files)]
-    return _digest([RECIPE, asdict(sweep), texts])
+    return digest([RECIPE, asdict(sweep), texts])
 
 
 def _remember(sweep: Sweep, plan: Plan, path: Path) -> None:
@@ -165,5 +165,6 @@ def _remember(sweep: Sweep, plan: Plan, path: Path) -> None:
     write_json(path, {"entries": list(every.values())})
 
 
-def _digest(value: Any) -> str:
+def digest(value: Any) -> str:
+    """Of a value made of what JSON holds; of a tree of dataclasses its `asdict`."""
     return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()

@@ -15,6 +15,7 @@ from memmlp.cli.options import outputs_option
 from memmlp.errors import InputError
 
 if TYPE_CHECKING:
+    from memmlp.sweep.controller import Fleet
     from memmlp.sweep.executors import Executor
     from memmlp.sweep.plan import Plan
     from memmlp.sweep.spec import Sweep
@@ -121,21 +122,30 @@ def slurm_options(options: dict[str, str]) -> dict[str, object]:
 def bring_to_end(chosen: Sweep, plan: Plan, engine: str, options: dict[str, str], workers: int) -> None:
     """Start workers and wait for them."""
     from memmlp.cli.plan import sweep_folder
-    from memmlp.cli.work import work, work_alone
     from memmlp.sweep.board import Board
-    from memmlp.sweep.controller import Fleet, oversee
+    from memmlp.sweep.controller import oversee
+
+    _, fleet = hire(sweep_folder(chosen, plan.outputs), plan, engine, options, workers)
+    oversee(plan, fleet, Board())
+
+
+def hire(folder: Path, plan: Plan, engine: str, options: dict[str, str], workers: int) -> tuple[Path, Fleet]:
+    """The file of this process' plan, whatever others plan meanwhile, and workers for it, none started yet.
+
+    folder: of the sweep or search; the workers' logs lie there too.
+    """
+    from memmlp.cli.work import work, work_alone
+    from memmlp.sweep.controller import Fleet
     from memmlp.sweep.worker import Presence
 
-    folder = sweep_folder(chosen, plan.outputs)
-    own = folder / "controllers" / uuid4().hex  # the plan of these workers, whatever others plan meanwhile
-    path = str(own.with_suffix(".json"))
-    plan.save(Path(path))
+    own = folder / "controllers" / uuid4().hex
+    path = own.with_suffix(".json")
+    plan.save(path)
     presence = Presence(own.with_suffix(".lock"))
     threads = max((os.cpu_count() or 1) // workers, 1) if engine == "local" else 0
-    local = partial(work, path, threads, str(presence.path))
-    task = local if engine == "local" else partial(work_alone, path)
-    fleet = Fleet(executor(engine, options, folder), task, workers, folder / "workers")
-    oversee(plan, fleet, Board())
+    local = partial(work, str(path), threads, str(presence.path))
+    task = local if engine == "local" else partial(work_alone, str(path))
+    return path, Fleet(executor(engine, options, folder), task, workers, folder / "workers", presence)
 
 
 def track(plan: Plan) -> None:

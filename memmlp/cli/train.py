@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import click
 from hydra import compose, version
@@ -18,7 +18,7 @@ from hydra._internal.utils import _run_hydra, create_config_search_path, get_arg
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from memmlp.cli.errors import explain
 from memmlp.cli.schema import check, register
@@ -89,6 +89,14 @@ def composed(overrides: Sequence[str]) -> DictConfig:
     version.setbase(VERSION_BASE)
     (cfg,) = preflight(args)
     return cfg
+
+
+def composed_plain(name: str, overrides: Sequence[str], folder: Path | None = None) -> dict[str, Any]:
+    """The content of a config of another command; folder: of configs of the user's, searched first."""
+    args, _ = parse([*(["--config-dir", str(folder)] if folder else []), *overrides])
+    version.setbase(VERSION_BASE)
+    with _hydra(args), _explained(overrides):
+        return OmegaConf.to_container(compose(name, args.overrides), resolve=True)  # type: ignore[return-value]
 
 
 def preflight(args: argparse.Namespace) -> list[DictConfig]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from memmlp.errors import InputError
 from memmlp.sweep.plan import Plan, Task
-from memmlp.sweep.worker import Cancelled, Presence
+from memmlp.sweep.worker import Cancelled, Presence, directed
 from memmlp.sweep.worker import work as work_on
 
 if TYPE_CHECKING:
@@ -21,8 +21,8 @@ def work(path: str, threads: int, controller: str) -> None:
 
 
 def work_alone(path: str) -> None:
-    """Take tasks of the plan in that file until none is left, whether or not the controller stays."""
-    work_on(Path(path), partial(perform, Path(path), 0))
+    """Take tasks of the plan in that file until none is left, whether or not a sweep's controller stays."""
+    work_on(Path(path), partial(perform, Path(path), 0), lambda: directed(Path(path)))
 
 
 def perform(path: Path, threads: int, plan: Plan, task: Task) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from typing import Self
 
 from rich import box
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -18,15 +19,14 @@ COLOURS = {"done": "green", "running": "cyan", "failed": "red", "blocked": "red"
 WORDS = {"new": "waiting", "stopped": "waiting, begun", "lost": "lost, to be taken over"}
 
 
-class Board:
-    """Shows a plan's state: a table that changes on a terminal, elsewhere a line for every change."""
+class Screen:
+    """What changes, shown in place on a terminal; elsewhere a line for every change."""
 
     def __init__(self, console: Console | None = None):
         self.console = console or Console(highlight=False, stderr=True)
         self.live = Live(console=self.console, refresh_per_second=4, transient=False)
-        self.before: dict[str, str] | None = None
 
-    def __enter__(self) -> Board:
+    def __enter__(self) -> Self:
         if self.console.is_terminal:
             self.live.start()
         return self
@@ -35,24 +35,39 @@ class Board:
         if self.console.is_terminal:
             self.live.stop()
 
+    def show(self, whole: Callable[[], RenderableType], changes: Iterable[str]) -> None:
+        """Show the whole on a terminal, elsewhere the lines of what changed."""
+        if self.console.is_terminal:
+            self.live.update(whole())
+        else:
+            for line in changes:
+                self.console.print(line, soft_wrap=True, markup=False)
+
+
+class Board(Screen):
+    """Shows a plan's state: arms by seeds."""
+
+    before: Mapping[str, str] | None = None
+
     def update(self, plan: Plan) -> None:
         """Show the plan as it is now."""
         states = plan.states()
-        if self.console.is_terminal:
-            self.live.update(render(plan, states))
-        else:
-            self._lines(plan, states)
+        self.show(lambda: render(plan, states), self._changes(plan, states))
         self.before = states
 
-    def _lines(self, plan: Plan, states: Mapping[str, str]) -> None:
+    def _changes(self, plan: Plan, states: Mapping[str, str]) -> list[str]:
         """A line for each task whose state is another than before."""
+        if self.before is None:
+            return []
+        changed = [task for task in plan.tasks if self.before.get(task.id) != states[task.id]]
         done = sum(state == "done" for state in states.values())
-        for task in plan.tasks:
-            state = states[task.id]
-            if self.before is not None and self.before.get(task.id) != state:
-                reason = plan.run_of(task).failure if state == "failed" else None
-                what = f"{name(plan, task)}: {WORDS.get(state, state)}{f', {reason}' if reason else ''}"
-                self.console.print(f"{done} of {len(states)} done; {what}", soft_wrap=True)
+        return [f"{done} of {len(states)} done; {_change(plan, t, states[t.id])}" for t in changed]
+
+
+def _change(plan: Plan, task: Task, state: str) -> str:
+    """What became of a task, and why."""
+    reason = plan.run_of(task).failure if state == "failed" else None
+    return f"{name(plan, task)}: {WORDS.get(state, state)}{f', {reason}' if reason else ''}"
 
 
 def name(plan: Plan, task: Task) -> str:

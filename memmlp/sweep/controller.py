@@ -10,6 +10,7 @@ from memmlp.errors import InputError
 from memmlp.sweep.board import Board
 from memmlp.sweep.executors import Executor, Handle
 from memmlp.sweep.plan import Plan
+from memmlp.sweep.worker import Presence
 
 LOOK = 0.5  # seconds between looks at the run folders
 QUICK = 20.0  # seconds within which a worker that ends has not begun to work
@@ -21,10 +22,19 @@ class Fleet:
 
     Args:
         executor: starts them. work: what a worker does. size: how many at most. logs: where theirs are.
+        presence: what tells the workers that the controller lives; it ends with the fleet.
     """
 
-    def __init__(self, executor: Executor, work: Callable[[], None], size: int, logs: Path):
+    def __init__(
+        self,
+        executor: Executor,
+        work: Callable[[], None],
+        size: int,
+        logs: Path,
+        presence: Presence | None = None,
+    ):
         self.executor, self.work, self.size, self.logs = executor, work, size, logs
+        self.presence = presence
         self.handles: list[tuple[Handle, float]] = []
         self.stillborn = 0
 

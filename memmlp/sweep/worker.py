@@ -18,6 +18,7 @@ from memmlp.runs import Run
 from memmlp.sweep.plan import Plan, Task
 
 PAUSE = 0.5  # seconds between looks at a plan whose tasks are all in other hands
+ABANDONED = 600.0  # seconds without a sign of life after which an open plan's controller counts as dead
 DEATHS = 10  # workers that died at the same step of a run before it counts as failed
 
 Perform = Callable[[Plan, Task], None]
@@ -39,6 +40,11 @@ def work(path: Path, perform: Perform, wanted: Callable[[], bool] = lambda: True
             return
         if not any(attempt(plan, task, perform) for task in left):
             time.sleep(PAUSE)
+
+
+def directed(path: Path) -> bool:
+    """Whether the plan of that file is closed, or its controller, which touches the file, lives."""
+    return not Plan.load(path).open or time.time() - path.stat().st_mtime < ABANDONED
 
 
 def attempt(plan: Plan, task: Task, perform: Perform) -> bool:

@@ -1,0 +1,185 @@
+"""`memmlp tune`: search loss weights, or any numeric keys, by the errors on validation."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import click
+from filelock import FileLock, Timeout
+
+from memmlp.cli.options import outputs_option
+from memmlp.errors import InputError
+
+if TYPE_CHECKING:
+    from memmlp.search.spec import Search, Value
+    from memmlp.search.study import Study
+    from memmlp.sweep.plan import Task
+
+
+@click.command("tune")
+@click.argument("overrides", nargs=-1)
+@click.option("--workers", default=None, type=click.IntRange(1), help="At once; as many as cores by default.")
+@click.option("--status", is_flag=True, help="Show how far it is, and do nothing.")
+@click.option("--config-dir", type=click.Path(path_type=Path), help="Folder of configs of your own.")
+@outputs_option
+def tune(
+    overrides: tuple[str, ...], workers: int | None, status: bool, config_dir: Path | None, outputs: Path
+) -> None:
+    """Search the manual loss weights: the paper's first, then what Optuna proposes.
+
+    OVERRIDES are those of `memmlp train` for all trials, those of the search (`search.n_trials=50`,
+    `search.objectives=[MPJPE,Jitter] search.pruner=none`, `+search.space.optim.lr={low: 1e-4, high: 1e-2,
+    log: true}`; `search=NAME` takes conf/search/NAME.yaml), and the executor's of `memmlp sweep`. Started
+    again, it goes on where it was left.
+    """
+    from memmlp.cli.sweep import split_executor
+    from memmlp.search.study import Study
+
+    engine, options, words = split_executor(overrides)
+    setup = prepared(words, config_dir, outputs.absolute())
+    if status:
+        show(setup)
+        return
+    setup.folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(setup.folder / ".lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise InputError(f"search {setup.folder.name}: another process is at it; --status shows it") from None
+    with lock:
+        study = Study.own(setup.search, setup.folder.name, setup.folder)
+        search(setup, study, engine, options, workers or os.cpu_count() or 1)
+        leave(setup, study)
+    summary(setup, study)
+
+
+class Setup(NamedTuple):
+    """A search, where it is kept, and what makes its trials' runs.
+
+    Attributes:
+        search: what is searched. words: overrides of the command line. outputs: folder of the runs' folder.
+        folder: of the search. config_dir: of configs of the user's.
+    """
+
+    search: Search
+    words: tuple[str, ...]
+    outputs: Path
+    folder: Path
+    config_dir: Path | None
+
+    def overrides(self, values: Mapping[str, Value]) -> list[str]:
+        """Those of a trial: the search's base, the command line's, the values."""
+        return [*self.search.base, *self.words, *self.search.overrides(values)]
+
+
+def prepared(words: Sequence[str], config_dir: Path | None, outputs: Path) -> Setup:
+    """The search of a command line, its keys and ranges checked against the config."""
+    from memmlp.cli.plan import digest
+    from memmlp.search.spec import parse_search
+
+    own = [word for word in words if word.lstrip("+~").partition("=")[0].split(".")[0] == "search"]
+    rest = tuple(word for word in words if word not in own)
+    wanted = parse_search(_search_config(own, config_dir))
+    setup = Setup(wanted, rest, outputs, outputs / "tune" / wanted.name, config_dir)
+    base = _check_space(setup)
+    counted = {**asdict(wanted), "n_trials": None, "storage": None}
+    return setup._replace(folder=outputs / "tune" / f"{wanted.name}-{digest([base, counted])[:8]}")
+
+
+def _search_config(words: Sequence[str], config_dir: Path | None) -> dict[str, Any]:
+    """The composed config of the search alone."""
+    from memmlp.cli.train import composed_plain
+
+    return composed_plain("tune", words, config_dir)["search"]
+
+
+def _check_space(setup: Setup) -> str:
+    """Refuse a range with a value that the config refuses; the id of the first trial's run."""
+    space = setup.search.space
+    most = max(len(one.corners()) for one in space)
+    for number in range(most):
+        corner = {one.key: one.corners()[number % len(one.corners())] for one in space}
+        try:
+            _tasks(setup, corner, prepare=False)
+        except InputError as error:
+            raise InputError(f"search.space: {error}") from None
+    return _tasks(setup, setup.search.first(), prepare=True)[-1].id
+
+
+def _tasks(setup: Setup, values: Mapping[str, Value], prepare: bool = True) -> Sequence[Task]:
+    """The runs of a trial with those values; none where the data is not to be prepared and isn't."""
+    from memmlp.cli.build import build_experiment
+    from memmlp.cli.plan import tasks_of
+    from memmlp.cli.train import composed
+
+    own = ["--config-dir", str(setup.config_dir)] if setup.config_dir else []
+    cfg = composed([*own, *setup.overrides(values)])
+    cfg.paths.outputs = str(setup.outputs)
+    experiment = build_experiment(cfg)
+    return tasks_of(experiment, experiment.data.prepare()[1].digest) if prepare else ()
+
+
+def show(setup: Setup) -> None:
+    """How far the search is."""
+    from rich.console import Console
+
+    from memmlp.search.board import render
+    from memmlp.search.study import Study
+
+    study = Study.view(setup.search, setup.folder.name, setup.folder)
+    Console(highlight=False).print(render(study, setup.outputs) if study else "not begun")
+
+
+def search(setup: Setup, study: Study, engine: str, options: dict[str, str], workers: int) -> None:
+    """Bring the study to as many trials as are wanted."""
+    from memmlp.cli.sweep import hire
+    from memmlp.search.board import SearchBoard
+    from memmlp.search.director import Director, direct
+    from memmlp.sweep.plan import Plan
+
+    plan = Plan(setup.folder.name, setup.outputs, (), (), open=True)
+    director = Director(study, partial(_tasks, setup), plan)
+    path, fleet = hire(setup.folder, plan, engine, options, workers)
+    direct(director, fleet, SearchBoard(setup.outputs), path)
+
+
+def leave(setup: Setup, study: Study) -> None:
+    """Write what the search found, and show its runs where they are tracked."""
+    from memmlp.cli.shipped import shipped
+    from memmlp.search import results
+
+    results.write_trials(study, setup.folder / "trials.csv")
+    results.write_experiments(study, setup.folder)
+    table = f"table{results.TABLE:02d}.yaml"
+    results.write_table(study, shipped("sweeps") / table, setup.folder / table)
+    results.write_plots(study, setup.folder)
+
+
+def summary(setup: Setup, study: Study) -> None:
+    """The best trials, what mattered, where all of it lies, and the next command."""
+    from rich.console import Console
+    from rich.text import Text
+
+    from memmlp.search.board import counts, figures, row, trials_table
+    from memmlp.search.results import importances
+
+    console = Console(highlight=False)
+    best = study.best()
+    if best:
+        title = "Pareto front" if len(study.search.objectives) > 1 else "best trial"
+        table = trials_table(study.search, f"{title}, errors on validation")
+        for trial in best:
+            row(table, study.search, trial, Text(figures(trial)))
+        console.print(table)
+    if found := importances(study):
+        click.echo("importance: " + ", ".join(f"{key} {share:.2f}" for key, share in found))
+    click.echo(counts(study))
+    click.echo(f"in {setup.folder}")
+    if best:
+        words = " ".join(setup.words)
+        click.echo(f"next: memmlp train --config-dir {setup.folder} experiment=best {words}".rstrip())

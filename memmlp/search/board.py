@@ -1,0 +1,105 @@
+"""The live table of a search: what runs, the best so far, and how many ended how."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+from optuna.trial import FrozenTrial, TrialState
+from rich import box
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from memmlp.runs import Run
+from memmlp.search.spec import Search
+from memmlp.search.study import Study
+from memmlp.sweep.board import Screen, progress
+
+SHOWN = 5  # of the best trials
+WORDS = {TrialState.COMPLETE: "complete", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
+
+
+class SearchBoard(Screen):
+    """Shows a search while it goes on; outputs: folder of the runs' folder."""
+
+    def __init__(self, outputs: Path):
+        super().__init__()
+        self.outputs = outputs
+        self.told: set[int] | None = None
+
+    def update(self, study: Study) -> None:
+        """Show the study and the runs of its trials as they are now."""
+        ended = [trial for trial in study.trials if trial.state in WORDS]
+        told = {trial.number for trial in ended} if self.told is None else self.told
+        new = [trial for trial in ended if trial.number not in told]
+        self.show(lambda: render(study, self.outputs), [line(study.search, t, len(ended)) for t in new])
+        self.told = {trial.number for trial in ended}
+
+
+def line(search: Search, trial: FrozenTrial, ended: int) -> str:
+    """How a trial ended."""
+    what = trial.user_attrs.get("reason") if trial.state == TrialState.FAIL else figures(trial)
+    params = ", ".join(f"{key}={trial.params[key]:.4g}" for key in trial.params)
+    return f"{ended} of {search.n_trials}; trial {trial.number} {WORDS[trial.state]}: {what} ({params})"
+
+
+def figures(trial: FrozenTrial) -> str:
+    """A trial's objective values."""
+    return ", ".join(f"{value:.3f}" for value in trial.values or [])
+
+
+def render(study: Study, outputs: Path) -> Group:
+    """The trials under way, the best ones, and the counts."""
+    table = trials_table(study.search, f"search {study.search.name}")
+    for trial in study.trials:
+        if trial.state not in WORDS:
+            row(table, study.search, trial, _going(trial, outputs))
+    ranked = sorted((t for t in study.trials if t.state == TrialState.COMPLETE), key=lambda t: t.values)
+    for trial in ranked[:SHOWN]:
+        row(table, study.search, trial, Text(figures(trial), style="green"))
+    return Group(table, Text(counts(study)))
+
+
+def _going(trial: FrozenTrial, outputs: Path) -> Text:
+    """How far a trial's run is."""
+    run = Run.of(outputs, trial.user_attrs.get("run", "-"))
+    if run.status != "running":
+        return Text("waiting")
+    return Text(progress(run, trial.user_attrs["steps"]), style="cyan")
+
+
+def trials_table(search: Search, title: str) -> Table:
+    """An empty table of trials."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=title, title_justify="left")
+    table.add_column("trial", justify="right")
+    table.add_column(", ".join(objective.text for objective in search.objectives))
+    for name in short(one.key for one in search.space):
+        table.add_column(name, justify="right")
+    return table
+
+
+def short(keys: Iterable[str]) -> list[str]:
+    """Keys without the group that all have in common."""
+    every = list(keys)
+    groups = {key.rpartition(".")[0] for key in every}
+    return [key.rpartition(".")[2] for key in every] if len(groups) == 1 else every
+
+
+def row(table: Table, search: Search, trial: FrozenTrial, state: Text) -> None:
+    """A trial's row."""
+    table.add_row(str(trial.number), state, *_shown(search, trial))
+
+
+def _shown(search: Search, trial: FrozenTrial) -> Iterable[str]:
+    for one in search.space:
+        value = trial.params.get(one.key, "")
+        yield f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def counts(study: Study) -> str:
+    """How many trials there are in which state, of how many."""
+    found = Counter(WORDS.get(trial.state, "running") for trial in study.trials)
+    listed = ", ".join(f"{count} {state}" for state, count in found.items())
+    return f"{len(study.trials)} of {study.search.n_trials} trials: {listed or 'none yet'}"

@@ -1,0 +1,166 @@
+"""What a search leaves: its trials as CSV, the best as experiments, Table 5 with it, plots."""
+
+from __future__ import annotations
+
+import csv
+import io
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import optuna
+import yaml
+from optuna.exceptions import ExperimentalWarning
+from optuna.trial import FrozenTrial, TrialState
+
+from memmlp.files import atomic_write
+from memmlp.search.spec import Search, word
+from memmlp.search.study import Study, values
+
+TABLE = 5  # of the paper: manual weights against learned ones
+
+
+def write_trials(study: Study, path: Path) -> None:
+    """All trials: number, state, objectives, values, run, and the reason of a failure."""
+    names = [objective.text for objective in study.search.objectives]
+    keys = [one.key for one in study.search.space]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["trial", "state", *names, *keys, "run", "reason"])
+    for trial in study.trials:
+        figures = trial.values or [""] * len(names)
+        params = [trial.params.get(key, "") for key in keys]
+        extra = [trial.user_attrs.get(name, "") for name in ("run", "reason")]
+        writer.writerow([trial.number, trial.state.name.lower(), *figures, *params, *extra])
+    atomic_write(path, text.getvalue())
+
+
+def write_experiments(study: Study, folder: Path) -> list[Path]:
+    """The best trial as best.yaml, and each one of a Pareto front as trial-N.yaml; the files, best first."""
+    (folder / "experiment").mkdir(parents=True, exist_ok=True)
+    best = study.best()
+    files = [folder / "experiment" / f"trial-{trial.number}.yaml" for trial in best[1:]]
+    files = [folder / "experiment" / "best.yaml", *files] if best else []
+    for path, trial in zip(files, best, strict=True):
+        atomic_write(path, experiment(study, trial))
+    return files
+
+
+def experiment(study: Study, trial: FrozenTrial) -> str:
+    """A trial as a file of the config group `experiment`."""
+    search = study.search
+    tree: dict[str, Any] = {}
+    groups: list[dict[str, str]] = []
+    for key, value in _words(search, trial):
+        if "." in key:
+            _put(tree, key.split("."), value)
+        else:
+            groups.append({f"override /{key}": value})
+    head = (
+        f"# @package _global_\n# Trial {trial.number} of {len(study.trials)} of the search {search.name}: "
+        f"{', '.join(o.text for o in search.objectives)} on validation "
+        f"{', '.join(f'{value:.4f}' for value in trial.values)}; run {trial.user_attrs.get('run')}.\n"
+    )
+    return head + yaml.safe_dump({"defaults": [*groups, "_self_"], **tree}, sort_keys=False)
+
+
+def _words(search: Search, trial: FrozenTrial) -> Iterator[tuple[str, Any]]:
+    """The keys and values of the search's base and of the trial."""
+    for override in search.base:
+        key, _, value = override.partition("=")
+        yield key.lstrip("+"), yaml.safe_load(value)
+    yield from values(trial, search).items()
+
+
+def _put(tree: dict[str, Any], keys: Sequence[str], value: Any) -> None:
+    for key in keys[:-1]:
+        tree = tree.setdefault(key, {})
+    tree[keys[-1]] = value
+
+
+def write_table(study: Study, shipped: Path, path: Path) -> bool:
+    """The paper's Table 5 with the best trial as one more arm, where loss weights were searched."""
+    best = study.best()
+    if not best or not all(one.key.startswith("loss.") for one in study.search.space):
+        return False
+    content = yaml.safe_load(shipped.read_text(encoding="utf-8"))
+    found = values(best[0], study.search)
+    overrides = [*study.search.base, *(f"{key}={word(value)}" for key, value in found.items())]
+    content["arms"] = {"manual, searched": {"overrides": overrides}, **content["arms"]}
+    atomic_write(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+    return True
+
+
+def importances(study: Study) -> list[tuple[str, float]]:
+    """The share of each key in the first objective's variation (PED-ANOVA); none for too few trials."""
+    complete = [trial for trial in study.trials if trial.state == TrialState.COMPLETE]
+    if len(complete) < 4 or len(study.search.space) < 2:
+        return []
+    single = len(study.search.objectives) == 1
+    target = None if single else _first
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = optuna.importance.get_param_importances(study.study, target=target)
+    return sorted(found.items(), key=lambda item: -item[1])
+
+
+def _first(trial: FrozenTrial) -> float:
+    return trial.values[0]
+
+
+def plots(study: Study) -> dict[str, dict[str, Any]]:
+    """Which plots a study can have, with what makes them beside the study, by the name of the plot."""
+    complete = [trial for trial in study.trials if trial.state == TrialState.COMPLETE]
+    names = [objective.text for objective in study.search.objectives]
+    if len(complete) < 2:
+        return {}
+    if len(names) == 2:
+        first = {"target": _first, "target_name": names[0]}
+        return {"pareto_front": {"target_names": names}, "parallel_coordinate": first, "slice": first}
+    titled = {"target_name": names[0]}
+    found: dict[str, dict[str, Any]] = dict.fromkeys(
+        ("optimization_history", "parallel_coordinate", "slice"), titled
+    )
+    return found | ({"param_importances": titled} if importances(study) else {})
+
+
+def write_plots(study: Study, folder: Path) -> list[Path]:
+    """The plots as PNG files, and all on one page study.html that needs no network."""
+    wanted = plots(study)
+    files = [_png(study, name, keywords, folder / f"{name}.png") for name, keywords in wanted.items()]
+    if wanted:
+        files.append(_page(study, wanted, folder / "study.html"))
+    return files
+
+
+def _png(study: Study, name: str, keywords: dict[str, Any], path: Path) -> Path:
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    draw = getattr(optuna.visualization.matplotlib, f"plot_{name}")
+    with warnings.catch_warnings(), pyplot.rc_context():
+        warnings.simplefilter("ignore")
+        axes = draw(study.study, **keywords)
+        figure = next(iter(axes.flat)).figure if hasattr(axes, "flat") else axes.figure
+        figure.set_size_inches(max(figure.get_size_inches()[0], 9), 5)
+        figure.savefig(path, dpi=110, bbox_inches="tight")
+        pyplot.close("all")
+    return path
+
+
+def _page(study: Study, wanted: dict[str, dict[str, Any]], path: Path) -> Path:
+    parts: list[str] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ExperimentalWarning)
+        for name, keywords in wanted.items():
+            figure = getattr(optuna.visualization, f"plot_{name}")(study.study, **keywords)
+            parts.append(figure.to_html(full_html=False, include_plotlyjs=not parts))
+    title = f"search {study.search.name}: {len(study.trials)} trials"
+    atomic_write(
+        path,
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
+        f"<body><h1>{title}</h1>{''.join(parts)}</body></html>\n",
+    )
+    return path

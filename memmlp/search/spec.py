@@ -1,0 +1,233 @@
+"""What a search searches: config keys with their ranges, objectives on validation, how many trials.
+
+name: loss_weights
+base: [loss=manual]                 # overrides of every trial
+space:                              # a tree of config keys; its leaves are ranges
+  loss:
+    rotation: {low: 0.1, high: 10.0, log: true, first: 1.0}
+  optim:
+    batch: {low: 16, high: 64, step: 16}
+  hand: {choices: ['off', fk]}
+objectives: [MPJPE]                 # on validation, to be lowered; [MPJPE, Jitter] gives a Pareto front
+n_trials: 30                        # in all, however often the search is started
+sampler: tpe                        # or random
+startup: 10                         # random trials (after the first) before TPE learns from them
+seed: 0
+pruner: median                      # stops a trial that is worse than the median of the others; or none
+prune_after: 5                      # finished trials before the first is stopped
+storage: null                       # a journal beside the search's results, or a storage URL of Optuna's
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from memmlp.errors import InputError
+from memmlp.units import UNITS
+
+SAMPLERS = ("tpe", "random")
+PRUNERS = ("median", "none")
+BRANCHES = ("rotation", "position")
+RANGE_KEYS = ("low", "high", "log", "step", "choices", "first")
+
+Value = float | int | str | bool | None
+
+
+@dataclass(frozen=True)
+class Range:
+    """The values of one config key.
+
+    Attributes:
+        key: dotted. low, high: inclusive; whole numbers where both are. log: uniform in the logarithm.
+        step: of a grid; None for none. choices: in place of a range; empty for none.
+        first: the value of the first trial; None to leave it to the sampler.
+    """
+
+    key: str
+    low: float | int = 0
+    high: float | int = 0
+    log: bool = False
+    step: float | int | None = None
+    choices: tuple[Value, ...] = ()
+    first: Value | None = None
+
+    def allows(self, value: Any) -> bool:
+        """Whether a value is one of the range's."""
+        if self.choices:
+            return value in self.choices
+        return isinstance(value, int | float) and self.low <= value <= self.high
+
+    def corners(self) -> tuple[Value, ...]:
+        """The values at the ends, or all choices."""
+        return self.choices or (self.low, self.high)
+
+
+@dataclass(frozen=True)
+class Objective:
+    """A weighted sum of validation metrics, to be lowered.
+
+    Attributes:
+        text: as it was written. terms: weight and name as the metrics log has it ("rotation MPJPE").
+    """
+
+    text: str
+    terms: tuple[tuple[float, str], ...]
+
+    def value(self, metrics: Mapping[str, float]) -> float:
+        """Of a validation's metrics. Raises InputError where one is not among them."""
+        for _, name in self.terms:
+            if name not in metrics:
+                known = ", ".join(metrics)
+                raise InputError(f"search.objectives: '{name}' is not validated; allowed are {known}")
+        return sum(weight * metrics[name] for weight, name in self.terms)
+
+
+@dataclass(frozen=True)
+class Search:
+    """A search, checked; its keys are those of the config group `search` (see the module's text)."""
+
+    name: str
+    base: tuple[str, ...]
+    space: tuple[Range, ...]
+    objectives: tuple[Objective, ...]
+    n_trials: int
+    sampler: str
+    startup: int
+    seed: int
+    pruner: str
+    prune_after: int
+    storage: str | None
+
+    def first(self) -> dict[str, Value]:
+        """What is known of the first trial's values, by key."""
+        return {one.key: one.first for one in self.space if one.first is not None}
+
+    def overrides(self, values: Mapping[str, Value]) -> tuple[str, ...]:
+        """A trial's values as overrides of `memmlp train`."""
+        return tuple(f"{key}={word(value)}" for key, value in values.items())
+
+
+def word(value: Value) -> str:
+    """A value as an override has it."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def parse_search(content: Mapping[str, Any]) -> Search:
+    """The search of a config. Raises InputError, naming the key."""
+    space = tuple(_ranges(content["space"], ""))
+    if not space:
+        raise InputError("search.space: empty; allowed are config keys with low and high, or with choices")
+    objectives = tuple(_objective(text) for text in _texts(content["objectives"], "search.objectives"))
+    if not 1 <= len(objectives) <= 2:
+        raise InputError(
+            f"search.objectives: {len(objectives)} of them; allowed is 1, or 2 for a Pareto front"
+        )
+    if len(objectives) > 1 and content["pruner"] != "none":
+        raise InputError(f"search.pruner={content['pruner']}: allowed with two objectives is none")
+    name = str(content["name"])
+    if not re.fullmatch(r"[\w-]+", name):
+        raise InputError(f"search.name={name}: allowed are letters, digits, - and _")
+    return Search(
+        name=name,
+        base=tuple(_texts(content["base"], "search.base")),
+        space=space,
+        objectives=objectives,
+        n_trials=_whole(content, "n_trials", 1),
+        sampler=_one_of(content, "sampler", SAMPLERS),
+        startup=_whole(content, "startup", 1),
+        seed=_whole(content, "seed", 0),
+        pruner=_one_of(content, "pruner", PRUNERS),
+        prune_after=_whole(content, "prune_after", 1),
+        storage=content["storage"],
+    )
+
+
+def _ranges(node: Any, prefix: str) -> Iterator[Range]:
+    """The ranges of a tree of keys."""
+    where = f"search.space{'.' if prefix else ''}{prefix}"
+    if not isinstance(node, Mapping):
+        raise InputError(f"{where}: {node!r}; allowed is a mapping with low and high, or with choices")
+    if not set(node) & set(RANGE_KEYS):
+        for key, child in node.items():
+            yield from _ranges(child, f"{prefix}.{key}" if prefix else str(key))
+        return
+    for key in node:
+        if key not in RANGE_KEYS:
+            raise InputError(f"{where}.{key}: no such key; allowed are {', '.join(RANGE_KEYS)}")
+    yield _range(prefix, node, where)
+
+
+def _range(key: str, node: Mapping[str, Any], where: str) -> Range:
+    made = _choices(key, node, where) if "choices" in node else _interval(key, node, where)
+    if made.first is not None and not made.allows(made.first):
+        raise InputError(f"{where}.first={made.first}: allowed is a value of the range")
+    return made
+
+
+def _choices(key: str, node: Mapping[str, Any], where: str) -> Range:
+    choices = node["choices"]
+    plain = isinstance(choices, Sequence) and all(isinstance(item, int | float | str) for item in choices)
+    if isinstance(choices, str) or not plain or len(choices) < 2:
+        raise InputError(f"{where}.choices: allowed is a list of at least two values")
+    for other in set(node) - {"choices", "first"}:
+        raise InputError(f"{where}.{other}: does not go with choices")
+    return Range(key, choices=tuple(choices), first=node.get("first"))
+
+
+def _interval(key: str, node: Mapping[str, Any], where: str) -> Range:
+    low, high = (_number(node.get(end), f"{where}.{end}") for end in ("low", "high"))
+    log, step = bool(node.get("log", False)), node.get("step")
+    if low >= high:
+        raise InputError(f"{where}.high={high}: allowed is more than low={low}")
+    if log and low <= 0:
+        raise InputError(f"{where}.low={low}: allowed with log is above 0")
+    if step is not None and (log or _number(step, f"{where}.step") <= 0):
+        raise InputError(f"{where}.step={step}: allowed is a number above 0, without log")
+    return Range(key, low, high, log, step, first=node.get("first"))
+
+
+def _objective(text: str) -> Objective:
+    """The objective of a text such as "MPJPE", or "MPJPE + 0.1*position Jitter"."""
+    terms = [_term(part.strip(), text) for part in text.split("+")]
+    return Objective(text, tuple(terms))
+
+
+def _term(part: str, text: str) -> tuple[float, str]:
+    """Weight and metric of a term; the rotation branch where none is named."""
+    match = re.fullmatch(r"(?:([\d.eE-]+)\s*\*\s*)?(?:(\w+)\s+)??(\w+(?: PE)?)", part)
+    branch, metric = (match[2] or BRANCHES[0], match[3]) if match else ("", "")
+    if match is None or metric not in UNITS or branch not in BRANCHES:
+        names = ", ".join(UNITS)
+        raise InputError(
+            f"search.objectives: '{text}'; allowed is a sum of [WEIGHT*][{' or '.join(BRANCHES)}] METRIC "
+            f"with a metric of {names}"
+        )
+    return float(match[1] or 1), f"{branch} {metric}"
+
+
+def _number(value: Any, name: str) -> float | int:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{name}: {'nothing' if value is None else value}; allowed is a number")
+    return value
+
+
+def _whole(content: Mapping[str, Any], name: str, least: int) -> int:
+    value = content[name]
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise InputError(f"search.{name}={value}: allowed is a whole number of at least {least}")
+    return value
+
+
+def _one_of(content: Mapping[str, Any], name: str, words: Sequence[str]) -> str:
+    if content[name] not in words:
+        raise InputError(f"search.{name}={content[name]}: allowed is {' or '.join(words)}")
+    return content[name]
+
+
+def _texts(value: Any, name: str) -> list[str]:
+    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+        raise InputError(f"{name}={value}: allowed is a list of words")
+    return value

@@ -1,0 +1,187 @@
+"""The Optuna study of a search. One process owns it: it asks for trials and tells how they ended.
+
+A trial's user attribute "run" is the id of its run. Whatever moment the owner is killed at, the next one
+finds every trial either ended or running, and goes on with the running ones under their numbers.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import optuna
+from optuna.exceptions import ExperimentalWarning
+from optuna.storages import BaseStorage, JournalStorage, get_storage
+from optuna.storages.journal import JournalFileBackend
+from optuna.study import StudyDirection
+from optuna.trial import FrozenTrial, Trial, TrialState
+
+from memmlp.errors import InputError
+from memmlp.files import sync_folder
+from memmlp.search.spec import Range, Search, Value
+
+ENDED = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
+
+
+class Study:
+    """A search's trials, in a storage that survives its owner."""
+
+    def __init__(self, search: Search, study: optuna.Study):
+        self.search, self.study = search, study
+
+    @classmethod
+    def own(cls, search: Search, name: str, folder: Path) -> Study:
+        """The study of that name in the search's storage, begun or taken up; for its only owner.
+
+        folder: of the journal, where the search names no storage.
+        """
+        if search.storage is None:
+            mend(journal(folder))
+        study = optuna.create_study(
+            storage=storage(search, folder),
+            study_name=name,
+            directions=[StudyDirection.MINIMIZE] * len(search.objectives),
+            pruner=optuna.pruners.MedianPruner(search.prune_after, 0),
+            load_if_exists=True,
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ExperimentalWarning)
+            study.set_metric_names([objective.text for objective in search.objectives])
+        if not study.get_trials(deepcopy=False) and search.first():
+            study.enqueue_trial(search.first())
+        return cls(search, study)
+
+    @classmethod
+    def view(cls, search: Search, name: str, folder: Path) -> Study | None:
+        """The study to look at while its owner works; None where there is none."""
+        if search.storage is None and not journal(folder).exists():
+            return None
+        try:
+            return cls(search, optuna.load_study(storage=storage(search, folder), study_name=name))
+        except KeyError:
+            return None
+
+    @property
+    def trials(self) -> list[FrozenTrial]:
+        """All trials that were asked for, by number."""
+        trials = self.study.get_trials(deepcopy=False)
+        return [trial for trial in trials if trial.state != TrialState.WAITING]
+
+    def running(self) -> Iterator[Trial]:
+        """The trials that have not ended."""
+        for trial in self.trials:
+            if trial.state == TrialState.RUNNING:
+                yield self._taken_up(trial)
+
+    def ask(self) -> Trial | None:
+        """A new trial; None when there are as many as the search wants."""
+        number = len(self.trials)
+        if number >= self.search.n_trials:
+            return None
+        self.study.sampler = sampler(self.search, number)
+        return self._suggested(self.study.ask())
+
+    def _taken_up(self, trial: FrozenTrial) -> Trial:
+        """A running trial whose owner may have been killed before it had all its values."""
+        self.study.sampler = sampler(self.search, trial.number)
+        return self._suggested(Trial(self.study, trial._trial_id))
+
+    def _suggested(self, trial: Trial) -> Trial:
+        """The trial with a value for every key; those that it has already stay."""
+        for one in self.search.space:
+            suggest(trial, one)
+        return trial
+
+    def report(self, trial: Trial, step: int, value: float) -> None:
+        """What the objective was at a validation on the way; for one objective only."""
+        trial.report(value, step)
+
+    def prune(self, trial: Trial) -> bool:
+        """End the trial if others were better at its step; whether it was."""
+        if self.search.pruner == "none" or not trial.should_prune():
+            return False
+        self.study.tell(trial.number, state=TrialState.PRUNED)
+        return True
+
+    def complete(self, trial: Trial, values: Sequence[float]) -> None:
+        """End the trial with its objectives' values; ones that are no numbers make it a failure."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self.study.tell(trial.number, list(values), skip_if_finished=True)
+
+    def fail(self, trial: Trial, reason: str) -> None:
+        """End the trial without values."""
+        trial.set_user_attr("reason", reason)
+        self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
+
+    def best(self) -> list[FrozenTrial]:
+        """The best trial; of two objectives the Pareto front, the best of the first objective first."""
+        complete = [trial for trial in self.trials if trial.state == TrialState.COMPLETE]
+        if not complete:
+            return []
+        if len(self.search.objectives) == 1:
+            return [self.study.best_trial]
+        return sorted(self.study.best_trials, key=lambda trial: trial.values)
+
+
+def storage(search: Search, folder: Path) -> BaseStorage:
+    """The journal in a folder, or the storage of the search's URL. Raises InputError for a bad URL."""
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    if search.storage:
+        try:
+            return get_storage(search.storage)
+        except Exception as error:
+            reason = " ".join(str(error).split())[:200]
+            raise InputError(f"search.storage={search.storage}: {reason}") from None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ExperimentalWarning)
+        return JournalStorage(JournalFileBackend(str(journal(folder))))
+
+
+def journal(folder: Path) -> Path:
+    """The file of a search's study in its folder; `optuna-dashboard` reads it."""
+    return folder / "study.journal"
+
+
+def mend(path: Path) -> None:
+    """Cut a torn last line off a journal and free its lock; to be done by its only owner.
+
+    Optuna takes a line appended to a torn one for damage, and waits half a minute for a dead owner's lock.
+    """
+    for left in path.parent.glob(f"{path.name}.lock*"):
+        left.unlink(missing_ok=True)
+    if path.exists():
+        content = path.read_bytes()
+        whole = content.rfind(b"\n") + 1
+        if whole < len(content):
+            os.truncate(path, whole)
+            sync_folder(path.parent)
+
+
+def sampler(search: Search, number: int) -> optuna.samplers.BaseSampler:
+    """The sampler of a trial: seeded by search and number, so that a resumed search repeats nothing."""
+    seed = int(np.random.SeedSequence([search.seed, number]).generate_state(1)[0])
+    if search.sampler == "random":
+        return optuna.samplers.RandomSampler(seed=seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ExperimentalWarning)
+        return optuna.samplers.TPESampler(
+            seed=seed, n_startup_trials=search.startup, multivariate=True, constant_liar=True
+        )
+
+
+def suggest(trial: Trial, one: Range) -> Value:
+    """A trial's value for a key, the one that it has already or a new one."""
+    if one.choices:
+        return trial.suggest_categorical(one.key, one.choices)
+    if isinstance(one.low, int) and isinstance(one.high, int):
+        return trial.suggest_int(one.key, one.low, one.high, step=int(one.step or 1), log=one.log)
+    return trial.suggest_float(one.key, one.low, one.high, step=one.step, log=one.log)
+
+
+def values(trial: FrozenTrial | Trial, search: Search) -> Mapping[str, Value]:
+    """A trial's values by config key, in the order of the search's space."""
+    return {one.key: trial.params[one.key] for one in search.space}
