@@ -146,7 +146,9 @@ def parse_search(content: Mapping[str, Any]) -> Search:
 
 
 def _ranges(node: Any, prefix: str) -> Iterator[Range]:
-    """The ranges of a tree of keys."""
+    """The ranges of a tree of keys; what is null is left out."""
+    if node is None:
+        return
     where = f"search.space{'.' if prefix else ''}{prefix}"
     if not isinstance(node, Mapping):
         raise InputError(f"{where}: {node!r}; allowed is a mapping with low and high, or with choices")

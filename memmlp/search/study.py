@@ -10,6 +10,7 @@ import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import optuna
@@ -40,16 +41,17 @@ class Study:
         """
         if search.storage is None:
             mend(journal(folder))
-        study = optuna.create_study(
-            storage=storage(search, folder),
-            study_name=name,
-            directions=[StudyDirection.MINIMIZE] * len(search.objectives),
-            pruner=optuna.pruners.MedianPruner(search.prune_after, 0),
-            load_if_exists=True,
-        )
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ExperimentalWarning)
-            study.set_metric_names([objective.text for objective in search.objectives])
+        pruner = optuna.pruners.MedianPruner(search.prune_after, 0)
+        kept: dict[str, Any] = {"storage": storage(search, folder), "study_name": name, "pruner": pruner}
+        try:
+            study = optuna.load_study(**kept)
+        except KeyError:
+            minimize = [StudyDirection.MINIMIZE] * len(search.objectives)
+            study = optuna.create_study(**kept, directions=minimize)
+        if study.metric_names is None:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ExperimentalWarning)
+                study.set_metric_names([objective.text for objective in search.objectives])
         if not study.get_trials(deepcopy=False) and search.first():
             study.enqueue_trial(search.first())
         return cls(search, study)

@@ -1,0 +1,158 @@
+"""`memmlp tune` as a person types it, on tiny runs, calm and under SIGKILLs."""
+
+from __future__ import annotations
+
+import csv
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from filelock import FileLock
+
+from memmlp.cli.chaos import examine
+from memmlp.cli.tune import prepared
+
+MAIN = [sys.executable, "-c", "from memmlp.cli.main import main; main()"]
+TINY = [
+    "profile=tiny",
+    "data.synth.minutes=0.8",
+    "tracker=none",
+    "threads=1",
+    "optim.steps=6",
+    "optim.validate_every=3",
+    "vqvae.steps=6",
+]
+
+
+def command(folder: Path, *arguments: str, code: int = 0) -> str:
+    ran = subprocess.run([*MAIN, *arguments], cwd=folder, capture_output=True, text=True, check=False)
+    assert ran.returncode == code, ran.stdout + ran.stderr
+    return ran.stdout + ran.stderr
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a search of three trials."""
+    folder = tmp_path_factory.mktemp("tune")
+    (folder / "said.txt").write_text(command(folder, "tune", *TINY, "search.n_trials=3", "--workers", "2"))
+    return folder
+
+
+def folder_of(home: Path) -> Path:
+    (folder,) = (home / "outputs/tune").iterdir()
+    return folder
+
+
+def test_a_search_ends_with_its_best_trial_and_the_command_for_it(home: Path):
+    said = (home / "said.txt").read_text()
+    assert "3 of 3 trials: 3 complete" in said
+    rows = list(csv.DictReader((folder_of(home) / "trials.csv").read_text().splitlines()))
+    assert rows[0]["loss.rotation_velocity"] == "30.0"
+    assert examine(home / "outputs", 3) == []
+    best = min(rows, key=lambda row: float(row["MPJPE"]))
+    (words,) = re.findall(r"next: memmlp (.*)", said)
+    trained = command(home, *words.split())
+    assert f"outputs/runs/{best['run']}" in trained
+    assert len(list((home / "outputs/runs").iterdir())) == 4  # the VQ-VAE's and three: none was made anew
+
+
+def test_the_same_command_does_nothing_and_status_shows_the_same(home: Path):
+    before = (folder_of(home) / "study.journal").read_bytes()
+    again = command(home, "tune", *TINY, "search.n_trials=3")
+    assert "3 of 3 trials: 3 complete" in again
+    assert "3 of 3 trials: 3 complete" in command(home, "tune", *TINY, "search.n_trials=3", "--status")
+    assert "not begun" in command(home, "tune", *TINY, "search.seed=5", "--status")
+    assert (folder_of(home) / "study.journal").read_bytes() == before
+
+
+def test_the_best_is_an_arm_of_table_5(home: Path):
+    table = folder_of(home) / "table05.yaml"
+    words = [str(table), *TINY, "seed=0"]
+    assert "manual, searched" in command(home, "sweep", *words, "--dry-run")
+    shown = command(home, "table", *words)
+    assert re.search(r"manual, searched .*1", shown)
+
+
+def test_a_second_owner_is_refused(home: Path):
+    with FileLock(folder_of(home) / ".lock"):
+        said = command(home, "tune", *TINY, "search.n_trials=4", code=2)
+    assert "another process is at it; --status shows it" in said
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("search.n_trial=3", "n_trial"),
+        ("search.n_trials=0", "search.n_trials=0: allowed is a whole number"),
+        ("search=losses", "losses"),
+        (
+            "search.space.loss.rotation.low=-1",
+            "search.space.loss.rotation.low=-1: allowed with log is above 0",
+        ),
+        ("+search.space.optim.lrr={low: 0.1, high: 1.0}", "optim.lrr"),
+        (
+            "+search.space.optim.batch={low: -4, high: 8}",
+            "search.space: optim.batch=-4: allowed is at least 1",
+        ),
+        ("optim.lr=-1", "optim.lr=-1"),
+        ("executor=cloud", "executor=cloud: allowed is local, slurm or ray"),
+    ],
+)
+def test_bad_searches_are_refused_before_anything_runs(tmp_path: Path, word: str, message: str):
+    said = command(tmp_path, "tune", *TINY, word, code=2)
+    assert said.startswith("memmlp: ")
+    assert said.count("\n") == 1
+    assert message in said
+    assert not (tmp_path / "outputs").exists()
+
+
+def test_what_counts_gives_a_search_of_its_own(tmp_path: Path):
+    def folder(*words: str) -> str:
+        return prepared([*TINY, *words], None, tmp_path).folder.name
+
+    base = folder()
+    assert folder("search.n_trials=99", "optim.checkpoint_every=7") == base
+    others = [
+        folder("search.seed=1"), folder("search.objectives=[Jitter]"), folder("optim.lr=2e-3"),
+        folder("search.space.loss.hand.high=2.0"), folder("search.pruner=none"), folder("seed=3"),
+    ]  # fmt: skip
+    assert len({base, *others}) == 7
+
+
+def test_a_folder_of_ones_own_searches(tmp_path: Path):
+    (tmp_path / "own/search").mkdir(parents=True)
+    space = "space: {loss: null, optim: {lr: {low: 1.0e-4, high: 0.1}}}"
+    text = f"defaults: [loss_weights, _self_]\nname: rates\nbase: []\n{space}\n"
+    (tmp_path / "own/search/rates.yaml").write_text(text)
+    setup = prepared([*TINY, "search=rates"], tmp_path / "own", tmp_path)
+    assert [one.key for one in setup.search.space] == ["optim.lr"]
+    assert setup.folder.name.startswith("rates-")
+
+
+def test_a_search_under_kills_has_every_trial_once(tmp_path: Path):
+    said = command(tmp_path, "bench", "chaos-tune", "--trials", "4", "--kills", "5", "data.synth.minutes=0.8")
+    assert "4 trials with 5 kills" in said
+    assert "all trials as they should be: 0 differences" in said
+
+
+def test_the_judge_of_a_search_can_say_no(home: Path, tmp_path: Path):
+    import shutil
+
+    outputs = tmp_path / "outputs"
+    shutil.copytree(home / "outputs", outputs)
+    (folder,) = (outputs / "tune").iterdir()
+    text = (folder / "trials.csv").read_text()
+    rows = text.splitlines()
+    (folder / "trials.csv").write_text(
+        "\n".join([*rows[:3], rows[2], rows[3].replace("complete", "running")])
+    )
+    said = "\n".join(examine(outputs, 3))
+    assert "4 trials, not 3" in said
+    assert "of 2 trials" in said
+    assert "trial 2: running" in said
+    (folder / "trials.csv").write_text("\n".join([rows[0], re.sub(r",\d", ",9", rows[1], count=1), rows[2]]))
+    said = "\n".join(examine(outputs, 2))
+    assert "trial 0: not the value of its run" in said
+    assert "of no trial" in said
