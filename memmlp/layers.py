@@ -20,11 +20,11 @@ class TimeMix(nn.Module):
         nn.init.uniform_(self.weight, -(frames**-0.5), frames**-0.5)
 
     def forward(self, h: Tensor, newest: int = 0) -> Tensor:
-        """(B, T, d) -> (B, T, d), or of the `newest` frames alone."""
-        weight = self.weight[-newest:].expand(len(h), -1, -1)
-        return torch.baddbmm(
-            self.bias[-newest:], weight, h
-        )  # the same numbers as weight @ h + bias, in one pass
+        """(B, T, d) or (T, d) -> the same, or of the `newest` frames alone."""
+        weight, bias = self.weight[-newest:], self.bias[-newest:]
+        if h.dim() == 2:
+            return torch.addmm(bias, weight, h)
+        return torch.baddbmm(bias, weight.expand(len(h), -1, -1), h)  # weight @ h + bias, in one pass
 
 
 class MLPBlock(nn.Module):
@@ -39,11 +39,11 @@ class MLPBlock(nn.Module):
 
     def forward(self, h: Tensor, past: object = None) -> Tensor:
         """(B, T, d) -> (B, T, d); the past is not looked at."""
-        return self.newest(h, h.shape[1])
+        return self.newest(h, h.shape[-2])
 
     def newest(self, h: Tensor, count: int) -> Tensor:
         """(B, T, d) -> the newest frames (B, count, d) of the same, without the work for the others."""
-        h = h[:, -count:] + F.silu(self.time_mix(self.time_norm(h), count))
+        h = h[..., -count:, :] + F.silu(self.time_mix(self.time_norm(h), count))
         return h + F.silu(self.linear(self.norm(h)))
 
 
@@ -58,6 +58,15 @@ class ResidualFusion(MLPBlock):
         h = h + F.silu(self.time_mix(self.time_norm(h)))
         return h + F.silu(self.linear(torch.cat([self.norm(h), z], -1)))
 
+    def injection(self, z: Tensor) -> Tensor:
+        """The memory feature's own share of `fuse`, frame by frame: (B, n, k) -> (B, n, d)."""
+        return F.linear(z, self.linear.weight[:, -z.shape[-1] :], self.linear.bias)
+
+    def inject(self, h: Tensor, injection: Tensor) -> Tensor:
+        """`fuse` with that share (B, T, d) computed before: the same to rounding."""
+        h = h + F.silu(self.time_mix(self.time_norm(h)))
+        return h + F.silu(F.linear(self.norm(h), self.linear.weight[:, : h.shape[-1]]) + injection)
+
 
 class PlainFusion(MLPBlock):
     """An MLP block, then Linear([h; z]) from d + k to d without a residual: the literal concatenation."""
@@ -69,3 +78,11 @@ class PlainFusion(MLPBlock):
     def fuse(self, h: Tensor, z: Tensor) -> Tensor:
         """Hidden state (B, T, d) and memory feature (B, T, k) -> (B, T, d)."""
         return self.merge(torch.cat([super().forward(h), z], -1))
+
+    def injection(self, z: Tensor) -> Tensor:
+        """The memory feature's own share of `fuse`, frame by frame: (B, n, k) -> (B, n, d)."""
+        return F.linear(z, self.merge.weight[:, -z.shape[-1] :], self.merge.bias)
+
+    def inject(self, h: Tensor, injection: Tensor) -> Tensor:
+        """`fuse` with that share (B, T, d) computed before: the same to rounding."""
+        return F.linear(super().forward(h), self.merge.weight[:, : h.shape[-1]]) + injection

@@ -6,8 +6,9 @@ see (`recall`), and updates its buffers after the network's output (`remember`).
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import torch
 import torch.nn.functional as F
@@ -122,12 +123,26 @@ class Memory(nn.Module):
         uses_codes: wants a frozen VQ-VAE. trains_codes: has one of its own, trained with the network.
         shift: frames by which the past ends before the newest and a training step moves; 0 without a past.
         length: frames of inputs in the buffer, the last one just before the new ones.
+        frames: T, the window's length.
+        settled: what is recalled of a frame never changes, so that a stream may compute it once.
     """
 
     uses_codes: ClassVar[bool] = False
     trains_codes: ClassVar[bool] = False
     shift: int
     length: int
+    frames: int
+    settled: bool = True
+
+    def frame_by_frame(self) -> Self:
+        """The same memory, its modules shared, over windows of one frame: what each new frame brings in."""
+        narrow = copy.copy(self)
+        narrow.frames, narrow.length = 1, self.length - self.frames + 1
+        return narrow
+
+    def before(self, first: Tensor) -> Tensor:
+        """The memory feature (B, 1, k) of the frames before the first one, given that of the first."""
+        return first
 
     def block(self, layer: int) -> nn.Module:
         """The backbone's block of that layer (1-based)."""
@@ -241,6 +256,7 @@ class NoCodesMemory(FeatureMemory):
     ):
         super().__init__(layers, width, fusion, hidden=hidden, frames=frames, depth=depth)
         self.history, self.blend = history, Blend(blend)
+        self.settled = history == "first"
         self.shift = {"frame": 1, "window": frames}[shift]
         self.length = frames + self.shift - 1
 
@@ -466,6 +482,10 @@ class RecurrentMemory(FeatureMemory):
         blocks = len(self.recurrences)
         states = {name: torch.zeros(batch, blocks, self.width) for name in self.recurrence.carried}
         return states | {"features": torch.zeros(batch, blocks, self.frames - 1, self.width)}
+
+    def before(self, first: Tensor) -> Tensor:
+        """Zeros, the outputs of a layer that has seen nothing."""
+        return torch.zeros_like(first)
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
         """Hidden states from the last of inputs (B, length, 54)."""

@@ -39,7 +39,7 @@ class Branch(nn.Module):
         for block in self.blocks[-1:]:
             assert isinstance(block, MLPBlock)
             h = block.newest(h, newest)
-        return self.linear(h[:, -newest:])
+        return self.linear(h[..., -newest:, :])
 
 
 class MemoryBranch(Branch):
@@ -54,7 +54,7 @@ class MemoryBranch(Branch):
         """Hidden state (B, T, d), what the memory recalls -> the newest frames (B, newest, size)."""
         for block in self.blocks:
             h = block(h, past)
-        return self.linear(h[:, -newest:])
+        return self.linear(h[..., -newest:, :])
 
 
 class TwoBranch(nn.Module):
@@ -100,7 +100,7 @@ class RotationOnly(nn.Module):
 
     def forward(self, h: Tensor, past: object, sparse: Tensor, frame: Frame, newest: int) -> Tensor:
         """As TwoBranch's; world inputs (B, T, 54) place the body."""
-        rotation, sparse = self.rotation(h, past, newest), sparse[:, -newest:]
+        rotation, sparse = self.rotation(h, past, newest), sparse[..., -newest:, :]
         with torch.no_grad():
             place = frame.place(sparse)
             world = frame.decode_motion(F.pad(rotation, (0, MOTION_DIM - ROTATION.stop)), place)
