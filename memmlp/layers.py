@@ -58,9 +58,9 @@ class ResidualFusion(MLPBlock):
         h = h + F.silu(self.time_mix(self.time_norm(h)))
         return h + F.silu(self.linear(torch.cat([self.norm(h), z], -1)))
 
-    def injection(self, z: Tensor) -> Tensor:
-        """The memory feature's own share of `fuse`, frame by frame: (B, n, k) -> (B, n, d)."""
-        return F.linear(z, self.linear.weight[:, -z.shape[-1] :], self.linear.bias)
+    def share(self) -> tuple[Tensor, Tensor]:
+        """Weight (d, k) and bias (d,) of what a memory feature adds within `fuse`, frame by frame."""
+        return self.linear.weight[:, self.norm.normalized_shape[0] :], self.linear.bias
 
     def inject(self, h: Tensor, injection: Tensor) -> Tensor:
         """`fuse` with that share (B, T, d) computed before: the same to rounding."""
@@ -79,9 +79,9 @@ class PlainFusion(MLPBlock):
         """Hidden state (B, T, d) and memory feature (B, T, k) -> (B, T, d)."""
         return self.merge(torch.cat([super().forward(h), z], -1))
 
-    def injection(self, z: Tensor) -> Tensor:
-        """The memory feature's own share of `fuse`, frame by frame: (B, n, k) -> (B, n, d)."""
-        return F.linear(z, self.merge.weight[:, -z.shape[-1] :], self.merge.bias)
+    def share(self) -> tuple[Tensor, Tensor]:
+        """Weight (d, k) and bias (d,) of what a memory feature adds within `fuse`, frame by frame."""
+        return self.merge.weight[:, self.norm.normalized_shape[0] :], self.merge.bias
 
     def inject(self, h: Tensor, injection: Tensor) -> Tensor:
         """`fuse` with that share (B, T, d) computed before: the same to rounding."""

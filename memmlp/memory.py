@@ -71,7 +71,37 @@ class Blend(nn.Module):
         return self.value
 
 
-class CodeFeature(nn.Module):
+class Projections(nn.Module):
+    """The projections that several blocks make of one input, at once, for a stream of one frame a call."""
+
+    def __init__(self, parts: Sequence[Projection]):
+        super().__init__()
+        self.shape = len(parts), parts[0].norm.normalized_shape[0]
+        self.weight = nn.Parameter(torch.cat([part.linear.weight for part in parts]))
+        self.bias = nn.Parameter(torch.cat([part.linear.bias for part in parts]))
+        self.scale = nn.Parameter(torch.stack([part.norm.weight for part in parts]))
+        self.offset = nn.Parameter(torch.stack([part.norm.bias for part in parts]))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(1, 1, size) -> (1, blocks, k)."""
+        y = F.linear(x[0], self.weight, self.bias).view(1, *self.shape)
+        return F.silu(F.layer_norm(y, self.shape[1:]) * self.scale + self.offset)
+
+
+class ProjectedFeature(nn.Module):
+    """A memory feature made of projections."""
+
+    @staticmethod
+    def together(features: Sequence[nn.Module]) -> nn.Module:
+        """What gives the features (1, blocks, k) of all blocks at once, from the past of one frame."""
+        whole = copy.deepcopy(features[0])
+        for name, child in list(whole.named_children()):
+            if isinstance(child, Projection):
+                setattr(whole, name, Projections([getattr(feature, name) for feature in features]))
+        return whole
+
+
+class CodeFeature(ProjectedFeature):
     """Z_l = Z_x + m * Z_theta + (1 - m) * Z_E (Sec. 3.2.1)."""
 
     def __init__(self, width: int, code_width: int, blend: Blend):
@@ -88,7 +118,7 @@ class CodeFeature(nn.Module):
         return self.sparse(past.sparse) + m * motion + (1 - m) * self.codes(past.codes)
 
 
-class NoCodesFeature(nn.Module):
+class NoCodesFeature(ProjectedFeature):
     """Z_l = Z_x + m * Z_theta: Table 11's memory without the VQ-VAE."""
 
     def __init__(self, width: int, blend: Blend):
@@ -141,7 +171,7 @@ class Memory(nn.Module):
         return narrow
 
     def before(self, first: Tensor) -> Tensor:
-        """The memory feature (B, 1, k) of the frames before the first one, given that of the first."""
+        """The memory features of the frames before the first one, given that of the first."""
         return first
 
     def block(self, layer: int) -> nn.Module:
@@ -439,6 +469,23 @@ class RecurredFeature(nn.Module):
     def forward(self, past: Recurred) -> Tensor:
         """The memory feature (B, T, k)."""
         return past.features[:, self.index]
+
+    @staticmethod
+    def together(features: Sequence[RecurredFeature]) -> nn.Module:
+        """What gives the features (1, blocks, k) of all blocks at once, from the past of one frame."""
+        return AllRecurred([feature.index for feature in features])
+
+
+class AllRecurred(nn.Module):
+    """The features of recurrent layers, in the order of those indices, at one frame."""
+
+    def __init__(self, indices: Sequence[int]):
+        super().__init__()
+        self.indices = list(indices)
+
+    def forward(self, past: Recurred) -> Tensor:
+        """(1, blocks, k)."""
+        return past.features[:, self.indices, -1]
 
 
 class RecurrentMemory(FeatureMemory):
