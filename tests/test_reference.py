@@ -24,7 +24,14 @@ from memmlp.runs import list_runs
 NAMES = list(tiny.REFERENCES)
 CLIP = tiny.clip(40)
 SPARSE = CLIP[None, :, :SPARSE_DIM]
-SHORT = ["profile=tiny", "data.synth.minutes=0.6", "tracker=none", "threads=1", "optim.steps=2"]
+SHORT = [
+    "profile=tiny",
+    "data.synth.minutes=0.6",
+    "tracker=none",
+    "threads=1",
+    "optim.steps=2",
+    "model.depth=2",
+]
 
 
 def built(*overrides: str) -> WindowModel:
@@ -224,6 +231,14 @@ def test_attention_is_an_independent_computation():
                 expected[b, t, part] = sum(share[s] * value[s, part] for s in range(5))
     found = attention(h).numpy()
     np.testing.assert_allclose(found, linear(attention.out, expected), atol=1e-12)
+
+
+@torch.no_grad()
+def test_avatar_poser_reads_the_newest_frame_and_knows_no_order_of_the_others():
+    model, window = tiny.reference("avatar_poser").double(), torch.randn(1, 7, SPARSE_DIM).double()
+    found = model.rotations(window)
+    torch.testing.assert_close(model.rotations(window[:, [3, 1, 5, 0, 2, 4, 6]]), found)
+    assert not torch.allclose(model.rotations(window[:, [6, 1, 2, 3, 4, 5, 0]]), found, atol=1e-3)
 
 
 @torch.no_grad()
