@@ -38,7 +38,7 @@ class Measured:
     Attributes:
         run: where they lie.
         means: the metrics' means over the test clips. clips: those of each clip by its name.
-        costs: GFLOP and ms of a streaming step, millions of parameters, MB of the ONNX file, frames a second.
+        costs: GFLOP, GMAC and ms of a streaming step, millions of parameters, MB of ONNX, frames a second.
         origin: what the run was made from.
     """
 
@@ -82,6 +82,7 @@ def _costs(latency: Mapping[str, float]) -> dict[str, float]:
     """The costs that the measurement has, in the tables' units."""
     costs = {
         "FLOPs": latency.get("flops", np.nan) / 1e9,
+        "MACs": latency.get("macs", np.nan) / 1e9,
         "parameters": latency.get("parameters", np.nan) / 1e6,
         "size": latency.get("onnx_bytes", np.nan) / 1e6,
         "ms": latency.get("median_ms", np.nan),
