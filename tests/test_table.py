@@ -221,9 +221,20 @@ def test_damaged_results_are_one_line(tmp_path: Path, sweep: Sweep):
     find = fake_sweep(tmp_path, sweep)
     run = find(sweep.arms[3], 1)
     assert run is not None
-    run.clips.write_text("[{")
-    with pytest.raises(InputError, match=re.escape(str(run.clips))):
-        collect(sweep, find)
+    for text in ("[{", "[5]"):
+        run.clips.write_text(text)
+        with pytest.raises(InputError, match=re.escape(str(run.clips))):
+            collect(sweep, find)
+
+
+def test_costs_that_are_no_numbers_are_left_out(tmp_path: Path):
+    run = fake_run(tmp_path, "a")
+    results = json.loads(run.results_path.read_text())
+    results["latency"]["flops"] = "nan"
+    run.results_path.write_text(json.dumps(results))
+    costs = load(run.folder).costs
+    assert "FLOPs" not in costs
+    assert "parameters" in costs
 
 
 def test_only_costs_need_one_block(tmp_path: Path):
