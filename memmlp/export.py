@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from memmlp import __version__
 from memmlp.body import FPS, JOINTS, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.memory import Blend
-from memmlp.model import MemMLP
+from memmlp.model import WindowModel
 
 OPSET = 18
 TOLERANCE = 1e-4
@@ -36,7 +36,7 @@ FEATURES = (
 class StreamStep(nn.Module):
     """One step of the live stream with flat inputs and outputs."""
 
-    def __init__(self, model: MemMLP):
+    def __init__(self, model: WindowModel):
         super().__init__()
         self.model = model
         self.names = list(model.initial_state(1))
@@ -51,7 +51,7 @@ class StreamStep(nn.Module):
 
 
 @contextmanager
-def deterministic(model: MemMLP) -> Iterator[None]:
+def deterministic(model: WindowModel) -> Iterator[None]:
     """No draws, which torch and ONNX Runtime could not share: a sampled m (reading 7) is its mean."""
     sampled = [module for module in model.modules() if isinstance(module, Blend) and module.sampled]
     values = [blend.value for blend in sampled]
@@ -64,7 +64,7 @@ def deterministic(model: MemMLP) -> Iterator[None]:
             blend.value = value
 
 
-def export(model: MemMLP, path: Path, run_id: str) -> None:
+def export(model: WindowModel, path: Path, run_id: str) -> None:
     """Write the model's streaming step, on the CPU in float32, as one ONNX file with its metadata."""
     step = StreamStep(model.cpu().eval())
     states = tuple(model.initial_state(1).values())
@@ -94,7 +94,7 @@ def export(model: MemMLP, path: Path, run_id: str) -> None:
     temporary.replace(path)
 
 
-def metadata(model: MemMLP, run_id: str) -> dict[str, str]:
+def metadata(model: WindowModel, run_id: str) -> dict[str, str]:
     """What a program needs to know to drive the file."""
     return {
         "joints": json.dumps(JOINTS),
@@ -128,7 +128,7 @@ class OnnxStream:
 
 
 @torch.no_grad()
-def parity(model: MemMLP, path: Path, clip: Tensor) -> float:
+def parity(model: WindowModel, path: Path, clip: Tensor) -> float:
     """Largest difference between torch and ONNX Runtime, each with its own history, over a clip (N, 252)."""
     model = model.cpu().eval()
     onnx_stream, state, worst = OnnxStream(path), model.initial_state(1), 0.0

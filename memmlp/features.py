@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from memmlp.body import (
     FRAME_DIM,
     HEAD,
+    MOTION_DIM,
     N_JOINTS,
     POSITION,
     ROTATION,
@@ -213,6 +214,17 @@ class Frame(nn.Module):
         _, positions = forward_kinematics(local, torch.zeros_like(sparse[..., :3]), self.rest)
         head = sparse[..., SPARSE_POSITION][..., :3]
         return positions + (head - positions[..., HEAD, :]).unsqueeze(-2)
+
+    def posed(self, rotation: Tensor, sparse: Tensor) -> Tensor:
+        """World motion (..., 198) of rotations (..., 132) in network space at world inputs (..., 54).
+
+        The positions follow from the rotations (`pose`), without gradient.
+        """
+        motion = F.pad(rotation, (0, MOTION_DIM - ROTATION.stop))
+        world = self.decode_motion(motion, self.place(sparse))
+        with torch.no_grad():
+            positions = self.pose(world, sparse).flatten(-2)
+        return torch.cat([world[..., ROTATION], positions], -1)
 
 
 def _tile(point: Tensor, times: int) -> Tensor:

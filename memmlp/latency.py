@@ -15,7 +15,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from memmlp.body import SPARSE_DIM
 from memmlp.export import OnnxStream
-from memmlp.model import MemMLP
+from memmlp.model import WindowModel
 
 WARM_UP = 30
 REFERENCE_SHAPE = (41, 512, 8)  # rows, width, layers: 86 M multiply-adds of plain matrix products
@@ -48,7 +48,7 @@ def measure(path: Path, steps: int = 200) -> dict[str, Any]:
     }
 
 
-def size(model: MemMLP, path: Path) -> dict[str, Any]:
+def size(model: WindowModel, path: Path) -> dict[str, Any]:
     """Parameters, MACs and FLOPs of one streaming step, and the file's bytes.
 
     A FLOP is a multiplication or an addition of the matrix products, a MAC one of each.
@@ -64,7 +64,7 @@ def size(model: MemMLP, path: Path) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def macs(model: MemMLP) -> int:
+def macs(model: WindowModel) -> int:
     """Multiply-adds of the matrix products of one streaming step."""
     with FlopCounterMode(display=False) as counter:
         model.advance(torch.zeros(1, 1, SPARSE_DIM), model.initial_state(1), 1)

@@ -74,25 +74,12 @@ def position_terms(motion: Tensor, truth: Tensor) -> Terms:
     return {"position": l1(error), "velocity": l1(error[:, :, list(LOWER)].diff(dim=1))}
 
 
-class Manual(nn.Module):
-    """Fixed weights; the defaults are the paper's grid search (Sec. 4.4)."""
+class Fixed(nn.Module):
+    """Fixed weights by the names of the terms."""
 
-    def __init__(
-        self,
-        rotation: float = 1.0,
-        rotation_velocity: float = 30.0,
-        position: float = 0.5,
-        velocity: float = 0.1,
-        hand: float = 0.1,
-    ):
+    def __init__(self, values: Mapping[str, float]):
         super().__init__()
-        self.values = {
-            "rotation": rotation,
-            "rotation_velocity": rotation_velocity,
-            "position": position,
-            "velocity": velocity,
-            "hand": hand,
-        }
+        self.values = values
 
     def build(self, names: list[str]) -> None:
         """Nothing to learn."""
@@ -108,6 +95,28 @@ class Manual(nn.Module):
     def weights(self) -> Mapping[str, float]:
         """The weight of each term."""
         return self.values
+
+
+class Manual(Fixed):
+    """Fixed weights; the defaults are the paper's grid search (Sec. 4.4)."""
+
+    def __init__(
+        self,
+        rotation: float = 1.0,
+        rotation_velocity: float = 30.0,
+        position: float = 0.5,
+        velocity: float = 0.1,
+        hand: float = 0.1,
+    ):
+        super().__init__(
+            {
+                "rotation": rotation,
+                "rotation_velocity": rotation_velocity,
+                "position": position,
+                "velocity": velocity,
+                "hand": hand,
+            }
+        )
 
 
 class Uncertainty(nn.Module):
@@ -141,10 +150,25 @@ class Uncertainty(nn.Module):
         return {name: float((-s.detach()).exp()) for name, s in self.s.items()}
 
 
-Weighting = Manual | Uncertainty
+Weighting = Fixed | Uncertainty
 
 
-class MotionLoss(nn.Module):
+class Loss(nn.Module):
+    """The slot's interface: terms by name, and their weighted sum."""
+
+    weighting: Weighting
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+        """Each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
+        raise NotImplementedError
+
+    def forward(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> tuple[Tensor, Terms]:
+        """The loss and its unweighted terms."""
+        terms = self.terms(motion, truth, sparse, frame)
+        return self.weighting(terms), terms
+
+
+class MotionLoss(Loss):
     """The loss of Eq. 5 over the branches that the predictor has.
 
     Args:
@@ -170,7 +194,45 @@ class MotionLoss(nn.Module):
             terms |= self.hand(motion, truth, sparse, frame)
         return terms
 
-    def forward(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> tuple[Tensor, Terms]:
-        """The loss and its unweighted terms."""
-        terms = self.terms(motion, truth, sparse, frame)
-        return self.weighting(terms), terms
+
+class AGRoLLoss(Loss):
+    """Mean squared error of the 6D rotations in network space, where the diffusion model's noise lies too.
+
+    The L2 of Du et al. 2023 on the denoiser's prediction of the clean motion; their MLP's is taken to be the
+    same (reading).
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.weighting = Fixed({"rotation": 1.0})
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+        """The one term, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
+        place = frame.place(sparse)
+        error = frame.encode_motion(motion, place) - frame.encode_motion(truth, place)
+        return {"rotation": error[..., ROTATION].square().mean()}
+
+
+class AvatarPoserLoss(Loss):
+    """Mean absolute errors of root orientation, local rotations and joint positions (Jiang et al. 2022).
+
+    The positions are by forward kinematics with the head on its tracker (reading).
+
+    Args:
+        orientation, rotation, position: weights of the three terms; the paper's are 0.05, 1 and 1.
+    """
+
+    def __init__(self, orientation: float = 0.05, rotation: float = 1.0, position: float = 1.0):
+        super().__init__()
+        weights = {"orientation": orientation, "rotation": rotation, "position": position}
+        self.weighting = Fixed(weights)
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+        """Each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
+        error = (motion - truth)[..., ROTATION].abs()
+        position = (frame.pose(motion, sparse) - joints(truth)).abs()
+        return {
+            "orientation": error[..., :6].mean(),
+            "rotation": error[..., 6:].mean(),
+            "position": position.mean(),
+        }

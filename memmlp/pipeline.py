@@ -1,4 +1,4 @@
-"""A whole experiment: data, VQ-VAE run, Mem-MLP run. Every finished stage is found again, not redone."""
+"""A whole experiment: data, VQ-VAE run, motion network's run. Every finished stage is found again."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from memmlp.features import Frame, World
 from memmlp.files import write_json
 from memmlp.identity import run_id
 from memmlp.ik import IK
-from memmlp.losses import Hand, MotionLoss, Weighting
+from memmlp.losses import Loss
 from memmlp.memory import Memory
-from memmlp.model import MemMLP
+from memmlp.model import MemMLP, WindowModel
 from memmlp.predictor import Predictor
 from memmlp.render import poses_png
 from memmlp.rollout import PersistentStreams, Rollout
@@ -41,25 +41,30 @@ MOTION_ARTIFACTS = ("model.safetensors", "clips.json", "results.json", "step.onn
 
 @dataclass(frozen=True)
 class Architecture:
-    """The network: partial constructors for the slots, and its sizes."""
+    """What builds a family's network: this, and `build`.
+
+    Attributes:
+        coordinates, normalize: of world <-> network space.
+        vqvae: makes a VQ-VAE.
+    """
 
     coordinates: World
     normalize: bool
-    frames: int
-    hidden: int
-    depth: int
     vqvae: Callable[[], VQVAE]
-    memory: Callable[..., Memory]
-    uses_codes: bool
-    trains_codes: bool
-    predictor: Callable[..., Predictor]
 
-    def build(self, frame: Frame, codes: VQVAE | None) -> MemMLP:
+    @property
+    def uses_codes(self) -> bool:
+        """Whether the network wants a frozen VQ-VAE."""
+        return False
+
+    @property
+    def trains_codes(self) -> bool:
+        """Whether the network has a VQ-VAE of its own, trained with it."""
+        return False
+
+    def build(self, frame: Frame, codes: VQVAE | None) -> WindowModel:
         """The network with fresh weights."""
-        sizes = {"hidden": self.hidden, "frames": self.frames}
-        memory = self.memory(codes=codes, depth=self.depth, **sizes)
-        predictor = self.predictor(memory_block=memory.memory_block, **sizes)
-        return MemMLP(frame, memory, predictor, depth=self.depth, **sizes)
+        raise NotImplementedError
 
     def frame(self, manifest: Manifest, frames: Tensor) -> Frame:
         """World <-> network space, with the statistics of the training frames (F, 252) where asked."""
@@ -68,13 +73,53 @@ class Architecture:
             return Frame.fit(self.coordinates, rest, frames)
         return Frame.raw(self.coordinates, rest)
 
-    def load(self, run: Run) -> MemMLP:
+    def load(self, run: Run) -> WindowModel:
         """The network of a finished run."""
         tensors, _ = checkpoint.read(run.model)
         codes = self.vqvae() if self.uses_codes else None
         model = self.build(Frame.raw(self.coordinates, torch.zeros(22, 3)), codes)
         checkpoint.load_module("model", model, tensors)
         return model.eval()
+
+
+@dataclass(frozen=True)
+class MemMLPArchitecture(Architecture):
+    """Mem-MLP: partial constructors for the slots, and its sizes."""
+
+    frames: int
+    hidden: int
+    depth: int
+    memory: Callable[..., Memory]
+    memory_kind: type[Memory]
+    predictor: Callable[..., Predictor]
+
+    @property
+    def uses_codes(self) -> bool:
+        """Whether the memory wants a frozen VQ-VAE."""
+        return self.memory_kind.uses_codes
+
+    @property
+    def trains_codes(self) -> bool:
+        """Whether the memory has a VQ-VAE of its own."""
+        return self.memory_kind.trains_codes
+
+    def build(self, frame: Frame, codes: VQVAE | None) -> MemMLP:
+        """The network with fresh weights."""
+        sizes = {"hidden": self.hidden, "frames": self.frames}
+        memory = self.memory(codes=codes, depth=self.depth, **sizes)
+        predictor = self.predictor(memory_block=memory.memory_block, **sizes)
+        return MemMLP(frame, memory, predictor, depth=self.depth, **sizes)
+
+
+@dataclass(frozen=True)
+class ReferenceArchitecture(Architecture):
+    """A network without slots: its constructor, all but world <-> network space given."""
+
+    network: Callable[[Frame], WindowModel]
+
+    def build(self, frame: Frame, codes: VQVAE | None) -> WindowModel:
+        """The network with fresh weights."""
+        return self.network(frame)
 
 
 @dataclass(frozen=True)
@@ -91,8 +136,7 @@ class Experiment:
     vqvae_config: dict[str, Any]
     vqvae_optim: Optim
     vqvae_seed: int
-    weighting: Weighting
-    hand: Hand
+    loss: Callable[[frozenset[str]], Loss]
     rollout: Rollout
     optim: Optim
     modes: Sequence[str]
@@ -185,7 +229,7 @@ def load_vqvae(architecture: Architecture, run: Run) -> VQVAE:
 def motion_run(
     experiment: Experiment, run: Run, cache: Path, manifest: Manifest, upstream: Run | None, watch: Watch
 ) -> None:
-    """Train, evaluate, export and time one Mem-MLP, and mark its run as done."""
+    """Train, evaluate, export and time one network, and mark its run as done."""
     seconds: dict[str, float] = {}
     started = time.monotonic()
     model = trained(experiment, run, cache, manifest, upstream, watch)
@@ -214,7 +258,7 @@ def trained(
     manifest: Manifest,
     upstream: Run | None,
     watch: Watch = unwatched,
-) -> MemMLP:
+) -> WindowModel:
     """The trained network, its training resumed where it was left."""
     architecture, device = experiment.architecture, experiment.device
     frames = Frames.open(cache, "train").to(device)
@@ -226,18 +270,18 @@ def trained(
     pieces = evaluation.chunks(Frames.open(cache, "val").to(device), VALIDATION_PIECE, least=60)
     task = MotionTask(
         model,
-        MotionLoss(experiment.weighting, experiment.hand, model.predictor.branches).to(device),
+        experiment.loss(model.branches).to(device),
         experiment.rollout.to(device),
         frames,
         experiment.optim,
         experiment.seed,
         validate=lambda network: evaluation.quick_stream(network, pieces),
     )
-    train(task, experiment.optim, run, experiment.seed, "Mem-MLP", watch)
+    train(task, experiment.optim, run, experiment.seed, "network", watch)
     return model.eval()
 
 
-def export_checked(model: MemMLP, run: Run, clip: Tensor) -> None:
+def export_checked(model: WindowModel, run: Run, clip: Tensor) -> None:
     """Write the run's ONNX file and prove it on a whole clip (N, 252)."""
     export(model, run.onnx, run.id)
     worst = parity(model, run.onnx, clip)
@@ -246,9 +290,9 @@ def export_checked(model: MemMLP, run: Run, clip: Tensor) -> None:
         raise RuntimeError(f"{run.onnx}: ONNX Runtime differs from torch by {worst:.2e} (> {TOLERANCE:.0e})")
 
 
-def picture(model: MemMLP, test: Frames, run: Run) -> None:
+def picture(model: WindowModel, test: Frames, run: Run) -> None:
     """Draw the start of the first test clip, streamed."""
-    device = model.stem.weight.device
+    device = model.frame.rest.device
     clip = test.clip(0)[:PICTURE_FRAMES].to(device)
     motion = evaluation.stream(model, [clip])[0]
     predicted = model.frame.pose(motion, clip[:, :SPARSE_DIM])
@@ -256,7 +300,7 @@ def picture(model: MemMLP, test: Frames, run: Run) -> None:
     poses_png(run.folder / "poses.png", truth.cpu().numpy(), predicted.cpu().numpy(), test.names[0])
 
 
-def save_predictions(experiment: Experiment, model: MemMLP, cache: Path) -> None:
+def save_predictions(experiment: Experiment, model: WindowModel, cache: Path) -> None:
     """Write `<folder>/<mode>/<clip>.npz` for every test clip: positions (N, 22, 3) and rotations."""
     assert experiment.save_predictions is not None
     test = Frames.open(cache, "test").to(experiment.device)

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import ClassVar
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.body import MOTION_DIM, ROTATION
@@ -102,11 +101,8 @@ class RotationOnly(nn.Module):
         """As TwoBranch's; world inputs (B, T, 54) place the body."""
         rotation, sparse = self.rotation(h, past, newest), sparse[..., -newest:, :]
         with torch.no_grad():
-            place = frame.place(sparse)
-            world = frame.decode_motion(F.pad(rotation, (0, MOTION_DIM - ROTATION.stop)), place)
-            positions = frame.pose(world, sparse).flatten(-2)
-            world = torch.cat([world[..., ROTATION], positions], -1)
-            position = frame.encode_motion(world, place)[..., ROTATION.stop :]
+            motion = frame.encode_motion(frame.posed(rotation, sparse), frame.place(sparse))
+        position = motion[..., ROTATION.stop :]
         return torch.cat([rotation, position], -1)
 
 

@@ -14,11 +14,11 @@ from torch import Tensor, nn
 from memmlp.body import SPARSE_DIM
 from memmlp.data.dataset import Frames, WindowSampler
 from memmlp.memory import State
-from memmlp.model import MemMLP
+from memmlp.model import WindowModel
 
 
 class Call(NamedTuple):
-    """One training call: `model.advance(sparse, state)` should give the truth.
+    """One training call: `model.learn(sparse, state, truth)` should give the truth.
 
     sparse (B, n, 54) and truth (B, T, 252) are world frames; clips (B,) says where they are from.
     """
@@ -32,10 +32,10 @@ class Call(NamedTuple):
 class TeacherForcing(nn.Module):
     """The true history: the paper's training (Sec. 3.2.1)."""
 
-    def draw(self, model: MemMLP, frames: Frames, sampler: WindowSampler, step: int) -> Call:
+    def draw(self, model: WindowModel, frames: Frames, sampler: WindowSampler, step: int) -> Call:
         """The call of a training step."""
         clips, end = sampler.draw(step)
-        past, stride = model.memory.length, model.stride
+        past, stride = model.length, model.stride
         segment = frames.segments(clips, end, past + stride)
         state = model.true_state(segment[:, :past])
         return Call(segment[:, past:, :SPARSE_DIM], state, segment[:, -model.frames :], clips)
@@ -54,11 +54,11 @@ class OwnPredictions(nn.Module):
         super().__init__()
         self.max_passes = max_passes
 
-    def draw(self, model: MemMLP, frames: Frames, sampler: WindowSampler, step: int) -> Call:
+    def draw(self, model: WindowModel, frames: Frames, sampler: WindowSampler, step: int) -> Call:
         """The call of a training step."""
         clips, end = sampler.draw(step)
-        past, stride = model.memory.length, model.stride
-        passes = int(torch.randint(self.max_passes + 1, ())) if model.memory.shift else 0
+        past, stride = model.length, model.stride
+        passes = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
         segment = frames.segments(clips, end, past + stride * (passes + 1))
         sparse = segment[..., :SPARSE_DIM]
         state = model.running_state(sparse[:, :past])
@@ -92,12 +92,12 @@ class PersistentStreams(nn.Module):
         self.register_buffer("end", torch.zeros(streams, dtype=torch.long))
         self.register_buffer("lives", torch.zeros(streams, dtype=torch.bool))
 
-    def build(self, model: MemMLP) -> None:
+    def build(self, model: WindowModel) -> None:
         """Room for the streams' states."""
         for name, tensor in model.initial_state(1).items():
             self.register_buffer(f"state_{name}", tensor.repeat(self.streams, *[1] * (tensor.dim() - 1)))
 
-    def draw(self, model: MemMLP, frames: Frames, sampler: WindowSampler, step: int) -> Call:
+    def draw(self, model: WindowModel, frames: Frames, sampler: WindowSampler, step: int) -> Call:
         """The call of a training step: the next streams, each one stride further."""
         clips, end = sampler.draw(step)
         who = (step * len(clips) + torch.arange(len(clips), device=clips.device)) % self.streams
@@ -105,7 +105,7 @@ class PersistentStreams(nn.Module):
         self.clip[who] = torch.where(going, self.clip[who], clips)
         self.end[who] = torch.where(going, self.end[who] + model.stride, end)
         self.lives[who] = True
-        past, stride = model.memory.length, model.stride
+        past, stride = model.length, model.stride
         segment = frames.segments(self.clip[who], self.end[who], past + stride)
         fresh = model.running_state(segment[:, :past, :SPARSE_DIM])
         state = {}

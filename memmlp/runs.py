@@ -160,7 +160,9 @@ class Run:
         )
 
     def retry(self) -> None:
-        """Forget the failure."""
+        """Forget the failure, and the attempts that led to it."""
+        if self.failure:
+            self.write_manifest({"forgiven": len(self.manifest.get("attempts", []))})
         (self.folder / "FAILED").unlink(missing_ok=True)
 
     def begin(self, kind: str, config: Mapping[str, Any], *, data: str, upstream: str | None) -> None:
@@ -186,8 +188,14 @@ class Run:
 
     @property
     def config(self) -> dict[str, Any]:
-        """The resolved config; empty before the run began."""
-        return yaml.safe_load(self.config_path.read_text()) if self.config_path.exists() else {}
+        """The resolved config; empty before the run began. Raises InputError where it is damaged."""
+        try:
+            found = yaml.safe_load(self.config_path.read_text()) if self.config_path.exists() else {}
+        except (yaml.YAMLError, UnicodeDecodeError):
+            found = None
+        if not isinstance(found, dict):
+            raise InputError(f"{self.config_path}: cannot be read; remove the run's folder to do it again")
+        return found
 
     @property
     def results(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The training loop, for the VQ-VAE and for Mem-MLP alike: steps, checkpoints, validation, records.
+"""The training loop, for VQ-VAE and motion networks alike: steps, checkpoints, validation, records.
 
 A step's randomness comes from (seed, step) alone, so a run that was killed and resumed ends in the same
 weights, bit for bit on a CPU, as one that was not.
@@ -22,8 +22,8 @@ from memmlp.body import SPARSE_DIM
 from memmlp.data.dataset import Frames, WindowSampler
 from memmlp.errors import TrainingDiverged
 from memmlp.features import Frame
-from memmlp.losses import MotionLoss
-from memmlp.model import MemMLP
+from memmlp.losses import Loss
+from memmlp.model import WindowModel
 from memmlp.progress import progress
 from memmlp.rollout import Rollout
 from memmlp.runs import Run
@@ -147,22 +147,22 @@ class VQVAETask:
 
 
 class MotionTask:
-    """Mem-MLP under its loss, its history made by the rollout."""
+    """A motion network under its loss, its history made by the rollout."""
 
     def __init__(
         self,
-        model: MemMLP,
-        loss: MotionLoss,
+        model: WindowModel,
+        loss: Loss,
         rollout: Rollout,
         frames: Frames,
         optim: Optim,
         seed: int,
-        validate: Callable[[MemMLP], dict[str, float]],
+        validate: Callable[[WindowModel], dict[str, float]],
     ):
         self.model, self.loss, self.rollout, self.frames = model, loss, rollout, frames
         self.module: nn.Module = nn.ModuleDict({"model": model, "loss": loss, "rollout": rollout})
         self.sampler = WindowSampler(frames, batch=optim.batch, window=model.frames, seed=seed)
-        self.advance = torch.compile(model.advance) if optim.compile else model.advance
+        self.learn = torch.compile(model.learn) if optim.compile else model.learn
         self._validate = validate
 
     def parameter_groups(self) -> list[dict]:
@@ -173,11 +173,11 @@ class MotionTask:
     def step(self, step: int) -> StepResult:
         """The loss of one training call."""
         call = self.rollout.draw(self.model, self.frames, self.sampler, step)
-        motion, state = self.advance(call.sparse, call.state)
+        motion, state = self.learn(call.sparse, call.state, call.truth)
         self.rollout.keep(state)
-        sparse, truth = call.truth[..., :SPARSE_DIM], call.truth[..., SPARSE_DIM:]
-        loss, terms = self.loss(motion, truth, sparse, self.model.frame)
-        own = self.model.memory.terms(call.truth, self.model.frame)
+        true = call.truth[:, -motion.shape[1] :]
+        loss, terms = self.loss(motion, true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], self.model.frame)
+        own = self.model.terms(call.truth)
         return StepResult(sum(own.values(), loss), terms | own, call.clips)
 
     def report(self) -> dict[str, float]:

@@ -297,6 +297,14 @@ def test_diff_names_what_differs(tmp_path: Path):
     assert found.results == {"stream.MPJPE": (1.0, 3.0)}
 
 
+@pytest.mark.parametrize("text", ["a: [b", "5", "[]"])
+def test_a_damaged_config_is_named(tmp_path: Path, text: str):
+    run = begun(tmp_path)
+    run.config_path.write_text(text)
+    with pytest.raises(InputError, match=r"config\.yaml: cannot be read"):
+        _ = run.config
+
+
 def test_flatten_keeps_lists_and_empty_mappings():
     assert flatten({"a": {"b": 1, "c": {}}, "d": [1]}) == {"a.b": 1, "a.c": {}, "d": [1]}
 

@@ -122,7 +122,7 @@ def test_costs_come_from_the_latency(table: Table):
 def test_costs_have_the_tables_units(tmp_path: Path):
     costs = load(fake_run(tmp_path, "run").folder).costs
     assert costs == pytest.approx(
-        {"FLOPs": 0.026, "parameters": 0.356798, "size": 1.9, "ms": 0.8, "FPS": 1250}
+        {"FLOPs": 0.026, "MACs": 0.013, "parameters": 0.356798, "size": 1.9, "ms": 0.8, "FPS": 1250}
     )
 
 
@@ -221,17 +221,38 @@ def test_damaged_results_are_one_line(tmp_path: Path, sweep: Sweep):
     find = fake_sweep(tmp_path, sweep)
     run = find(sweep.arms[3], 1)
     assert run is not None
-    run.clips.write_text("[{")
-    with pytest.raises(InputError, match=re.escape(str(run.clips))):
-        collect(sweep, find)
+    for text in ("[{", "[5]"):
+        run.clips.write_text(text)
+        with pytest.raises(InputError, match=re.escape(str(run.clips))):
+            collect(sweep, find)
+
+
+def test_costs_that_are_no_numbers_are_left_out(tmp_path: Path):
+    run = fake_run(tmp_path, "a")
+    results = json.loads(run.results_path.read_text())
+    results["latency"]["flops"] = "nan"
+    run.results_path.write_text(json.dumps(results))
+    costs = load(run.folder).costs
+    assert "FLOPs" not in costs
+    assert "parameters" in costs
 
 
 def test_only_costs_need_one_block(tmp_path: Path):
     sweep = load_sweep(SHIPPED / "table16.yaml")
     table = collect(sweep, fake_sweep(tmp_path, sweep))
     assert len(table.modes) == 1
-    assert "mode" not in printed(table, 100)
+    assert not {"stream mode", "window mode"} & set(printed(table, 100).splitlines())
     assert table.flags == ()
+
+
+def test_costs_show_how_many_times_the_references_they_are(tmp_path: Path):
+    """Of the fake arms' 0.8, 0.88, 0.96 ms, and of the paper's 6.0 and 30.1."""
+    sweep = load_sweep(SHIPPED / "table17.yaml")
+    text = printed(collect(sweep, fake_sweep(tmp_path, sweep)), 100)
+    table = collect(sweep, fake_sweep(tmp_path, sweep))
+    ms = [row.cells[table.modes[0]]["ms"].mean for row in table.rows]
+    assert f"(x {ms[1] / ms[0]:.3g})" in text
+    assert f"(x {30.1 / 6.0:.3g})" in text
 
 
 def test_heads_tell_unit_and_direction():

@@ -7,6 +7,7 @@ import sys
 import textwrap
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -37,6 +38,11 @@ def motion_task(rollout: str = "own", optim: Optim = OPTIM, seed: int = 0) -> Mo
     return MotionTask(model, loss, made, tiny.frames(), optim, seed, validate=lambda model: {"answer": 42.0})
 
 
+def reference_task(name: str, optim: Optim = OPTIM, seed: int = 0) -> MotionTask:
+    model, loss = tiny.reference(name, seed=seed), tiny.REFERENCE_LOSSES[name]()
+    return MotionTask(model, loss, TeacherForcing(), tiny.frames(), optim, seed, validate=lambda model: {})
+
+
 def vqvae_task(optim: Optim = OPTIM) -> VQVAETask:
     torch.manual_seed(0)
     model = VQVAE(codes=8, width=12, encoder_depth=1)
@@ -47,16 +53,23 @@ def weights(run: Run) -> dict[str, torch.Tensor]:
     return checkpoint.read(run.checkpoint)[0]
 
 
+TASKS = {
+    **{name: partial(motion_task, name) for name in ROLLOUTS},
+    **{name: partial(reference_task, name) for name in tiny.REFERENCES},
+    "vqvae": vqvae_task,
+}
+
+
 class Kill(Exception):
     """Stands for a process that ends."""
 
 
-@pytest.mark.parametrize("make", [*ROLLOUTS, "vqvae"])
+@pytest.mark.parametrize("make", [*ROLLOUTS, *tiny.REFERENCES, "vqvae"])
 def test_a_resumed_run_is_the_same_run(make, tmp_path):
     """Stopped at step 7 of 12, two steps after the last checkpoint, and gone on by a new process' objects."""
 
     def task():
-        return vqvae_task() if make == "vqvae" else motion_task(make)
+        return TASKS[make]()
 
     whole, broken = Run(tmp_path / "a"), Run(tmp_path / "b")
     for run in (whole, broken):
@@ -127,7 +140,7 @@ def test_kill_9_at_any_moment_then_again_ends_in_the_same_weights(tmp_path):
     assert all(torch.equal(expected[name], got[name]) for name in expected)
 
 
-@pytest.mark.parametrize("make", [vqvae_task, motion_task])
+@pytest.mark.parametrize("make", [vqvae_task, motion_task, *(TASKS[name] for name in tiny.REFERENCES)])
 def test_it_learns_and_logs(make, tmp_path):
     optim = replace(OPTIM, steps=60, lr=5e-3, final_lr=1e-3, batch=16, validate_every=30)
     run = Run(tmp_path)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -10,9 +12,12 @@ import torch
 from memmlp.body import FRAME_DIM, builtin_rest_joints
 from memmlp.data.dataset import Frames
 from memmlp.features import Frame, HeadRelative, World, motion_frames
+from memmlp.losses import AGRoLLoss, AvatarPoserLoss, Loss
 from memmlp.memory import CodeMemory, JointCodeMemory, Memory, NoMemory, RecurrentMemory
-from memmlp.model import MemMLP
+from memmlp.model import MemMLP, WindowModel
 from memmlp.predictor import Predictor, TwoBranch
+from memmlp.reference.agrol import AGRoLDiffusion, AGRoLMLP
+from memmlp.reference.avatar_poser import AvatarPoser
 from memmlp.vqvae import VQVAE
 
 SIZES = {"hidden": 16, "frames": 7}
@@ -81,3 +86,23 @@ def model(
     torch.manual_seed(seed)
     head = predictor(1, memory_block=slot.memory_block, **SIZES)
     return MemMLP(frame(coordinates), slot, head, depth=DEPTH, **SIZES).eval()
+
+
+REFERENCES: dict[str, Callable[..., WindowModel]] = {
+    "agrol_mlp": partial(AGRoLMLP, frames=7, width=16, depth=2),
+    "agrol_diffusion": partial(
+        AGRoLDiffusion, frames=7, width=16, depth=2, diffusion_steps=50, sampling_steps=3, noise_seed=0
+    ),
+    "avatar_poser": partial(AvatarPoser, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
+}
+REFERENCE_LOSSES: dict[str, type[Loss]] = {
+    "agrol_mlp": AGRoLLoss,
+    "agrol_diffusion": AGRoLLoss,
+    "avatar_poser": AvatarPoserLoss,
+}
+
+
+def reference(name: str, coordinates: World | None = None, seed: int = 0, **changes) -> WindowModel:
+    """A tiny reference network with random weights, in evaluation mode."""
+    torch.manual_seed(seed)
+    return REFERENCES[name](frame(coordinates), **changes).eval()

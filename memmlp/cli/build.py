@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from memmlp.cli.schema import Config, check
 from memmlp.errors import InputError
 from memmlp.features import Heading, HeadRelative, World
 from memmlp.ik import IK, LBFGS, NoIK
+from memmlp.losses import Loss, MotionLoss
 from memmlp.memory import Memory
 from memmlp.runs import Run
 from memmlp.tracking import Tracker
@@ -49,8 +51,7 @@ def build_experiment(cfg: DictConfig) -> pipeline.Experiment:
         vqvae_config={"frame": config["frame"], "vqvae": config["vqvae"]},
         vqvae_optim=build_vqvae_optim(cfg),
         vqvae_seed=0,
-        weighting=instantiate(cfg.loss),
-        hand=instantiate(cfg.hand),
+        loss=build_loss(cfg),
         rollout=instantiate(cfg.rollout),
         optim=Optim(**config["optim"]),
         modes=list(cfg.evaluation.modes),
@@ -76,21 +77,35 @@ def device(name: str) -> torch.device:
 
 
 def build_architecture(cfg: DictConfig) -> pipeline.Architecture:
-    """The network of a checked config."""
+    """What builds the network of a checked config."""
+    space = {"coordinates": COORDINATES[cfg.frame.coordinates](), "normalize": cfg.frame.normalize}
     vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in pipeline.VQVAE_SETTINGS})
+    if "_target_" in cfg.model:
+        return pipeline.ReferenceArchitecture(**space, vqvae=vqvae, network=instantiate(cfg.model))
     memory, kind = instantiate(cfg.memory, _convert_="all"), memory_class(cfg)
-    return pipeline.Architecture(
-        coordinates=COORDINATES[cfg.frame.coordinates](),
-        normalize=cfg.frame.normalize,
+    return pipeline.MemMLPArchitecture(
+        **space,
+        vqvae=vqvae,
         frames=cfg.model.frames,
         hidden=cfg.model.width,
         depth=cfg.model.depth,
-        vqvae=vqvae,
         memory=partial(memory, vqvae=vqvae) if kind.trains_codes else memory,
-        uses_codes=kind.uses_codes,
-        trains_codes=kind.trains_codes,
+        memory_kind=kind,
         predictor=instantiate(cfg.predictor),
     )
+
+
+def memory_class(cfg: DictConfig) -> type[Memory]:
+    """The class in the memory slot."""
+    return get_class(cfg.memory._target_)
+
+
+def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
+    """What makes the loss over a network's branches: of Mem-MLP weighting and hand term, else as it is."""
+    loss = instantiate(cfg.loss)
+    if isinstance(loss, Loss):
+        return lambda branches: loss
+    return partial(MotionLoss, loss, instantiate(cfg.hand))
 
 
 def build_ik(cfg: DictConfig) -> IK:
@@ -98,11 +113,6 @@ def build_ik(cfg: DictConfig) -> IK:
     if cfg.evaluation.get("ik", "off") == "off":
         return NoIK()
     return LBFGS(cfg.evaluation.ik_iterations)
-
-
-def memory_class(cfg: DictConfig) -> type[Memory]:
-    """The class in the memory slot."""
-    return get_class(cfg.memory._target_)
 
 
 def build_vqvae_optim(cfg: DictConfig) -> Optim:
@@ -122,7 +132,7 @@ def build_vqvae_optim(cfg: DictConfig) -> Optim:
 
 
 def config_of(run: Run) -> DictConfig:
-    """The typed config of a finished Mem-MLP run. Raises InputError where it is none of ours."""
+    """The typed config of a finished run of a motion network. Raises InputError where it is none of ours."""
     if not run.done or run.manifest.get("kind") != "memmlp":
         raise InputError(f"run {run.id}: not a finished Mem-MLP run")
     cfg = OmegaConf.create(run.config)

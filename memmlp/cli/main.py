@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import importlib
 import os
 import sys
@@ -38,6 +39,18 @@ COMMANDS = {
     "export": Command("export", "export", "ONNX file of a finished run."),
     "bench": Command("bench", "bench", "Measure this machine: preparation, streaming."),
 }
+
+
+REFUSED = {
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.ENOENT,
+    errno.ENAMETOOLONG,
+}
+"""What the system says of a path that a person gave; other errors (a full disk) end a run that began."""
 
 
 class Commands(click.Group):
@@ -110,6 +123,8 @@ def _exit_code(error: Exception) -> int | None:
         return 130
     if isinstance(error, click.ClickException):
         return error.exit_code
+    if isinstance(error, OSError) and error.strerror:
+        return 2 if error.errno in REFUSED else 1
     return {InputError: 2, TrainingDiverged: 1}.get(type(error))
 
 
@@ -120,6 +135,8 @@ def _line(error: Exception) -> str:
     if isinstance(error, click.UsageError):
         path = error.ctx.command_path if error.ctx else "memmlp"
         return f"{error.format_message()} (see {path} --help)"
+    if isinstance(error, OSError):
+        return f"{error.filename or 'a file'}: {error.strerror}"
     return error.format_message() if isinstance(error, click.ClickException) else str(error)
 
 

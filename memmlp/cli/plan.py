@@ -55,7 +55,7 @@ def planned(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
     and key, where a config is wrong.
     """
     path = sweep_folder(sweep, outputs) / "planned.json"
-    stamp = _stamp(sweep)
+    stamp = _stamp(sweep, outputs)
     kept = read_json(path)
     if kept.get("stamp") == stamp and all(_fresh(data) for data in kept["data"]):
         return Plan.load(path.with_name("plan.json"))
@@ -150,12 +150,12 @@ def _fresh(data: dict[str, Any]) -> bool:
         return False
 
 
-def _stamp(sweep: Sweep) -> str:
-    """Digest of all that a plan follows from but the data: sweep, configs, the code that reads them."""
+def _stamp(sweep: Sweep, outputs: Path) -> str:
+    """Digest of all that a plan follows from but the data: sweep, outputs, configs, what reads them."""
     here = Path(__file__).parent
     files = [*shipped("conf").rglob("*.yaml"), *(here / f"{name}.py" for name in CODE)]
     texts = [(file.name, file.read_text(encoding="utf-8")) for file in sorted(files)]
-    return digest([RECIPE, asdict(sweep), texts])
+    return digest([RECIPE, asdict(sweep), str(outputs), texts])
 
 
 def _remember(sweep: Sweep, plan: Plan, path: Path) -> None:

@@ -134,10 +134,11 @@ def _number(results: Mapping[str, Any], path: tuple[str, ...]) -> str:
 
 def _age(run: Run) -> str:
     """Time since the start."""
-    started = run.manifest.get("started")
-    if not started:
+    try:
+        started = datetime.fromisoformat(run.manifest.get("started", ""))
+        seconds = (datetime.now(UTC) - started).total_seconds()
+    except (TypeError, ValueError):
         return "-"
-    seconds = (datetime.now(UTC) - datetime.fromisoformat(started)).total_seconds()
     for unit, size in (("d", 86400), ("h", 3600), ("min", 60)):
         if seconds >= size:
             return f"{int(seconds // size)} {unit}"

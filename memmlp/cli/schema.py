@@ -171,6 +171,12 @@ class Profile:
     code_lr: float = positive()
     evaluation_batch: int = at_least(1)
     latency_steps: int = at_least(1)
+    memory_shift: str = one_of("frame", "window")
+    memory_history: str = one_of("first", "latest")
+    agrol_frames: int = at_least(2)
+    avatar_poser_frames: int = at_least(2)
+    avatar_poser_width: int = at_least(1)
+    avatar_poser_feedforward: int = at_least(1)
 
 
 @dataclass
@@ -254,6 +260,36 @@ class Model:
     frames: int = at_least(2)
     width: int = at_least(1)
     depth: int = at_least(1)
+
+
+@dataclass
+class Reference(Model):
+    """A network without slots: it leaves memory, predictor and hand empty."""
+
+    _target_: str = MISSING
+    _partial_: bool = True
+
+
+@dataclass
+class AGRoLMLP(Reference):
+    _target_: str = target("memmlp.reference.agrol.AGRoLMLP")
+
+
+@dataclass
+class AGRoLDiffusion(Reference):
+    _target_: str = target("memmlp.reference.agrol.AGRoLDiffusion")
+    width: int = at_least(2)
+    diffusion_steps: int = at_least(1)
+    sampling_steps: int = at_least(1)
+    noise_seed: int = at_least(0)
+
+
+@dataclass
+class AvatarPoser(Reference):
+    _target_: str = target("memmlp.reference.avatar_poser.AvatarPoser")
+    heads: int = at_least(1)
+    feedforward: int = at_least(1)
+    dropout: float = fraction()
 
 
 @dataclass
@@ -393,6 +429,24 @@ class Manual(Loss):
 
 
 @dataclass
+class ReferenceLoss(Loss):
+    """A whole loss, where the others are weights of Mem-MLP's terms."""
+
+
+@dataclass
+class AGRoLLoss(ReferenceLoss):
+    _target_: str = target("memmlp.losses.AGRoLLoss")
+
+
+@dataclass
+class AvatarPoserLoss(ReferenceLoss):
+    _target_: str = target("memmlp.losses.AvatarPoserLoss")
+    orientation: float = at_least(0)
+    rotation: float = at_least(0)
+    position: float = at_least(0)
+
+
+@dataclass
 class Hand:
     _target_: str = MISSING
 
@@ -472,12 +526,12 @@ class Config:
     data: Data = field(default_factory=Data)
     frame: Frame = field(default_factory=Frame)
     model: Model = field(default_factory=Model)
-    memory: Memory = field(default_factory=Memory)
-    predictor: Predictor = field(default_factory=Predictor)
+    memory: Optional[Memory] = None
+    predictor: Optional[Predictor] = None
     vqvae: VQVAE = field(default_factory=VQVAE)
     rollout: Rollout = field(default_factory=Rollout)
     loss: Loss = field(default_factory=Loss)
-    hand: Hand = field(default_factory=Hand)
+    hand: Optional[Hand] = None
     optim: Optim = field(default_factory=Optim)
     evaluation: Evaluation = field(default_factory=Evaluation)
     export: Export = field(default_factory=Export)
@@ -493,6 +547,9 @@ SCHEMAS: dict[str, type] = {
     "data_subsets": SubsetData,
     "frame": Frame,
     "model": Model,
+    "model_agrol_mlp": AGRoLMLP,
+    "model_agrol_diffusion": AGRoLDiffusion,
+    "model_avatar_poser": AvatarPoser,
     "predictor_two_branch": TwoBranch,
     "predictor_two_branch_memory": TwoBranchMemory,
     "predictor_rotation_only": RotationOnly,
@@ -509,6 +566,8 @@ SCHEMAS: dict[str, type] = {
     "rollout_streams": Streams,
     "loss_uncertainty": Uncertainty,
     "loss_manual": Manual,
+    "loss_agrol": AGRoLLoss,
+    "loss_avatar_poser": AvatarPoserLoss,
     "hand_position": HandPosition,
     "hand_fk": HandFK,
     "hand_off": NoHand,
@@ -580,11 +639,57 @@ def _show(value: Any) -> str:
 
 def _check_combinations(cfg: DictConfig) -> None:
     """What no key alone can tell."""
+    if cfg.optim.final_lr > cfg.optim.lr:
+        raise InputError(f"optim.final_lr={cfg.optim.final_lr}: allowed is at most optim.lr={cfg.optim.lr}")
+    if _is(cfg.model, Reference):
+        _check_reference(cfg)
+    else:
+        _check_slots(cfg)
+    split = cfg.data.split
+    held_out = split.val + (split.test if isinstance(split.get("test"), float) else 0)
+    if held_out >= 1:
+        raise InputError(f"data.split.val={split.val}: allowed is less than what data.split.test leaves of 1")
+
+
+def _is(node: DictConfig, schema: type) -> bool:
+    """Whether a group's option is of a schema."""
+    kind = OmegaConf.get_type(node)
+    return kind is not None and issubclass(kind, schema)
+
+
+def _check_reference(cfg: DictConfig) -> None:
+    """A network without slots, a history of its own or positions has nothing set that is about them."""
+    name = cfg.model._target_.rsplit(".", 1)[-1]
+    for group in ("memory", "predictor", "hand"):
+        if cfg[group] is not None:
+            raise InputError(f"{group}: {name} has none; allowed is a command line without {group}=...")
+    if not _is(cfg.loss, ReferenceLoss):
+        raise InputError(f"loss: weights of Mem-MLP's terms, which {name} has not; allowed is its own loss")
+    if not _is(cfg.rollout, TeacherForcing):
+        raise InputError(f"rollout: {name} has no history of its own; allowed is rollout=teacher_forcing")
+    if cfg.evaluation.ik != "off":
+        raise InputError(
+            f"evaluation.ik={cfg.evaluation.ik} needs positions, and {name} has rotations alone: "
+            "allowed is evaluation.ik=off"
+        )
+    if cfg.model.width % cfg.model.get("heads", 1):
+        raise InputError(
+            f"model.heads={cfg.model.heads}: allowed is a divisor of model.width={cfg.model.width}"
+        )
+    steps = cfg.model.get("diffusion_steps", 1)
+    if cfg.model.get("sampling_steps", 1) > steps:
+        raise InputError(
+            f"model.sampling_steps={cfg.model.sampling_steps}: allowed is up to model.diffusion_steps={steps}"
+        )
+
+
+def _check_slots(cfg: DictConfig) -> None:
+    """What stands in Mem-MLP's slots goes together."""
     layers = list(cfg.memory.get("layers", []))
     if layers and max(layers) > cfg.model.depth:
         raise InputError(f"memory.layers={layers}: allowed is up to model.depth={cfg.model.depth}")
-    if cfg.optim.final_lr > cfg.optim.lr:
-        raise InputError(f"optim.final_lr={cfg.optim.final_lr}: allowed is at most optim.lr={cfg.optim.lr}")
+    if _is(cfg.loss, ReferenceLoss):
+        raise InputError("loss: that of a reference network; allowed is loss=uncertainty or loss=manual")
     predictor = cfg.predictor._target_.rsplit(".", 1)[-1]
     if cfg.hand._target_.endswith("HandPosition") and predictor.startswith("RotationOnly"):
         raise InputError(
@@ -604,7 +709,3 @@ def _check_combinations(cfg: DictConfig) -> None:
         raise InputError(
             f"rollout.streams={cfg.rollout.streams}: allowed is at least optim.batch={cfg.optim.batch}"
         )
-    split = cfg.data.split
-    held_out = split.val + (split.test if isinstance(split.get("test"), float) else 0)
-    if held_out >= 1:
-        raise InputError(f"data.split.val={split.val}: allowed is less than what data.split.test leaves of 1")

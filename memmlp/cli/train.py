@@ -177,7 +177,7 @@ def _collecting(
     def task(cfg: DictConfig) -> None:
         try:
             job(cfg)
-        except (InputError, TrainingDiverged) as failure:
+        except (InputError, TrainingDiverged, OSError) as failure:
             failures.append(failure)
 
     return task

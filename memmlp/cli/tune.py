@@ -46,15 +46,13 @@ def tune(
         show(setup)
         return
     setup.folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(setup.folder / ".lock")
     try:
-        lock.acquire(timeout=0)
+        with FileLock(setup.folder / ".lock", timeout=0):
+            study = Study.own(setup.search, setup.folder.name, setup.folder)
+            search(setup, study, engine, options, workers or os.cpu_count() or 1)
+            leave(setup, study)
     except Timeout:
         raise InputError(f"search {setup.folder.name}: another process is at it; --status shows it") from None
-    with lock:
-        study = Study.own(setup.search, setup.folder.name, setup.folder)
-        search(setup, study, engine, options, workers or os.cpu_count() or 1)
-        leave(setup, study)
     summary(setup, study)
 
 
@@ -95,12 +93,19 @@ def _search_config(words: Sequence[str], config_dir: Path | None) -> dict[str, A
     """The composed config of the search alone."""
     from memmlp.cli.train import composed_plain
 
-    return composed_plain("tune", words, config_dir)["search"]
+    found = composed_plain("tune", words, config_dir).get("search")
+    if not isinstance(found, dict):
+        raise InputError("search: has no value; allowed is the name of a file in conf/search")
+    return found
 
 
 def _check_space(setup: Setup) -> str:
     """Refuse a range with a value that the config refuses; the id of the first trial's run."""
     space = setup.search.space
+    for word in setup.words:
+        if word.partition("=")[0].lstrip("+") in {one.key for one in space}:
+            raise InputError(f"{word}: is searched; leave it out of the space with search.space....=null")
+    _tasks(setup, {}, prepare=False)
     most = max(len(one.corners()) for one in space)
     for number in range(most):
         corner = {one.key: one.corners()[number % len(one.corners())] for one in space}
@@ -154,7 +159,8 @@ def leave(setup: Setup, study: Study) -> None:
     from memmlp.search import results
 
     results.write_trials(study, setup.folder / "trials.csv")
-    results.write_experiments(study, setup.folder)
+    groups = [path.name for path in shipped("conf").iterdir() if path.is_dir()]
+    results.write_experiments(study, setup.folder, groups)
     table = f"table{results.TABLE:02d}.yaml"
     results.write_table(study, shipped("sweeps") / table, setup.folder / table)
     results.write_plots(study, setup.folder)
@@ -183,3 +189,9 @@ def summary(setup: Setup, study: Study) -> None:
     if best:
         words = " ".join(setup.words)
         click.echo(f"next: memmlp train --config-dir {setup.folder} experiment=best {words}".rstrip())
+    else:
+        reasons = [trial.user_attrs["reason"] for trial in study.trials if "reason" in trial.user_attrs]
+        click.echo(
+            f"no trial is complete; the last failure: {(reasons or ['errors that are no numbers'])[-1]}"
+        )
+        raise SystemExit(1)

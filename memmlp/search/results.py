@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from optuna.exceptions import ExperimentalWarning
 from optuna.trial import FrozenTrial, TrialState
 
 from memmlp.files import atomic_write
-from memmlp.search.spec import Search, word
+from memmlp.search.spec import Search
 from memmlp.search.study import Study, values
 
 TABLE = 5  # of the paper: manual weights against learned ones
@@ -37,41 +37,43 @@ def write_trials(study: Study, path: Path) -> None:
     atomic_write(path, text.getvalue())
 
 
-def write_experiments(study: Study, folder: Path) -> list[Path]:
-    """The best trial as best.yaml, and each one of a Pareto front as trial-N.yaml; the files, best first."""
+def write_experiments(study: Study, folder: Path, groups: Collection[str]) -> list[Path]:
+    """The best trial as best.yaml, and each one of a Pareto front as trial-N.yaml; the files, best first.
+
+    groups: names of the config groups, whose values are options.
+    """
     (folder / "experiment").mkdir(parents=True, exist_ok=True)
     best = study.best()
     files = [folder / "experiment" / f"trial-{trial.number}.yaml" for trial in best[1:]]
     files = [folder / "experiment" / "best.yaml", *files] if best else []
     for path, trial in zip(files, best, strict=True):
-        atomic_write(path, experiment(study, trial))
+        atomic_write(path, experiment(study, trial, groups))
     return files
 
 
-def experiment(study: Study, trial: FrozenTrial) -> str:
+def experiment(study: Study, trial: FrozenTrial, groups: Collection[str]) -> str:
     """A trial as a file of the config group `experiment`."""
     search = study.search
     tree: dict[str, Any] = {}
-    groups: list[dict[str, str]] = []
-    for key, value in _words(search, trial):
-        if "." in key:
-            _put(tree, key.split("."), value)
+    options: list[dict[str, str]] = []
+    for key, text in _words(search, trial):
+        if key in groups:
+            options.append({f"override /{key}": text})
         else:
-            groups.append({f"override /{key}": value})
+            _put(tree, key.split("."), yaml.safe_load(text))
     head = (
         f"# @package _global_\n# Trial {trial.number} of {len(study.trials)} of the search {search.name}: "
         f"{', '.join(o.text for o in search.objectives)} on validation "
         f"{', '.join(f'{value:.4f}' for value in trial.values)}; run {trial.user_attrs.get('run')}.\n"
     )
-    return head + yaml.safe_dump({"defaults": [*groups, "_self_"], **tree}, sort_keys=False)
+    return head + yaml.safe_dump({"defaults": [*options, "_self_"], **tree}, sort_keys=False)
 
 
-def _words(search: Search, trial: FrozenTrial) -> Iterator[tuple[str, Any]]:
-    """The keys and values of the search's base and of the trial."""
-    for override in search.base:
+def _words(search: Search, trial: FrozenTrial) -> Iterator[tuple[str, str]]:
+    """The keys of the search's base and of the trial, with their values as they are typed."""
+    for override in (*search.base, *search.overrides(values(trial, search))):
         key, _, value = override.partition("=")
-        yield key.lstrip("+"), yaml.safe_load(value)
-    yield from values(trial, search).items()
+        yield key.lstrip("+"), value
 
 
 def _put(tree: dict[str, Any], keys: Sequence[str], value: Any) -> None:
@@ -86,8 +88,7 @@ def write_table(study: Study, shipped: Path, path: Path) -> bool:
     if not best or not all(one.key.startswith("loss.") for one in study.search.space):
         return False
     content = yaml.safe_load(shipped.read_text(encoding="utf-8"))
-    found = values(best[0], study.search)
-    overrides = [*study.search.base, *(f"{key}={word(value)}" for key, value in found.items())]
+    overrides = [*study.search.base, *study.search.overrides(values(best[0], study.search))]
     content["arms"] = {"manual, searched": {"overrides": overrides}, **content["arms"]}
     atomic_write(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
     return True

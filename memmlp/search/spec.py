@@ -20,6 +20,7 @@ storage: null                       # a journal beside the search's results, or 
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,6 +32,10 @@ from memmlp.units import UNITS
 SAMPLERS = ("tpe", "random")
 PRUNERS = ("median", "none")
 BRANCHES = ("rotation", "position")
+KEYS = (
+    "name", "base", "space", "objectives", "n_trials", "sampler", "startup", "seed", "pruner", "prune_after",
+    "storage",
+)  # fmt: skip
 RANGE_KEYS = ("low", "high", "log", "step", "choices", "first")
 
 Value = float | int | str | bool | None
@@ -117,6 +122,12 @@ def word(value: Value) -> str:
 
 def parse_search(content: Mapping[str, Any]) -> Search:
     """The search of a config. Raises InputError, naming the key."""
+    for key in content:
+        if key not in KEYS:
+            raise InputError(f"search.{key}: no such key; allowed are {', '.join(KEYS)}")
+    for key in KEYS:
+        if key not in content:
+            raise InputError(f"search.{key}: has no value; give one with search.{key}=...")
     space = tuple(_ranges(content["space"], ""))
     if not space:
         raise InputError("search.space: empty; allowed are config keys with low and high, or with choices")
@@ -128,8 +139,13 @@ def parse_search(content: Mapping[str, Any]) -> Search:
     if len(objectives) > 1 and content["pruner"] != "none":
         raise InputError(f"search.pruner={content['pruner']}: allowed with two objectives is none")
     name = str(content["name"])
-    if not re.fullmatch(r"[\w-]+", name):
-        raise InputError(f"search.name={name}: allowed are letters, digits, - and _")
+    if not re.fullmatch(r"[\w-]{1,64}", name):
+        raise InputError(f"search.name={name}: allowed are up to 64 letters, digits, - and _")
+    storage = content["storage"]
+    if storage is not None and not isinstance(storage, str):
+        raise InputError(f"search.storage={storage}: allowed is a URL, or null")
+    if len({objective.text for objective in objectives}) < len(objectives):
+        raise InputError("search.objectives: twice the same; allowed are two different ones")
     return Search(
         name=name,
         base=tuple(_texts(content["base"], "search.base")),
@@ -141,7 +157,7 @@ def parse_search(content: Mapping[str, Any]) -> Search:
         seed=_whole(content, "seed", 0),
         pruner=_one_of(content, "pruner", PRUNERS),
         prune_after=_whole(content, "prune_after", 1),
-        storage=content["storage"],
+        storage=storage,
     )
 
 
@@ -171,24 +187,39 @@ def _range(key: str, node: Mapping[str, Any], where: str) -> Range:
 
 def _choices(key: str, node: Mapping[str, Any], where: str) -> Range:
     choices = node["choices"]
+    if isinstance(choices, list):
+        choices = [_listed(item) if isinstance(item, list) else item for item in choices]
     plain = isinstance(choices, Sequence) and all(isinstance(item, int | float | str) for item in choices)
-    if isinstance(choices, str) or not plain or len(choices) < 2:
-        raise InputError(f"{where}.choices: allowed is a list of at least two values")
+    if isinstance(choices, str) or not plain or len(set(choices)) < max(len(choices), 2):
+        raise InputError(f"{where}.choices: allowed is a list of at least two values, each once")
     for other in set(node) - {"choices", "first"}:
         raise InputError(f"{where}.{other}: does not go with choices")
     return Range(key, choices=tuple(choices), first=node.get("first"))
 
 
+def _listed(items: list[Any]) -> str:
+    """A list among choices, as an override has it."""
+    return f"[{','.join(word(item) for item in items)}]"
+
+
 def _interval(key: str, node: Mapping[str, Any], where: str) -> Range:
     low, high = (_number(node.get(end), f"{where}.{end}") for end in ("low", "high"))
-    log, step = bool(node.get("log", False)), node.get("step")
+    log, step, first = node.get("log", False), node.get("step"), node.get("first")
+    if not isinstance(log, bool):
+        raise InputError(f"{where}.log={log}: allowed is true or false")
     if low >= high:
         raise InputError(f"{where}.high={high}: allowed is more than low={low}")
     if log and low <= 0:
         raise InputError(f"{where}.low={low}: allowed with log is above 0")
     if step is not None and (log or _number(step, f"{where}.step") <= 0):
         raise InputError(f"{where}.step={step}: allowed is a number above 0, without log")
-    return Range(key, low, high, log, step, first=node.get("first"))
+    if step is not None and isinstance(low, int) and isinstance(high, int) and not isinstance(step, int):
+        raise InputError(f"{where}.step={step}: allowed is a whole number, as low and high are")
+    if step is not None and step > high - low:
+        raise InputError(f"{where}.step={step}: allowed is at most high - low")
+    if step is not None and first is not None and abs((first - low) / step % 1 - 0.5) < 0.5 - 1e-9:
+        raise InputError(f"{where}.first={first}: allowed is low or some steps above it")
+    return Range(key, low, high, log, step, first=first)
 
 
 def _objective(text: str) -> Objective:
@@ -199,7 +230,7 @@ def _objective(text: str) -> Objective:
 
 def _term(part: str, text: str) -> tuple[float, str]:
     """Weight and metric of a term; the rotation branch where none is named."""
-    match = re.fullmatch(r"(?:([\d.eE-]+)\s*\*\s*)?(?:(\w+)\s+)??(\w+(?: PE)?)", part)
+    match = re.fullmatch(r"(?:(\d+\.?\d*(?:[eE][+-]?\d+)?)\s*\*\s*)?(?:(\w+)\s+)??(\w+(?: PE)?)", part)
     branch, metric = (match[2] or BRANCHES[0], match[3]) if match else ("", "")
     if match is None or metric not in UNITS or branch not in BRANCHES:
         names = ", ".join(UNITS)
@@ -207,7 +238,10 @@ def _term(part: str, text: str) -> tuple[float, str]:
             f"search.objectives: '{text}'; allowed is a sum of [WEIGHT*][{' or '.join(BRANCHES)}] METRIC "
             f"with a metric of {names}"
         )
-    return float(match[1] or 1), f"{branch} {metric}"
+    weight = float(match[1] or 1)
+    if not 0 < weight < math.inf:
+        raise InputError(f"search.objectives: '{text}'; allowed are weights above 0")
+    return weight, f"{branch} {metric}"
 
 
 def _number(value: Any, name: str) -> float | int:

@@ -27,6 +27,9 @@ from memmlp.search.spec import Range, Search, Value
 ENDED = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
 
 
+BEGINNING = b'{"op_code":'  # of every line of a journal
+
+
 class Study:
     """A search's trials, in a storage that survives its owner."""
 
@@ -138,9 +141,14 @@ def storage(search: Search, folder: Path) -> BaseStorage:
         except Exception as error:
             reason = " ".join(str(error).split())[:200]
             raise InputError(f"search.storage={search.storage}: {reason}") from None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ExperimentalWarning)
-        return JournalStorage(JournalFileBackend(str(journal(folder))))
+    path = journal(folder)
+    check_journal(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ExperimentalWarning)
+            return JournalStorage(JournalFileBackend(str(path)))
+    except (ValueError, KeyError, TypeError) as error:
+        raise _damaged(path, error) from None
 
 
 def journal(folder: Path) -> Path:
@@ -153,6 +161,7 @@ def mend(path: Path) -> None:
 
     Optuna takes a line appended to a torn one for damage, and waits half a minute for a dead owner's lock.
     """
+    check_journal(path)
     for left in path.parent.glob(f"{path.name}.lock*"):
         left.unlink(missing_ok=True)
     if path.exists():
@@ -161,6 +170,19 @@ def mend(path: Path) -> None:
         if whole < len(content):
             os.truncate(path, whole)
             sync_folder(path.parent)
+
+
+def check_journal(path: Path) -> None:
+    """Refuse a file that is no journal, which Optuna would take for an empty one. Raises InputError."""
+    if path.exists():
+        with open(path, "rb") as file:
+            begins = file.read(len(BEGINNING))
+        if not BEGINNING.startswith(begins):
+            raise _damaged(path, "it does not begin like one")
+
+
+def _damaged(path: Path, reason: object) -> InputError:
+    return InputError(f"{path}: not a journal of Optuna's ({reason}); move it away to begin the search anew")
 
 
 def sampler(search: Search, number: int) -> optuna.samplers.BaseSampler:

@@ -30,8 +30,8 @@ from memmlp.units import UNITS
 BRANCHES = ("rotation", "position", "combined")
 KEYS = ("title", "table", "notes", "base", "seeds", "reference", "metrics", "arms", "axes")
 ARM_KEYS = ("overrides", "branch", "paper", "note")
-COSTS = ("FLOPs", "parameters", "size", "ms", "FPS")
-"""Columns of the paper's tables that are no errors: GFLOP, millions, MB, ms, frames a second."""
+COSTS = ("FLOPs", "MACs", "parameters", "size", "ms", "FPS")
+"""Columns of the paper's tables that are no errors: GFLOP, GMAC, millions, MB, ms, frames a second."""
 
 
 @dataclass(frozen=True)
@@ -112,10 +112,23 @@ class Sweep:
         ]
 
 
+class UniqueKeys(yaml.SafeLoader):
+    """Safe YAML in which no mapping has a key twice: plain YAML lets the last one win without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """The mapping. Raises ConstructorError for a key that is there twice."""
+        seen = set()
+        for key, _ in node.value:
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' twice", key.start_mark)
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
 def load_sweep(path: Path) -> Sweep:
     """Read a sweep file. Raises InputError, naming file and key."""
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml.load(path.read_text(encoding="utf-8"), UniqueKeys)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -177,10 +190,13 @@ def _grid(arms: Sequence[Arm], axes: Mapping[str, Any]) -> Iterable[Arm]:
         if not isinstance(values, list) or not values:
             raise InputError(f"axes.{key}: allowed is a list of values, not empty")
     for arm in arms or [Arm("")]:
+        if arm.overrides is None:
+            yield arm
+            continue
         for values in itertools.product(*axes.values()):
             words = [f"{key}={_word(value)}" for key, value in zip(axes, values, strict=True)]
             label = ", ".join([arm.label, *words] if arm.label else words)
-            yield replace(arm, label=label, overrides=(*(arm.overrides or ()), *words))
+            yield replace(arm, label=label, overrides=(*arm.overrides, *words))
 
 
 def _word(value: Any) -> str:
@@ -212,6 +228,9 @@ def _labelled(value: Any) -> dict[str, Any]:
     arms = {str(label): arm for label, arm in _mapping(value, "arms").items()}
     if len(arms) < len(value):
         raise InputError("arms: two have the same label")
+    for label in arms:
+        if not label.isprintable():
+            raise InputError(f"arms: {label!r}; allowed is a label of one line")
     return arms
 
 
@@ -221,7 +240,7 @@ def _overrides(value: Any, name: str) -> list[str]:
     for word in words:
         if not re.match(r"[+~]*[\w./@]+(=|$)", word):
             raise InputError(f"{name}: '{word}'; allowed is KEY=VALUE or GROUP=OPTION")
-        if re.match(r"seed=", word):
+        if re.match(r"[+~]*seed(=|$)", word):
             raise InputError(f"{name}: '{word}'; the seeds are set by the key seeds")
     return words
 
@@ -255,6 +274,8 @@ def _seeds(value: Any, name: str) -> tuple[int, ...]:
 
 def _metrics(value: Any) -> tuple[str, ...]:
     names = _texts(value, "metrics")
+    if not names:
+        raise InputError("metrics: empty; allowed is at least one")
     for name in names:
         if name not in UNITS and name not in COSTS:
             raise InputError(f"metrics: '{name}'; allowed are {', '.join([*UNITS, *COSTS])}")

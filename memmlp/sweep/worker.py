@@ -77,9 +77,9 @@ def _perform(plan: Plan, task: Task, run: Run, perform: Perform) -> None:
 
 
 def deaths(run: Run) -> int:
-    """How many processes in a row began the run at the step where it still is."""
-    step, count = run.step, 0
-    for begun in reversed(run.manifest.get("attempts", [])):
+    """How many processes in a row, since a retry, began the run at the step where it still is."""
+    step, count, manifest = run.step, 0, run.manifest
+    for begun in reversed(manifest.get("attempts", [])[manifest.get("forgiven", 0) :]):
         if begun.get("step") != step:
             break
         count += 1

@@ -7,10 +7,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from memmlp.sweep.spec import COSTS
-from memmlp.tables.collect import Cell, Effect, Row, Table
+from memmlp.tables.collect import Cell, Row, Table
 from memmlp.units import UNITS
 
-COST_UNITS = {"FLOPs": "G", "parameters": "M", "size": "MB", "ms": "", "FPS": ""}
+COST_UNITS = {"FLOPs": "G", "MACs": "G", "parameters": "M", "size": "MB", "ms": "", "FPS": ""}
 MISSING = "-"
 MINUS = "\N{MINUS SIGN}"
 
@@ -96,7 +96,7 @@ def _lines(table: Table, row: Row, mode: str) -> Iterable[Line]:
     seeds = f"{len(row.found)}/{len(row.wanted)}"
     yield Line("measured", (row.label, seeds), tuple((_value(cell, metric),) for cell, metric in cells))
     if any(cell.effect for cell, _ in cells):
-        effects = tuple(_effect(cell.effect, metric) for cell, metric in cells)
+        effects = tuple(_effect(cell, metric) for cell, metric in cells)
         yield Line("difference", ("", "diff."), effects)
     if any(cell.paper is not None for cell, _ in cells):
         yield Line("paper", ("", "paper"), paper)
@@ -112,16 +112,26 @@ def _value(cell: Cell, metric: str) -> str:
     return f"{cell.mean:.2f}{sd}"
 
 
-def _effect(effect: Effect | None, metric: str) -> tuple[str, ...]:
-    """The difference, starred where it is significant, and its interval."""
+def _effect(cell: Cell, metric: str) -> tuple[str, ...]:
+    """The difference, starred where it is significant, and its interval; of a cost the ratio."""
+    effect = cell.effect
     if effect is None:
         return (MISSING,)
+    if metric in COSTS:
+        return _signed(effect.mean, "+.3g"), *_ratio(cell.mean, effect.mean)
     if effect.low is None or effect.high is None:
-        return (_signed(effect.mean, "+.3g" if metric in COSTS else "+.2f"),)
+        return (_signed(effect.mean, "+.2f"),)
     places = _places(effect.high - effect.low)
     low, high = (_signed(number, f".{places}f") for number in (effect.low, effect.high))
     star = "*" if effect.significant else ""
     return _signed(effect.mean, f"+.{places}f") + star, f"[{low}, {high}]"
+
+
+def _ratio(value: float | None, difference: float) -> tuple[str, ...]:
+    """How many times the reference's a cost is that differs from it by so much."""
+    if value is None or value == difference:
+        return ()
+    return (f"(x {value / (value - difference):.3g})",)
 
 
 def _signed(number: float, form: str) -> str:
@@ -143,4 +153,5 @@ def _paper(cell: Cell, metric: str) -> str:
     if cell.paper_effect is None:
         return value
     mark = {None: "", True: " ✓", False: " ✗"}[cell.agrees]
-    return f"{value} ({_signed(cell.paper_effect, f'+.{places}f')}{mark})"
+    ratio = "".join(f" {words}" for words in _ratio(cell.paper, cell.paper_effect)) if metric in COSTS else ""
+    return f"{value} ({_signed(cell.paper_effect, f'+.{places}f')}{mark}){ratio}"

@@ -38,7 +38,7 @@ class Measured:
     Attributes:
         run: where they lie.
         means: the metrics' means over the test clips. clips: those of each clip by its name.
-        costs: GFLOP and ms of a streaming step, millions of parameters, MB of the ONNX file, frames a second.
+        costs: GFLOP, GMAC and ms of a streaming step, millions of parameters, MB of ONNX, frames a second.
         origin: what the run was made from.
     """
 
@@ -64,8 +64,11 @@ def load(folder: Path) -> Measured:
     """Read a finished run. Raises InputError, naming the file that is damaged."""
     run = Run(folder)
     results, manifest = _read(run.results_path, dict), _read(run.manifest_path, dict)
-    clips = {clip["name"]: clip for clip in _read(run.clips, list)}
-    return Measured(run, results, clips, _costs(results.get("latency", {})), _origin(manifest))
+    clips = _read(run.clips, list)
+    if not all(isinstance(clip, dict) and "name" in clip for clip in clips):
+        raise _unreadable(run.clips)
+    named = {clip["name"]: clip for clip in clips}
+    return Measured(run, results, named, _costs(results.get("latency", {})), _origin(manifest))
 
 
 def _read(path: Path, kind: type) -> Any:
@@ -74,18 +77,27 @@ def _read(path: Path, kind: type) -> Any:
     except (OSError, ValueError):
         content = None
     if not isinstance(content, kind):
-        raise InputError(f"{path}: cannot be read; do the run again with force=true, or remove its folder")
+        raise _unreadable(path)
     return content
+
+
+def _unreadable(path: Path) -> InputError:
+    return InputError(f"{path}: cannot be read; do the run again with force=true, or remove its folder")
 
 
 def _costs(latency: Mapping[str, float]) -> dict[str, float]:
     """The costs that the measurement has, in the tables' units."""
+
+    def of(name: str) -> float:
+        return float(latency.get(name, np.nan))
+
     costs = {
-        "FLOPs": latency.get("flops", np.nan) / 1e9,
-        "parameters": latency.get("parameters", np.nan) / 1e6,
-        "size": latency.get("onnx_bytes", np.nan) / 1e6,
-        "ms": latency.get("median_ms", np.nan),
-        "FPS": 1000 / latency.get("median_ms", np.nan),
+        "FLOPs": of("flops") / 1e9,
+        "MACs": of("macs") / 1e9,
+        "parameters": of("parameters") / 1e6,
+        "size": of("onnx_bytes") / 1e6,
+        "ms": of("median_ms"),
+        "FPS": 1000 / of("median_ms"),
     }
     return {name: float(cost) for name, cost in costs.items() if not np.isnan(cost)}
 

@@ -30,6 +30,8 @@ def needed(tmp_path: Path) -> dict[str, list[str]]:
         "data=amass_s2": [root],
         "data=amass_s3": [root],
         "predictor=rotation_only": ["hand=fk"],
+        "loss=agrol": ["model=agrol_mlp"],
+        "loss=avatar_poser": ["model=avatar_poser"],
         "predictor=rotation_only_memory": ["hand=fk"],
     }
 

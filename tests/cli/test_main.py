@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -96,7 +97,13 @@ def test_bad_usage_is_one_line(memmlp: Memmlp, arguments: list[str], words: list
 
 @pytest.mark.parametrize(
     ("error", "code"),
-    [(InputError("a\nb"), 2), (TrainingDiverged("a b"), 1), (KeyboardInterrupt(), 130)],
+    [
+        (InputError("a\nb"), 2),
+        (TrainingDiverged("a b"), 1),
+        (KeyboardInterrupt(), 130),
+        (NotADirectoryError(errno.ENOTDIR, "Not a directory", "/dev/null/runs"), 2),
+        (OSError(errno.ENOSPC, "No space left on device", "checkpoint.safetensors"), 1),
+    ],
 )
 def test_exit_codes(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int):
     failing(monkeypatch, error)

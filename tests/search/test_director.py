@@ -304,7 +304,7 @@ def test_two_objectives_give_a_front(tmp_path: Path):
     front = study.best()
     assert len(front) == 6  # Jitter is 20 less MPJPE here, so that none is better in both
     assert [trial.values[0] for trial in front] == sorted(trial.values[0] for trial in front)
-    files = results.write_experiments(study, tmp_path)
+    files = results.write_experiments(study, tmp_path, ["loss"])
     assert [file.name for file in files] == ["best.yaml", *(f"trial-{t.number}.yaml" for t in front[1:])]
     names = {path.name for path in results.write_plots(study, tmp_path)}
     assert names == {"pareto_front.png", "parallel_coordinate.png", "slice.png", "study.html"}
@@ -318,7 +318,7 @@ def test_what_a_search_leaves(tmp_path: Path):
         rows = list(csv.DictReader(file))
     assert [row["trial"] for row in rows] == list("012345")
     assert [float(row["MPJPE"]) for row in rows] == [trial.value for trial in study.trials]
-    (path,) = results.write_experiments(study, tmp_path)
+    (path,) = results.write_experiments(study, tmp_path, ["loss"])
     best = study.best()[0]
     content = yaml.safe_load(path.read_text())
     assert content["defaults"] == [{"override /loss": "manual"}, "_self_"]
@@ -367,3 +367,30 @@ def test_a_team_storage_and_a_bad_one(tmp_path: Path):
     assert not journal(tmp_path).exists()
     with pytest.raises(InputError, match=r"search\.storage=nonsense:"):
         opened(tmp_path, storage="nonsense://x")
+
+
+def test_a_best_trial_of_groups_lists_and_plain_keys_is_a_config(tmp_path: Path):
+    space = {"hand": {"choices": ["off", "fk"]}, "memory": {"layers": {"choices": [[2], [2, 4]]}}}
+    space |= {"seed": {"low": 3, "high": 9}}
+    study = opened(tmp_path, space=space, n_trials=1, base=[])
+    one = director(study, tmp_path)
+    run = begun(one.look(1))
+    log(run, STEPS, 1.0)
+    run.finish([])
+    one.look(1)
+    (path,) = results.write_experiments(study, tmp_path, ["hand", "memory"])
+    content = yaml.safe_load(path.read_text())
+    assert content["defaults"][0]["override /hand"] in ("off", "fk")
+    assert content["memory"]["layers"] in ([2], [2, 4])
+    assert content["seed"] in range(3, 10)
+
+
+@pytest.mark.parametrize(
+    "content", [b"x" * 5000, b"hello\nthis is no journal\n", b'{"op_code":0,"x":1}\ngarbage\n{}\n']
+)
+def test_what_is_no_journal_is_left_alone_and_named(tmp_path: Path, content: bytes):
+    journal(tmp_path).write_bytes(content)
+    for look in (opened, lambda folder: Study.view(search(), "mine", folder)):
+        with pytest.raises(InputError, match=r"study.journal: not a journal of Optuna's"):
+            look(tmp_path)
+    assert journal(tmp_path).read_bytes() == content

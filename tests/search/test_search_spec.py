@@ -103,9 +103,29 @@ def test_an_objective_that_is_not_validated_is_named():
         ({"pruner": "hyperband"}, "search.pruner=hyperband: allowed is median or none"),
         ({"prune_after": 0}, "search.prune_after=0"),
         ({"name": "a/b"}, "search.name=a/b"),
+        ({"name": "a" * 65}, "allowed are up to 64 letters"),
+        ({"storage": 5}, "search.storage=5: allowed is a URL"),
+        ({"nonsense": 3}, "search.nonsense: no such key; allowed are name, base"),
+        ({"objectives": ["1e*MPJPE"]}, "'1e*MPJPE'; allowed is a sum of"),
+        ({"objectives": ["0*MPJPE"]}, "allowed are weights above 0"),
+        ({"objectives": ["1e999*MPJPE"]}, "allowed are weights above 0"),
+        ({"objectives": ["MPJPE", "MPJPE"], "pruner": "none"}, "twice the same"),
+        ({"space": space(low=1.0, high=2.0, log="maybe")}, "optim.lr.log=maybe: allowed is true or false"),
+        ({"space": space(low=4, high=8, step=1.5)}, "optim.lr.step=1.5: allowed is a whole number"),
+        ({"space": space(low=4, high=8, step=100)}, "optim.lr.step=100: allowed is at most high - low"),
+        ({"space": space(low=4, high=8, step=2, first=5)}, "optim.lr.first=5: allowed is low or some steps"),
+        (
+            {"space": space(choices=[1, 1])},
+            "optim.lr.choices: allowed is a list of at least two values, each once",
+        ),
     ],
 )
 def test_what_is_wrong_is_named(changes: dict[str, Any], message: str):
     with pytest.raises(InputError) as caught:
         made(**changes)
     assert message in str(caught.value)
+
+
+def test_a_key_that_was_taken_away_is_named():
+    with pytest.raises(InputError, match=r"search\.n_trials: has no value"):
+        parse_search({key: value for key, value in GOOD.items() if key != "n_trials"})

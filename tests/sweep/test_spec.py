@@ -44,6 +44,9 @@ def test_axes_are_a_grid_over_every_arm():
     assert len(sweep.arms) == 4
     assert sweep.arms[1].label == "a, model.frames=11, memory.layers=[2,4]"
     assert sweep.arms[1].overrides == ("loss=manual", "model.frames=11", "memory.layers=[2,4]")
+    printed = parse_sweep("s", {"arms": {"theirs": {"overrides": None}, "a": []}, "axes": axes})
+    assert [arm.label for arm in printed.arms if arm.overrides is None] == ["theirs"]
+    assert len(printed.runnable()) == 4
     alone = parse_sweep("s", {"axes": {"model.frames": [11, 21]}})
     assert [arm.label for arm in alone.arms] == ["model.frames=11", "model.frames=21"]
 
@@ -65,6 +68,9 @@ def test_rows_of_the_paper_alone_are_not_run():
         ({"arms": {"a": "memory=none"}}, "arms.a: 'memory=none'; allowed is a mapping"),
         ({"arms": {"a": ["memory none"]}}, "arms.a: 'memory none'; allowed is KEY=VALUE"),
         ({"arms": {"a": ["seed=1"]}}, "the seeds are set by the key seeds"),
+        ({"arms": {"a": ["++seed=1"]}}, "the seeds are set by the key seeds"),
+        ({"arms": {"a\nb": []}}, "allowed is a label of one line"),
+        ({"arms": ARMS, "metrics": []}, "metrics: empty; allowed is at least one"),
         ({"arms": {"a": {"branch": "hips"}}}, "arms.a.branch: 'hips'; allowed are rotation"),
         ({"arms": {"a": {"paper": {"MPJPX": 1}}}}, "arms.a.paper.MPJPX: no such key"),
         ({"arms": {"a": {"paper": {"MPJPE": "3"}}}}, "arms.a.paper.MPJPE: '3'; allowed is a number"),
@@ -85,7 +91,7 @@ def test_what_is_wrong_is_named(tmp_path: Path, content, words: str):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("text", [b"arms: [", b"\xff\xfe", b"a: b: c"])
+@pytest.mark.parametrize("text", [b"arms: [", b"\xff\xfe", b"a: b: c", b"arms: {a: [], a: [memory=none]}"])
 def test_a_file_that_is_no_yaml_is_named(tmp_path: Path, text: bytes):
     path = tmp_path / "mine.yaml"
     path.write_bytes(text)

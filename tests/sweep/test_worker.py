@@ -165,6 +165,10 @@ def test_a_run_that_kills_its_workers_fails_at_last(tmp_path: Path):
     work(path, finish)
     assert run.status == "failed"
     assert "processes died at step 5" in str(run.failure)
+    run.retry()
+    assert worker.deaths(run) == 0
+    work(path, finish)
+    assert run.status == "done"
 
 
 def test_many_workers_perform_each_task_exactly_once(tmp_path: Path):
