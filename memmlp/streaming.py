@@ -18,7 +18,10 @@ from memmlp.body import MOTION_DIM, SPARSE_DIM
 from memmlp.errors import InputError
 from memmlp.features import Frame
 from memmlp.memory import Memory, MemoryBlock, Past, Recurred, State
-from memmlp.model import MemMLP
+from memmlp.model import MemMLP, WindowModel
+
+Pieces = Sequence[Tensor]
+Way = Callable[[Tensor, Tensor], Tensor]
 
 
 class Injected(nn.Module):
@@ -43,8 +46,8 @@ class Shares(nn.Module):
         self.weight = nn.Parameter(torch.stack([weight.T for weight in weights]))
         self.bias = nn.Parameter(torch.stack(biases)[:, None])
 
-    def forward(self, past: Past | Recurred, memory: Memory) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
-        """Of the frame that is recalled, and of those that stand before the first one: each (1, d) a block."""
+    def forward(self, past: Past | Recurred, memory: Memory) -> tuple[Pieces, Pieces]:
+        """Of the frame that is recalled, and of those before the first one: (1, d) a block."""
         z = self.feature(past)
         return self._of(z), self._of(memory.before(z))
 
@@ -74,8 +77,12 @@ class Coordinates(nn.Module):
                 x[:, :MOTION_DIM], torch.cat([x[:, MOTION_DIM:], turn.expand(len(x), -1)], -1)
             )
 
-        self.encoder, self.encoder_bias = (nn.Parameter(p.to(frame.mean)) for p in _matrices(encode, inputs, turns))
-        self.decoder, self.decoder_bias = (nn.Parameter(p.to(frame.mean)) for p in _matrices(decode, motions, turns))
+        self.encoder, self.encoder_bias = (
+            nn.Parameter(p.to(frame.mean)) for p in _matrices(encode, inputs, turns)
+        )
+        self.decoder, self.decoder_bias = (
+            nn.Parameter(p.to(frame.mean)) for p in _matrices(decode, motions, turns)
+        )
 
     def encode(self, sparse: Tensor, place: Tensor) -> Tensor:
         """World inputs (1, 54) of a frame whose place is (1, 3 or 5) -> network space (1, 54)."""
@@ -86,8 +93,8 @@ class Coordinates(nn.Module):
         return _apply(self.decoder, self.decoder_bias, torch.cat([motion, place[:, :3]], -1), place)
 
 
-def _matrices(way: Callable[[Tensor, Tensor], Tensor], basis: Tensor, turns: int) -> tuple[Tensor, Tensor]:
-    """Matrices (1 + turns, out, in) and offsets (1 + turns, 1, out): constant part, then one a turn's number."""
+def _matrices(way: Way, basis: Tensor, turns: int) -> tuple[Tensor, Tensor]:
+    """Matrices (1 + turns, out, in), offsets (1 + turns, 1, out): the constant, then one a turn's number."""
     size = basis.shape[-1]
     tried = [torch.zeros(turns).double(), *torch.eye(turns).double()]
     offsets = torch.stack([way(torch.zeros(1, size).double(), turn) for turn in tried])
@@ -105,17 +112,24 @@ def _apply(matrices: Tensor, offsets: Tensor, x: Tensor, place: Tensor) -> Tenso
     return turn @ products
 
 
-class Streaming(nn.Module):
-    """A trained network as a live stream, for one stream and without gradients.
+def streaming(model: WindowModel) -> Streaming:
+    """The live stream of a trained network. Raises InputError where it has none of its own.
 
-    Raises InputError where past frames' estimates change with every step (`memory.history=latest`), so
-    that there is nothing to carry.
+    That is so for reference networks, which compute whole windows as published, and where estimates of past
+    frames change at each step (`memory.history=latest`), so that nothing can be carried.
     """
+    if not isinstance(model, MemMLP):
+        raise InputError("the streaming graph is Mem-MLP's: allowed is the whole one")
+    if not model.memory.settled:
+        raise InputError("memory.history=latest: estimates change at each step; allowed is the whole graph")
+    return Streaming(model)
+
+
+class Streaming(nn.Module):
+    """A Mem-MLP as a live stream, for one stream and without gradients; see `streaming`."""
 
     def __init__(self, model: MemMLP):
         super().__init__()
-        if not model.memory.settled:
-            raise InputError("memory.history=latest: past estimates change at each step; allowed is first")
         model = copy.deepcopy(model).eval()
         self.frames = model.frames
         self.frame, self.stem = model.frame, model.stem
@@ -176,7 +190,7 @@ class Streaming(nn.Module):
 
 
 def _entered(state: State, name: str, entering: Tensor, before: Tensor) -> Tensor:
-    """The frames (..., n, size) of a window: those carried, at a start what stands for them, and a new one."""
+    """A window's frames (..., n, size): those carried, at a start what stands for them, and a new one."""
     carried = torch.where(state["started"] > 0, state[name], before)
     return torch.cat([carried, entering], -2)
 
