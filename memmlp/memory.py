@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 import torch.nn.functional as F
@@ -471,7 +471,7 @@ class RecurredFeature(nn.Module):
         return past.features[:, self.index]
 
     @staticmethod
-    def together(features: Sequence[RecurredFeature]) -> nn.Module:
+    def together(features: Sequence[Any]) -> nn.Module:
         """What gives the features (1, blocks, k) of all blocks at once, from the past of one frame."""
         return AllRecurred([feature.index for feature in features])
 

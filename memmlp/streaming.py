@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -17,7 +18,7 @@ from torch import Tensor, nn
 from memmlp.body import MOTION_DIM, SPARSE_DIM
 from memmlp.errors import InputError
 from memmlp.features import Frame
-from memmlp.memory import Memory, MemoryBlock, Past, Recurred, State
+from memmlp.memory import Memory, MemoryBlock, Past, ProjectedFeature, Recurred, RecurredFeature, State
 from memmlp.model import MemMLP, WindowModel
 
 Pieces = Sequence[Tensor]
@@ -41,7 +42,8 @@ class Shares(nn.Module):
 
     def __init__(self, blocks: Sequence[MemoryBlock]):
         super().__init__()
-        self.feature = blocks[0].feature.together([block.feature for block in blocks])
+        features = [cast(ProjectedFeature | RecurredFeature, block.feature) for block in blocks]
+        self.feature = features[0].together(features)
         weights, biases = zip(*(block.fusion.share() for block in blocks), strict=True)
         self.weight = nn.Parameter(torch.stack([weight.T for weight in weights]))
         self.bias = nn.Parameter(torch.stack(biases)[:, None])
