@@ -17,6 +17,7 @@ from memmlp.cli.train import composed
 from memmlp.identity import IGNORED, flatten
 
 GROUPS = {folder.name: sorted(p.stem for p in folder.glob("*.yaml")) for folder in shipped("conf").glob("*/")}
+del GROUPS["search"]  # of `memmlp tune`
 OPTIONS = [f"{group}={name}" for group, names in GROUPS.items() for name in names]
 
 
