@@ -161,8 +161,9 @@ class Run:
 
     def retry(self) -> None:
         """Forget the failure, and the attempts that led to it."""
-        if self.failure:
-            self.write_manifest({"forgiven": len(self.manifest.get("attempts", []))})
+        attempts = self.manifest.get("attempts", [])
+        if self.failure and attempts:
+            self.write_manifest({"forgiven": len(attempts)})
         (self.folder / "FAILED").unlink(missing_ok=True)
 
     def begin(self, kind: str, config: Mapping[str, Any], *, data: str, upstream: str | None) -> None:

@@ -305,6 +305,14 @@ def test_a_damaged_config_is_named(tmp_path: Path, text: str):
         _ = run.config
 
 
+def test_a_retry_of_a_run_that_never_began_leaves_it_new(tmp_path: Path):
+    run = Run.of(tmp_path, "a" * 16)
+    run.folder.mkdir(parents=True)
+    run.fail("its data is gone")
+    run.retry()
+    assert run.status == "new"
+
+
 def test_flatten_keeps_lists_and_empty_mappings():
     assert flatten({"a": {"b": 1, "c": {}}, "d": [1]}) == {"a.b": 1, "a.c": {}, "d": [1]}
 

@@ -37,7 +37,7 @@ COMMANDS = {
     "ui": Command("track", "ui", "MLflow's page on the tracked runs."),
     "eval": Command("evaluate", "evaluate", "Metrics and predictions of a finished run."),
     "export": Command("export", "export", "ONNX file of a finished run."),
-    "bench": Command("bench", "bench", "Measure this machine: preparation, streaming."),
+    "bench": Command("bench", "bench", "Measure this machine; sweeps and searches under kills."),
 }
 
 

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 import click
 from hydra import compose, version
@@ -96,7 +96,7 @@ def composed_plain(name: str, overrides: Sequence[str], folder: Path | None = No
     args, _ = parse([*(["--config-dir", str(folder)] if folder else []), *overrides])
     version.setbase(VERSION_BASE)
     with _hydra(args), _explained(overrides):
-        return OmegaConf.to_container(compose(name, args.overrides), resolve=True)  # type: ignore[return-value]
+        return cast(dict[str, Any], OmegaConf.to_container(compose(name, args.overrides), resolve=True))
 
 
 def preflight(args: argparse.Namespace) -> list[DictConfig]:

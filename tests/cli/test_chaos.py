@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 from pathlib import Path
+
+from command_line import run
 
 from memmlp.cli.chaos import check, compare
 from memmlp.files import write_json
 from memmlp.runs import Run
 
-MAIN = [sys.executable, "-c", "from memmlp.cli.main import main; main()"]
 
-
-def test_a_sweep_under_kills_ends_as_an_undisturbed_one():
+def test_a_sweep_under_kills_ends_as_an_undisturbed_one(tmp_path: Path):
     words = ["--runs", "2", "--kills", "4", "--controllers", "2", "data.synth.minutes=0.8"]
-    ran = subprocess.run([*MAIN, "bench", "chaos", *words], capture_output=True, text=True, check=False)
-    assert ran.returncode == 0, ran.stdout + ran.stderr
-    assert "with 4 kills" in ran.stdout
-    assert "as undisturbed: 0 differences" in ran.stdout
+    said = run(tmp_path, "bench", "chaos", *words)
+    assert "with 4 kills" in said
+    assert "as undisturbed: 0 differences" in said
 
 
 def finished(outputs: Path, name: str, weights: bytes = b"w") -> Run:

@@ -7,13 +7,13 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
+from command_line import MAIN, TINY, run
 
 from memmlp.cli.plan import find_sweep, orphans, planned
 from memmlp.cli.sweep import split_executor
@@ -21,15 +21,6 @@ from memmlp.cli.work import perform
 from memmlp.errors import InputError
 from memmlp.runs import Run, list_runs
 
-MAIN = [sys.executable, "-c", "from memmlp.cli.main import main; main()"]
-TINY = [
-    "profile=tiny",
-    "data.synth.minutes=0.8",
-    "tracker=none",
-    "threads=1",
-    "optim.steps=6",
-    "vqvae.steps=6",
-]
 ARMS = {"full": [], "none": ["memory=none"], "wild": ["optim.lr=1e30"]}
 
 
@@ -47,10 +38,7 @@ def write(folder: Path, arms: dict) -> None:
 
 
 def command(folder: Path, *arguments: str, code: int = 0) -> str:
-    line = [*MAIN, "sweep", "trial.yaml", *TINY, *arguments]
-    ran = subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False)
-    assert ran.returncode == code, ran.stdout + ran.stderr
-    return ran.stdout + ran.stderr
+    return run(folder, "sweep", "trial.yaml", *TINY, *arguments, code=code)
 
 
 def stamps(folder: Path) -> dict[str, int]:

@@ -4,32 +4,18 @@ from __future__ import annotations
 
 import csv
 import re
-import subprocess
-import sys
+import shutil
 from pathlib import Path
 
 import pytest
+from command_line import TINY as BASE
+from command_line import run as command
 from filelock import FileLock
 
 from memmlp.cli.chaos import examine
 from memmlp.cli.tune import prepared
 
-MAIN = [sys.executable, "-c", "from memmlp.cli.main import main; main()"]
-TINY = [
-    "profile=tiny",
-    "data.synth.minutes=0.8",
-    "tracker=none",
-    "threads=1",
-    "optim.steps=6",
-    "optim.validate_every=3",
-    "vqvae.steps=6",
-]
-
-
-def command(folder: Path, *arguments: str, code: int = 0) -> str:
-    ran = subprocess.run([*MAIN, *arguments], cwd=folder, capture_output=True, text=True, check=False)
-    assert ran.returncode == code, ran.stdout + ran.stderr
-    return ran.stdout + ran.stderr
+TINY = [*BASE, "optim.validate_every=3"]
 
 
 @pytest.fixture(scope="module")
@@ -142,8 +128,6 @@ def test_a_search_under_kills_has_every_trial_once(tmp_path: Path):
 
 
 def test_the_judge_of_a_search_can_say_no(home: Path, tmp_path: Path):
-    import shutil
-
     outputs = tmp_path / "outputs"
     shutil.copytree(home / "outputs", outputs)
     (folder,) = (outputs / "tune").iterdir()
