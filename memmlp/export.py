@@ -24,7 +24,7 @@ from memmlp import __version__
 from memmlp.body import FPS, JOINTS, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.memory import Blend
 from memmlp.model import WindowModel
-from memmlp.streaming import Streaming
+from memmlp.streaming import Stream
 
 OPSET = 18
 TOLERANCE = 1e-4
@@ -37,7 +37,7 @@ FEATURES = (
 class StreamStep(nn.Module):
     """One step of the live stream with flat inputs and outputs."""
 
-    def __init__(self, model: WindowModel | Streaming):
+    def __init__(self, model: WindowModel | Stream):
         super().__init__()
         self.model = model
         self.names = list(model.initial_state(1))
@@ -65,7 +65,7 @@ def deterministic(model: nn.Module) -> Iterator[None]:
             blend.value = value
 
 
-def export(model: WindowModel | Streaming, path: Path, run_id: str) -> None:
+def export(model: WindowModel | Stream, path: Path, run_id: str) -> None:
     """Write the model's streaming step, on the CPU in float32, as one ONNX file with its metadata."""
     step = StreamStep(model.cpu().eval())
     states = tuple(model.initial_state(1).values())
@@ -95,7 +95,7 @@ def export(model: WindowModel | Streaming, path: Path, run_id: str) -> None:
     temporary.replace(path)
 
 
-def metadata(model: WindowModel | Streaming, run_id: str) -> dict[str, str]:
+def metadata(model: WindowModel | Stream, run_id: str) -> dict[str, str]:
     """What a program needs to know to drive the file."""
     return {
         "joints": json.dumps(JOINTS),
