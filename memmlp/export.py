@@ -21,17 +21,13 @@ import torch
 from torch import Tensor, nn
 
 from memmlp import __version__
-from memmlp.body import FPS, JOINTS, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
+from memmlp.body import FEATURES, FPS, JOINTS, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.memory import Blend
 from memmlp.model import WindowModel
 from memmlp.streaming import Streaming
 
 OPSET = 18
 TOLERANCE = 1e-4
-FEATURES = (
-    "joints head, left_wrist, right_wrist; 0:18 global rotation 6D, 18:36 R[t-1]^-1 R[t] 6D, "
-    "36:45 global position m, 45:54 p[t]-p[t-1] m/frame; 6D = first two columns; world Z up"
-)
 
 
 class StreamStep(nn.Module):
@@ -97,8 +93,12 @@ def export(model: WindowModel | Streaming, path: Path, run_id: str) -> None:
 
 def metadata(model: WindowModel | Streaming, run_id: str) -> dict[str, str]:
     """What a program needs to know to drive the file."""
+    learned = model.predictor.branches if isinstance(model, Streaming) else model.branches
     return {
         "joints": json.dumps(JOINTS),
+        "parents": json.dumps(PARENTS),
+        "rest": json.dumps(model.frame.rest.tolist()),
+        "branches": json.dumps(sorted(learned)),
         "fps": str(FPS),
         "T": str(model.frames),
         "features": FEATURES,
