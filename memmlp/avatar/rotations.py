@@ -59,17 +59,21 @@ def slerp(a: np.ndarray, b: np.ndarray, weight: float) -> np.ndarray:
 
 def sixd_to_matrix(sixd: np.ndarray) -> np.ndarray:
     """(n, 6) -> (n, 3, 3) by Gram-Schmidt, as `memmlp.geometry.sixd_to_matrix`."""
-    matrix = np.empty((len(sixd), 3, 3), sixd.dtype)
-    first, second = sixd[:, :3], sixd[:, 3:]
-    first = first / np.sqrt(np.einsum("ni,ni->n", first, first))[:, None]
-    second = second - np.einsum("ni,ni->n", first, second)[:, None] * first
-    second /= np.sqrt(np.einsum("ni,ni->n", second, second))[:, None]
-    matrix[:, :, 0], matrix[:, :, 1] = first, second
-    matrix[:, :, 2] = first[:, _NEXT] * second[:, _AFTER] - first[:, _AFTER] * second[:, _NEXT]
-    return matrix
+    columns = np.empty((3, 5, len(sixd)), sixd.dtype)  # x y z x y, so that a cross product takes slices
+    columns[:2, :3] = sixd.T.reshape(2, 3, -1)
+    first, second = columns[:2, :3]
+    first /= np.sqrt(_dot(first, first))
+    second -= _dot(first, second) * first
+    second /= np.sqrt(_dot(second, second))
+    columns[:2, 3:] = columns[:2, :2]
+    a, b, third = columns
+    third[:3] = a[1:4] * b[2:5] - a[2:5] * b[1:4]
+    return columns[:, :3].transpose(2, 1, 0)
 
 
-_NEXT, _AFTER = [1, 2, 0], [2, 0, 1]  # of the coordinates, for a cross product
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(3, n) and (3, n) -> (n,)."""
+    return np.add.reduce(a * b, 0)
 
 
 class Skeleton:

@@ -28,7 +28,7 @@ class Space:
     Attributes:
         name: by which users call it.
         world: orthogonal (3, 3), its positions -> AMASS' world; mirrors where the space is left-handed.
-        body: orthogonal (3, 3), the axes of its T-pose -> SMPL's body frame; mirrors with `world`.
+        body: signs (3,), the axes of its T-pose -> SMPL's body frame; they mirror where `world` does.
     """
 
     name: str
@@ -41,35 +41,37 @@ class Space:
 
     def positions_out(self, positions: np.ndarray) -> np.ndarray:
         """Positions (..., 3) of AMASS' world in this space."""
-        return positions @ self.world
+        return positions @ self.world.astype(positions.dtype)
 
     def rotations_in(self, rotations: np.ndarray) -> np.ndarray:
         """Global rotations (..., 3, 3) of this space in AMASS' world."""
-        return self.world @ rotations @ self.body.T
+        return self.world @ rotations * self.body
 
     def rotations_out(self, rotations: np.ndarray) -> np.ndarray:
         """Global rotations (..., 3, 3) of AMASS' world in this space."""
-        return self.world.T @ rotations @ self.body
+        return self.world.T.astype(rotations.dtype) @ rotations * self.body.astype(rotations.dtype)
 
     def pose_in(self, local: np.ndarray) -> np.ndarray:
         """Local rotations (..., J, 3, 3) of this space, the root's global, as AMASS has them."""
-        return np.concatenate([self.rotations_in(local[..., :1, :, :]), self._local(local, self.body)], -3)
+        return self._posed(local, self.rotations_in(local[..., 0, :, :]))
 
     def pose_out(self, local: np.ndarray) -> np.ndarray:
         """Local rotations (..., J, 3, 3) as AMASS has them, the root's global, in this space."""
-        return np.concatenate([self.rotations_out(local[..., :1, :, :]), self._local(local, self.body.T)], -3)
+        return self._posed(local, self.rotations_out(local[..., 0, :, :]))
 
-    @staticmethod
-    def _local(local: np.ndarray, way: np.ndarray) -> np.ndarray:
-        return way @ local[..., 1:, :, :] @ way.T
+    def _posed(self, local: np.ndarray, root: np.ndarray) -> np.ndarray:
+        """The joints' rotations with the T-pose's other axes on both sides, which is the way in and out."""
+        turned = local * np.outer(self.body, self.body).astype(local.dtype)
+        turned[..., 0, :, :] = root
+        return turned
 
 
 SPACES = {
     space.name: space
     for space in (
-        Space("amass", np.eye(3), np.eye(3)),
-        Space("openxr", np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.diag([-1.0, 1, -1])),
-        Space("unity", np.array([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]]), np.diag([-1.0, 1, 1])),
+        Space("amass", np.eye(3), np.ones(3)),
+        Space("openxr", np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.array([-1.0, 1, -1])),
+        Space("unity", np.array([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]]), np.array([-1.0, 1, 1])),
     )
 }
 

@@ -14,14 +14,16 @@ from numpy.typing import ArrayLike
 from memmlp.avatar.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
 from memmlp.avatar.session import Network
 from memmlp.avatar.spaces import space_of
-from memmlp.avatar.trackers import NOBODY, Features, Trackers, t_pose
+from memmlp.avatar.trackers import Features, Lost, Trackers, t_pose
 from memmlp.errors import InputError
 
 if TYPE_CHECKING:
     from memmlp.ik import LBFGS
 
 TRACKERS = ("head", "left", "right")
-IDENTITIES = np.tile(np.eye(3), (3, 1, 1))
+IDENTITY = np.eye(3)
+NOTHING = np.full((3, 12), np.nan)
+NEUTRAL = np.concatenate([np.zeros(3), IDENTITY.reshape(9)])
 UNIT = 1e-2  # by how much a quaternion's norm, or a matrix' columns, may be off
 
 Tracker = tuple[ArrayLike, ArrayLike] | None
@@ -172,7 +174,7 @@ class Stream:
             InputError: for a lost tracker, or hands that are not apart.
         """
         positions, rotations, lost = read_trackers((head, left, right))
-        if lost.any():
+        if any(lost):
             raise InputError(f"calibrate: no pose of {', '.join(_names(lost))}; all three are needed")
         world = self.space.positions_in(positions)
         across = world[1] - world[2]
@@ -192,7 +194,7 @@ class Stream:
         self._features.reset()
         self._last = None
 
-    def _again(self, lost: np.ndarray) -> Pose:
+    def _again(self, lost: Lost) -> Pose:
         """The last frame's pose, where none was due."""
         assert self._last is not None  # the first sample always makes a frame
         return self._last._replace(held=_names(lost), fresh=False, restarted=False)
@@ -227,53 +229,59 @@ class Solver:
         return self.ik.solve(self.frame, motion, torch.from_numpy(sparse[None])).numpy().reshape(-1, 6)
 
 
-def read_trackers(trackers: Sequence[Tracker]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions (3, 3), rotations (3, 3, 3) and which are lost (3,), of trackers as users give them."""
-    positions, rotations, lost = np.zeros((3, 3)), IDENTITIES.copy(), NOBODY
+def read_trackers(trackers: Sequence[Tracker]) -> tuple[np.ndarray, np.ndarray, Lost]:
+    """Positions (3, 3), rotations (3, 3, 3) and which are lost, of trackers as users give them."""
+    read, quaternions = NOTHING.copy(), {}
     for index, (name, tracker) in enumerate(zip(TRACKERS, trackers, strict=True)):
-        read = None if tracker is None else _read(name, tracker)
-        if read is None:
-            lost = lost.copy()
-            lost[index] = True
-        else:
-            positions[index], rotations[index] = read
+        if tracker is not None:
+            read[index, :3], rotation = _arrays(name, tracker)
+            if rotation.shape == (4,):
+                quaternions[index] = rotation
+            else:
+                read[index, 3:] = rotation.reshape(9)
+    if quaternions:
+        read[list(quaternions), 3:] = _matrices(quaternions).reshape(-1, 9)
+    lost = tuple((~np.isfinite(read).all(1)).tolist())
+    if any(lost):
+        read[list(lost)] = NEUTRAL
+    positions, rotations = read[:, :3], read[:, 3:].reshape(3, 3, 3)
     _check_rotations(TRACKERS, rotations)
     return positions, rotations, lost
 
 
-def _read(name: str, tracker: tuple[ArrayLike, ArrayLike]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Position (3,) and rotation (3, 3) of a tracker; None for a lost one."""
+def _arrays(name: str, tracker: tuple[ArrayLike, ArrayLike]) -> tuple[np.ndarray, np.ndarray]:
+    """Position (3,) and rotation (4,) or (3, 3) of a tracker."""
     try:
         position, rotation = (np.asarray(part, np.float64) for part in tracker)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: allowed is (position, rotation), arrays of numbers, or None") from error
     if position.shape != (3,):
         raise InputError(f"{name}: a position of shape {position.shape}; allowed is (3,), metres")
-    if rotation.shape not in ((3, 3), (4,)):
+    if rotation.shape not in ((4,), (3, 3)):
         raise InputError(f"{name}: a rotation of shape {rotation.shape}; allowed is (4,) xyzw or (3, 3)")
-    if not (math.isfinite(position.sum()) and math.isfinite(rotation.sum())):
-        return None
-    matrix = _matrix(name, rotation) if rotation.shape == (4,) else rotation
-    return None if matrix is None else (position, matrix)
+    return position, rotation
 
 
-def _matrix(name: str, quaternion: np.ndarray) -> np.ndarray | None:
-    """A quaternion (4,) xyzw as a matrix (3, 3); None for zeros, which runtimes give for a lost tracker."""
-    square = float(quaternion @ quaternion)
-    if square == 0:
-        return None
-    if abs(math.sqrt(square) - 1) > UNIT:
-        raise InputError(f"{name}: a quaternion of norm {math.sqrt(square):.3g}; allowed is 1 (xyzw)")
-    return quaternion_to_matrix(quaternion / math.sqrt(square))
+def _matrices(quaternions: dict[int, np.ndarray]) -> np.ndarray:
+    """Quaternions (4,) xyzw of trackers as matrices (n, 3, 3); NaN for zeros, as runtimes give if lost."""
+    array = np.array(list(quaternions.values()))
+    norms = np.sqrt(np.einsum("ni,ni->n", array, array))
+    for index, norm in zip(quaternions, norms.tolist(), strict=True):
+        if abs(norm - 1) > UNIT and norm != 0 and math.isfinite(norm):
+            raise InputError(f"{TRACKERS[index]}: a quaternion of norm {norm:.3g}; allowed is 1 (xyzw)")
+    return quaternion_to_matrix(array / np.where(norms == 0, np.nan, norms)[:, None])
 
 
 def _check_rotations(names: Sequence[str], rotations: np.ndarray) -> None:
-    """Refuse matrices (n, 3, 3) that are no rotations."""
-    off = np.abs(rotations.swapaxes(1, 2) @ rotations - np.eye(3)).max((1, 2)) > UNIT
-    for name, bad, matrix in zip(names, off | (np.linalg.det(rotations) < 0), rotations, strict=True):
-        if bad:
-            kind = "a mirror image" if abs(np.linalg.det(matrix) + 1) < UNIT else "not orthonormal"
-            raise InputError(f"{name}: no rotation matrix ({kind}); allowed is (3, 3), acting on columns")
+    """Refuse matrices (3, 3, 3) that are no rotations: not orthonormal, or mirror images."""
+    product = rotations @ rotations.swapaxes(1, 2)
+    if np.abs(product - IDENTITY).max() <= UNIT and np.linalg.det(rotations).min() > 0:
+        return
+    for name, matrix in zip(names, rotations, strict=True):
+        if np.abs(matrix @ matrix.T - IDENTITY).max() > UNIT:
+            raise InputError(f"{name}: the matrix is not orthonormal; allowed is a rotation (3, 3)")
+        if np.linalg.det(matrix) < 0:
+            raise InputError(f"{name}: the matrix is a mirror image; allowed is a rotation (3, 3)")
 
 
 def checked_offsets(offsets: Offsets) -> Offsets:
@@ -286,9 +294,9 @@ def checked_offsets(offsets: Offsets) -> Offsets:
     return Offsets(positions, rotations)
 
 
-def _names(lost: np.ndarray) -> tuple[str, ...]:
-    """The trackers of a mask (3,)."""
-    return tuple(name for name, gone in zip(TRACKERS, lost.tolist(), strict=True) if gone)
+def _names(lost: Lost) -> tuple[str, ...]:
+    """The names of the trackers that are lost."""
+    return tuple(name for name, gone in zip(TRACKERS, lost, strict=True) if gone)
 
 
 def _file(source: str | PathLike[str] | HasOnnx) -> Path:

@@ -34,8 +34,11 @@ RECOVERY = 0.25  # seconds
 EARLY = 5e-4  # seconds by which a frame may be ahead of its sample: times rounded to milliseconds still count
 SAME = 1e-6  # seconds: a sample this near to a frame is the frame
 
-NOBODY = np.zeros(3, bool)
+NOBODY = (False, False, False)
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # SMPL's body frame (Y up) stands in AMASS' world
+
+
+Lost = tuple[bool, ...]  # of head, left and right wrist
 
 
 class Tracked(NamedTuple):
@@ -85,34 +88,51 @@ class Hold:
     def reset(self) -> None:
         """Nothing was seen yet."""
         self.last: Tracked | None = None
-        self.lost = NOBODY
+        self.lost: Lost = NOBODY
+        self.settled = -np.inf  # when the last one that returned is where it is
         self.returned = np.full(3, -np.inf)  # when, each; the difference is let go from there on
         self.shift, self.turn = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1))
 
-    def __call__(self, sample: Tracked, lost: np.ndarray) -> Tracked:
-        """The sample with the lost trackers (3,) filled in, and those that return on their way."""
-        if not (lost.any() or self.lost.any() or sample.time - self.returned.max() < self.recovery):
-            self.last = sample
-            return sample
+    def __call__(self, sample: Tracked, lost: Lost) -> Tracked:
+        """The sample with the lost trackers filled in, and those that return on their way."""
         last = self.last or self._first(sample, lost)
-        back = self.lost & ~lost
-        if back.any():
-            self.returned = np.where(back, last.time, self.returned)
-            self.shift[back] = (last.positions - sample.positions)[back]
-            self.turn[back] = (last.rotations @ sample.rotations.swapaxes(1, 2))[back]
-        left = np.clip(1 - (sample.time - self.returned) / max(self.recovery, 1e-9), 0, 1)
-        positions = sample.positions + left[:, None] * self.shift
-        rotations = turned_by(self.turn, left) @ sample.rotations
-        positions[lost], rotations[lost] = last.positions[lost], last.rotations[lost]
-        self.last, self.lost = Tracked(sample.time, positions, rotations), lost
+        returning = [was and not is_lost for was, is_lost in zip(self.lost, lost, strict=True)]
+        self.last, self.lost = sample, lost
+        if any(returning):
+            self._return(returning, last, sample)
+        if sample.time < self.settled:
+            self.last = self._on_their_way(sample)
+        if any(lost):
+            self.last = _replaced(self.last, list(lost), last)
         return self.last
 
-    def _first(self, sample: Tracked, lost: np.ndarray) -> Tracked:
+    def _first(self, sample: Tracked, lost: Lost) -> Tracked:
         """The T-pose under the head where it is seen, else at the origin, standing."""
+        if not any(lost):
+            return sample
         if lost[0]:
             height = self.skeleton.rest[self.skeleton.tracked[0], 1] - self.skeleton.rest[:, 1].min()
             return t_pose(self.skeleton, np.array([0.0, 0.0, height]), 0.0)
         return t_pose(self.skeleton, sample.positions[0], heading_of(sample.rotations[0]))
+
+    def _return(self, which: list[bool], last: Tracked, sample: Tracked) -> None:
+        """Remember how far those that return are from where they were held."""
+        self.returned[which], self.settled = last.time, last.time + self.recovery
+        self.shift[which] = (last.positions - sample.positions)[which]
+        self.turn[which] = (last.rotations @ sample.rotations.swapaxes(1, 2))[which]
+
+    def _on_their_way(self, sample: Tracked) -> Tracked:
+        """The sample with what is left of the differences."""
+        left = np.clip(1 - (sample.time - self.returned) / self.recovery, 0, 1)
+        positions = sample.positions + left[:, None] * self.shift
+        return Tracked(sample.time, positions, turned_by(self.turn, left) @ sample.rotations)
+
+
+def _replaced(sample: Tracked, which: list[bool], last: Tracked) -> Tracked:
+    """The sample with some trackers as they were."""
+    positions, rotations = sample.positions.copy(), sample.rotations.copy()
+    positions[which], rotations[which] = last.positions[which], last.rotations[which]
+    return Tracked(sample.time, positions, rotations)
 
 
 class Taken(NamedTuple):
@@ -179,14 +199,12 @@ class Trackers:
         self.hold.reset()
         self.grid.reset()
 
-    def take(
-        self, time: float | None, positions: np.ndarray, rotations: np.ndarray, lost: np.ndarray
-    ) -> Taken:
+    def take(self, time: float | None, positions: np.ndarray, rotations: np.ndarray, lost: Lost) -> Taken:
         """The frames that are due with a sample.
 
         Args:
             time: seconds; None for that of the next frame, which is then exactly this sample.
-            positions, rotations: (3, 3) and (3, 3, 3), AMASS' world. lost: (3,) which of them do not count.
+            positions, rotations: (3, 3) and (3, 3, 3), AMASS' world. lost: which of them do not count.
         """
         if time is None:
             time = self.grid.next
