@@ -64,19 +64,37 @@ def deterministic(model: nn.Module) -> Iterator[None]:
 def export(model: WindowModel | Streaming, path: Path, run_id: str) -> None:
     """Write the model's streaming step, on the CPU in float32, as one ONNX file with its metadata."""
     step = StreamStep(model.cpu().eval())
-    states = tuple(model.initial_state(1).values())
     names = [f"state.{name}" for name in step.names]
+    save(
+        step,
+        (torch.zeros(1, SPARSE_DIM), *model.initial_state(1).values()),
+        ["sparse", *names],
+        ["rotation6d", "position", *(f"{name}.next" for name in names)],
+        path,
+        metadata(model, run_id),
+    )
+
+
+def save(
+    step: nn.Module,
+    arguments: tuple[Tensor, ...],
+    inputs: list[str],
+    outputs: list[str],
+    path: Path,
+    meta: dict[str, str],
+) -> None:
+    """Write a step with named flat inputs and outputs as one ONNX file, atomically."""
     quiet = logging.getLogger("torch.onnx")
     level = quiet.level
     quiet.setLevel(logging.ERROR)
     try:
-        with warnings.catch_warnings(), deterministic(model):
+        with warnings.catch_warnings(), deterministic(step):
             warnings.simplefilter("ignore")  # the exporter's own deprecations are no news to our users
             program = torch.onnx.export(
                 step,
-                (torch.zeros(1, SPARSE_DIM), *states),
-                input_names=["sparse", *names],
-                output_names=["rotation6d", "position", *(f"{name}.next" for name in names)],
+                arguments,
+                input_names=inputs,
+                output_names=outputs,
                 opset_version=OPSET,
                 dynamo=True,
                 verbose=False,
@@ -85,7 +103,7 @@ def export(model: WindowModel | Streaming, path: Path, run_id: str) -> None:
         quiet.setLevel(level)
     assert program is not None
     graph = program.model_proto
-    onnx.helper.set_model_props(graph, metadata(model, run_id))
+    onnx.helper.set_model_props(graph, meta)
     temporary = path.with_name(path.name + ".tmp")
     onnx.save(graph, temporary)
     temporary.replace(path)

@@ -85,6 +85,10 @@ class Skeleton:
     Args:
         joints: names (J). parents: indices (J), -1 of the root, which is the first.
         rest: rest positions (J, 3), metres, SMPL's body frame.
+
+    Attributes:
+        tracked: indices of head, left and right wrist. offsets: (J, 3) metres from the parent, 0 of the root.
+        ancestors: for each joint and one more above the root (J + 1), who is 1, 2, 4, ... above it.
     """
 
     def __init__(self, joints: Sequence[str], parents: Sequence[int], rest: np.ndarray):
@@ -97,13 +101,15 @@ class Skeleton:
         while (self.ancestors[-1] != count).any():
             self.ancestors.append(self.ancestors[-1][self.ancestors[-1]])
         self.ancestors.pop()
+        self.offsets = np.zeros((count, 3))
+        self.offsets[1:] = rest[1:] - rest[parent[1:count]]
         self._transforms = np.tile(np.eye(4, dtype=np.float32), (count + 1, 1, 1))
-        self._transforms[1:count, :3, 3] = rest[1:] - rest[parent[1:count]]
+        self._transforms[:count, :3, 3] = self.offsets
 
     def positions(self, local: np.ndarray) -> np.ndarray:
         """Positions (J, 3), metres, relative to the head, of local rotations (J, 3, 3), the root's global."""
         transforms = self._transforms
         transforms[:-1, :3, :3] = local
         for ancestor in self.ancestors:
-            transforms = transforms[ancestor] @ transforms
+            transforms = transforms.take(ancestor, 0) @ transforms
         return transforms[:-1, :3, 3] - transforms[self.tracked[0], :3, 3]

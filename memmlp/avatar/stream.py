@@ -269,7 +269,8 @@ def _matrices(quaternions: dict[int, np.ndarray]) -> np.ndarray:
     for index, norm in zip(quaternions, norms.tolist(), strict=True):
         if abs(norm - 1) > UNIT and norm != 0 and math.isfinite(norm):
             raise InputError(f"{TRACKERS[index]}: a quaternion of norm {norm:.3g}; allowed is 1 (xyzw)")
-    return quaternion_to_matrix(array / np.where(norms == 0, np.nan, norms)[:, None])
+    norms[norms == 0] = np.nan
+    return quaternion_to_matrix(array / norms[:, None])
 
 
 def _check_rotations(names: Sequence[str], rotations: np.ndarray) -> None:
