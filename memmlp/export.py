@@ -111,12 +111,11 @@ def save(
 
 def metadata(model: WindowModel | Stream, run_id: str) -> dict[str, str]:
     """What a program needs to know to drive the file."""
-    learned = model.predictor.branches if isinstance(model, Streaming) else model.branches
     return {
         "joints": json.dumps(JOINTS),
         "parents": json.dumps(PARENTS),
         "rest": json.dumps(model.frame.rest.tolist()),
-        "branches": json.dumps(sorted(learned)),
+        "branches": json.dumps(sorted(model.branches)),
         "fps": str(FPS),
         "T": str(model.frames),
         "features": FEATURES,

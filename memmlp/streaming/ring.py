@@ -57,7 +57,7 @@ class Stream(nn.Module):
     def __init__(self, model: WindowModel):
         super().__init__()
         model = copy.deepcopy(model).eval().requires_grad_(False)
-        self.frames, self.frame = model.frames, model.frame
+        self.frames, self.frame, self.branches = model.frames, model.frame, model.branches
         self.build(model)
         self.requires_grad_(False)
 
