@@ -125,11 +125,17 @@ def metadata(model: WindowModel | Stream, run_id: str) -> dict[str, str]:
 
 
 class OnnxStream:
-    """The exported step in ONNX Runtime on one thread, with its state."""
+    """The exported step in ONNX Runtime on one thread, with its state.
 
-    def __init__(self, path: Path):
+    Args:
+        path: the ONNX file. profile: where ONNX Runtime's profile goes, if anywhere: the start of the path.
+    """
+
+    def __init__(self, path: Path, profile: Path | None = None):
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
+        if profile is not None:
+            options.enable_profiling, options.profile_file_prefix = True, str(profile)
         self.session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         self.shapes = {i.name: i.shape for i in self.session.get_inputs() if i.name != "sparse"}
         self.reset()

@@ -14,7 +14,7 @@ from memmlp.streaming.mem_mlp import MemMLPStream
 from memmlp.streaming.reference import AGRoLDiffusionStream, AGRoLMLPStream, AvatarPoserStream
 from memmlp.streaming.ring import Stream
 
-__all__ = ["Stream", "streaming"]
+__all__ = ["Stream", "has_stream", "streaming"]
 
 STREAMS: dict[type[WindowModel], type[Stream]] = {
     MemMLP: MemMLPStream,
@@ -24,13 +24,18 @@ STREAMS: dict[type[WindowModel], type[Stream]] = {
 }
 
 
+def has_stream(model: WindowModel) -> bool:
+    """Whether a network has a live stream of its own: unless what it recalls of a frame changes with time."""
+    return not isinstance(model, MemMLP) or model.memory.settled
+
+
 def streaming(model: WindowModel) -> Stream:
     """The live stream of a trained network, which itself stays as it is.
 
     Raises InputError where there is none: where estimates of past frames change at each step
     (`memory.history=latest`), nothing can be carried.
     """
-    if isinstance(model, MemMLP) and not model.memory.settled:
+    if not has_stream(model):
         raise InputError(
             "memory.history=latest: its estimates change at each step, which no streaming graph can carry; "
             "allowed is export.graph=naive, or memory.history=first"

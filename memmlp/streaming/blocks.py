@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -42,7 +42,7 @@ class Mixing(nn.Module):
 
     def forward(self, slot: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Weights (T, T) and offsets (T, 1) of each block for the newest frame's slot (1,)."""
-        start = int((self.frames - 1 - slot).squeeze().item())
+        start: Any = (self.frames - 1 - slot).squeeze().item()  # a symbol while it is exported
         torch._check(start >= 0)
         torch._check(start <= self.frames)
         weights = self.weight.narrow(1, start, self.frames).narrow(2, start, self.frames).flatten(0, 1)

@@ -86,6 +86,8 @@ def _apply(matrices: Tensor, offsets: Tensor, x: Tensor, place: Tensor) -> Tenso
 class MemMLPStream(Stream):
     """A Mem-MLP as a live stream."""
 
+    ends = ("coordinates", "stem", "predictor.rotation.linear", "predictor.position.linear")
+
     def build(self, model: WindowModel) -> None:
         """Make the stream's parts of a copy of the network."""
         assert isinstance(model, MemMLP)

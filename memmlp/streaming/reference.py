@@ -24,6 +24,7 @@ from memmlp.streaming.ring import Ring, Stream
 class AvatarPoserStream(Stream):
     """AvatarPoser; its encoder has no order of frames, so that a ring's will do."""
 
+    ends = ("model.embedding", "model.orientation", "model.rotation")
     model: AvatarPoser
     layers: list[EncoderLayer]
 
@@ -61,6 +62,7 @@ class AGRoLStream(Stream):
     A ring would spare one copy of them, but turning the T x T matrices of 12 blocks to it costs more.
     """
 
+    ends = ("model.stem", "model.head")
     width: int
     blocks: list[MLPBlock]
 

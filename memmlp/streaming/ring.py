@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -52,7 +52,12 @@ class Stream(nn.Module):
 
     Args:
         model: the trained network; what is shared with it is a copy.
+
+    Attributes:
+        ends: names of the modules that make the hidden state of the inputs, and the motion of it.
     """
+
+    ends: ClassVar[tuple[str, ...]]
 
     def __init__(self, model: WindowModel):
         super().__init__()
