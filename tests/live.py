@@ -11,8 +11,15 @@ import torch
 
 from memmlp.avatar.stream import Pose, Stream
 from memmlp.body import TRACKED
-from memmlp.features import motion_frames
+from memmlp.features import Frame, motion_frames
 from memmlp.geometry import axis_angle_to_matrix, forward_kinematics
+from memmlp.model import WindowModel
+
+
+def at_ease(network: WindowModel, frames: torch.Tensor) -> WindowModel:
+    """The network with random weights, but about the mean pose of frames (N, 252), as a person stands."""
+    network.frame = Frame.fit(network.frame.coordinates, tiny.REST, frames)
+    return network
 
 
 class Person(NamedTuple):

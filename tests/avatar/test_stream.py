@@ -25,7 +25,7 @@ from memmlp.avatar.soak import Motion, repetitions, soak
 from memmlp.avatar.spaces import SPACES
 from memmlp.avatar.stream import Offsets, Stream
 from memmlp.avatar.trackers import t_pose
-from memmlp.body import HEAD, N_JOINTS, ROTATION, SPARSE_DIM
+from memmlp.body import HEAD, N_JOINTS, SPARSE_DIM
 from memmlp.data.bvh import read_bvh
 from memmlp.data.retarget import retarget
 from memmlp.data.skeleton import find_skeleton
@@ -52,7 +52,7 @@ MODELS = {
 
 @pytest.fixture(scope="module")
 def network():
-    return MODELS["vq"]()
+    return live.at_ease(MODELS["vq"](), PERSON.frames)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def largest_difference(network, file: Path, person: live.Person) -> float:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_it_is_evaluations_stream(name, tmp_path):
-    network = MODELS[name]()
+    network = live.at_ease(MODELS[name](), PERSON.frames)
     export(network, tmp_path / "step.onnx", "0123456789abcdef")
     assert largest_difference(network, tmp_path / "step.onnx", PERSON) < 1e-4
 
@@ -126,30 +126,30 @@ def test_every_space_is_the_same_stream(name, file):
         assert pose.rotations.shape == (N_JOINTS, 4)
 
 
-def test_inverse_kinematics_are_those_of_evaluation(network, file):
-    poses = live.play(Stream(file, ik=LBFGS(5)), PERSON.positions[:20], PERSON.rotations[:20])[1:]
+def test_inverse_kinematics_bring_the_pose_to_the_position_branch(network, file):
+    plain = live.play(Stream(file), PERSON.positions[:20], PERSON.rotations[:20])
+    solved = live.play(Stream(file, ik=LBFGS()), PERSON.positions[:20], PERSON.rotations[:20])
     frames = PERSON.frames[:19]
-    solved = LBFGS(5).solutions(network.frame, stream(network, [frames])[0], frames[:, :SPARSE_DIM])[
-        "combined"
-    ]
-    expected = local_rotations(solved).numpy()
-    assert solved[:, ROTATION].shape == (19, 132)
-    assert np.abs(np.stack([pose.rotations for pose in poses]) - expected).max() < 1e-3
+    motion = stream(network, [frames])[0]
+    expected = LBFGS().solutions(network.frame, motion, frames[:, :SPARSE_DIM])["combined"]
+    there = network.frame.pose(expected, frames[:, :SPARSE_DIM]).numpy()
+    targets = np.stack([pose.joints for pose in solved])
+    assert live.apart(live.joints(solved[1:]), there).max() < 0.1
+    assert (live.apart(live.joints(solved), targets) < 0.8 * live.apart(live.joints(plain), targets)).all()
 
 
 # Rates
 
 
-RATES = {  # Hz: bounds on mean and most, cm; measured, and what the newest sample in a frame's place gives
-    "30": (np.arange(0, 4, 1 / 30), 0.6, 3.0),  # 0.52, 2.85; 8.1, 36.5
-    "72": (np.arange(0, 4, 1 / 72), 0.08, 0.35),  # 0.068, 0.323; 4.0, 34.3
-    "90": (np.arange(0, 4, 1 / 90), 0.07, 0.35),  # 0.061, 0.321; 3.0, 11.8
+CHANGING = np.concatenate([np.arange(0, 1, 1 / 90), np.arange(1, 2, 1 / 30), np.arange(2, 4, 1 / 120)])
+RATES = {  # Hz: bounds on mean and most, cm; measured, and with the newest sample in each frame's place
+    "30": (np.arange(0, 4, 1 / 30), 1.6, 7.5),  # 1.54, 7.18; 16.8, 34.2
+    "72": (np.arange(0, 4, 1 / 72), 0.12, 0.85),  # 0.112, 0.827; 7.5, 32.6
+    "90": (np.arange(0, 4, 1 / 90), 0.18, 0.95),  # 0.166, 0.896; 10.1, 28.5
+    "90, 30, 120": (CHANGING, 0.4, 7.5),  # 0.375, 7.18; 5.7, 34.2
     "120": (np.arange(0, 4, 1 / 120), 1e-3, 1e-3),  # every second sample is a frame
-    "90, 30, 120": (  # 0.10, 1.89; 2.2, 19.4
-        np.concatenate([np.arange(0, 1, 1 / 90), np.arange(1, 2, 1 / 30), np.arange(2, 4, 1 / 120)]), 0.15, 2.0,
-    ),
-    "60 in whole milliseconds": (np.round(TIMES, 3), 0.05, 0.1),
-}  # fmt: skip
+    "60 in whole milliseconds": (np.round(TIMES, 3), 0.5, 1.5),
+}
 
 
 @pytest.mark.parametrize("rate", RATES)
@@ -201,11 +201,11 @@ def test_after_a_gap_all_begins_anew(file, undisturbed, jump):
 
 
 def test_a_short_gap_is_bridged(file, undisturbed):
-    """24 frames missing. Mean from there on 1.35 cm; 3.17 when it begins anew instead."""
-    kept = np.r_[0:100, 124:FRAMES]
+    """12 frames missing. Mean from there on 0.50 cm; 0.57 when it begins anew instead."""
+    kept = np.r_[0:100, 112:FRAMES]
     poses = live.play(Stream(file), PERSON.positions[kept], PERSON.rotations[kept], TIMES[kept])
     assert not any(pose.restarted for pose in poses[1:])
-    assert live.apart(live.joints(poses)[100:], undisturbed[124:]).mean() < 1.5
+    assert live.apart(live.joints(poses)[100:], undisturbed[112:]).mean() < 0.55
 
 
 def test_reset_is_a_new_stream(file, undisturbed):
@@ -220,11 +220,11 @@ def test_reset_is_a_new_stream(file, undisturbed):
 
 
 @pytest.mark.parametrize(
-    ("trackers", "during"),
-    [((1,), 25), ((0,), 53)],  # 23.3 and 51.3 cm (of random weights, whose joints move at 50 m/s)
+    ("trackers", "during", "speed"),  # cm and cm/s; measured 7.5, 46.5 and 2516, 3903
+    [((1,), 8, 3000), ((0,), 48, 4500)],
 )
-def test_lost_trackers_are_held_and_come_back(trackers, during, file, undisturbed):
-    """Half a second. Fastest joint afterwards 49 and 54 m/s, of the undisturbed stream 55; 79 and 86 with a jump."""
+def test_lost_trackers_are_held_and_come_back(trackers, during, speed, file, undisturbed):
+    """Half a second. Without a smooth return the fastest joint has 7585 and 12736 cm/s; undisturbed 1340."""
     lost = {index: trackers for index in range(100, 130)}
     poses = live.play(Stream(file), PERSON.positions, PERSON.rotations, lost=lost)
     names = tuple(("head", "left", "right")[tracker] for tracker in trackers)
@@ -232,8 +232,8 @@ def test_lost_trackers_are_held_and_come_back(trackers, during, file, undisturbe
     joints = live.joints(poses)
     error = live.apart(joints, undisturbed)
     assert error[100:130].mean() < during
-    assert error[160:190].max() < 1  # 0.84 and 0.94
-    assert live.fastest(joints[129:160]) < 1.05 * live.fastest(undisturbed[129:160])
+    assert error[160:190].max() < 1  # 0.91 and 0.35
+    assert live.fastest(joints[129:160]) < speed
 
 
 @pytest.mark.parametrize(
@@ -274,21 +274,21 @@ def test_calibration_finds_how_the_devices_sit(name, file):
     """In any heading; positions up to the devices' mean distance, which a T-pose cannot tell."""
     space, stream = SPACES[name], Stream(file, space=name)
     turns = Rotation.random(3, rng=4).as_matrix()
-    shifts = np.array([[0.05, 0.02, 0.01], [-0.03, 0.01, 0.04], [0.02, 0.06, -0.01]])
+    sits = np.array([[0, 0.08, 0.1], [0.05, 0.02, 0], [-0.05, 0.02, 0]])  # metres from the joints, body axes
+    shifts = -(turns @ (sits * space.body)[:, :, None])[..., 0]
 
     def devices(positions, rotations):
-        rotations = space.rotations_out(rotations) @ turns.swapaxes(1, 2)
-        away = (rotations @ shifts[:, :, None])[..., 0]
-        return [*zip(space.positions_out(positions) - away, rotations, strict=True)]
+        away = (rotations @ sits[:, :, None])[..., 0]
+        turned = space.rotations_out(rotations) @ turns.swapaxes(1, 2)
+        return [*zip(space.positions_out(positions + away), turned, strict=True)]
 
-    skeleton = stream.network.skeleton
-    pose = t_pose(skeleton, np.array([0.3, -0.2, 1.6]), 2.1)
-    head = devices(pose.positions, pose.rotations)
-    offsets = stream.calibrate(*head)
+    pose = t_pose(stream.network.skeleton, np.array([0.3, -0.2, 1.6]), 2.1)
+    offsets = stream.calibrate(*devices(pose.positions, pose.rotations))
     np.testing.assert_allclose(offsets.rotations, turns, atol=1e-9)
-    mean = (np.stack([r for _, r in head]) @ shifts[:, :, None])[..., 0].mean(0)
-    missing = (np.stack([r for _, r in head]) @ (shifts - offsets.positions)[:, :, None])[..., 0]
-    np.testing.assert_allclose(missing, np.tile(mean, (3, 1)), atol=1e-9)
+    mean = (pose.rotations @ sits[:, :, None])[..., 0].mean(0)
+    rotations = np.stack([rotation for _, rotation in devices(pose.positions, pose.rotations)])
+    missing = (rotations @ (offsets.positions - shifts)[:, :, None])[..., 0]
+    np.testing.assert_allclose(missing, np.tile(space.positions_out(mean), (3, 1)), atol=1e-9)
     exact = Stream(file, space=name, offsets=Offsets(shifts, turns))
     plain = Stream(file, space=name)
     for index in range(20):
@@ -368,7 +368,7 @@ def test_bad_times_spaces_and_outputs_are_refused(file):
         Stream(file).step(ONE, ONE, ONE, float("nan"))
     with pytest.raises(InputError, match="space=up"):
         Stream(file, space="up")
-    with pytest.raises(InputError, match="rotations=euler.*matrix, quaternion"):
+    with pytest.raises(InputError, match=r"rotations=euler.*matrix, quaternion"):
         Stream(file, rotations="euler")
     with pytest.raises(InputError, match="offsets: shapes"):
         Stream(file, offsets=Offsets(np.zeros(3), np.eye(3)))
