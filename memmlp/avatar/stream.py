@@ -44,7 +44,7 @@ class Pose(NamedTuple):
         rotations: local rotations (22, 3, 3), or quaternions xyzw (22, 4); the root's is global.
         joints: (22, 3), metres, from the network's position branch; where it has none, they follow from its
             rotations.
-        held: which of "head", "left", "right" are lost and held at their last poses.
+        held: which of "head", "left", "right" are lost at this sample, and held.
         fresh: whether this call made a frame; if not, the pose is the last frame's.
         restarted: whether the network began anew at this frame: the first, and those after `reset` or a gap.
     """

@@ -2,8 +2,9 @@
 
 The policy, in this order:
 
-- A **lost** tracker is held at its last pose; before its first sample, at the T-pose of a person under the
-  head (at the origin before the head's first). When it returns, the difference is let go over `RECOVERY`
+- A **lost** hand is held at its last pose as seen from the head: it goes with it and turns with its heading.
+  A lost head stays where it was. Before its first sample a tracker is held at the T-pose of a person under
+  the head (at the origin before the head's first). When it returns, the difference is let go over `RECOVERY`
   seconds instead of at once, which the network would take for a fast movement.
 - **Frames** lie on a grid of 1 / fps from the first sample on. One is made as soon as a sample at or after
   its time is in, between the samples beside it (positions linearly, rotations by slerp): no sample of the
@@ -30,7 +31,7 @@ from memmlp.body import (
 )
 
 GAP = 0.5  # seconds
-RECOVERY = 0.25  # seconds
+RECOVERY = 0.2  # seconds
 EARLY = 5e-4  # seconds by which a frame may be ahead of its sample: times rounded to milliseconds still count
 SAME = 1e-6  # seconds: a sample this near to a frame is the frame
 
@@ -61,10 +62,15 @@ def t_pose(skeleton: Skeleton, place: np.ndarray, heading: float) -> Tracked:
 
     heading: radians to the left of looking along -Y, where the person's left is +X.
     """
-    c, s = np.cos(heading), np.sin(heading)
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ UPRIGHT
+    turn = about_vertical(heading) @ UPRIGHT
     rest = skeleton.rest[skeleton.tracked]
     return Tracked(0.0, place + (rest - rest[0]) @ turn.T, np.tile(turn, (3, 1, 1)))
+
+
+def about_vertical(angle: float) -> np.ndarray:
+    """The rotation (3, 3) about AMASS' Z by an angle, radians."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def heading_of(rotation: np.ndarray) -> float:
@@ -103,7 +109,7 @@ class Hold:
         if sample.time < self.settled:
             self.last = self._on_their_way(sample)
         if any(lost):
-            self.last = _replaced(self.last, list(lost), last)
+            self.last = held(self.last, lost, last)
         return self.last
 
     def _first(self, sample: Tracked, lost: Lost) -> Tracked:
@@ -128,10 +134,15 @@ class Hold:
         return Tracked(sample.time, positions, turned_by(self.turn, left) @ sample.rotations)
 
 
-def _replaced(sample: Tracked, which: list[bool], last: Tracked) -> Tracked:
-    """The sample with some trackers as they were."""
+def held(sample: Tracked, lost: Lost, last: Tracked) -> Tracked:
+    """The sample with the lost trackers where they last were as seen from the head."""
     positions, rotations = sample.positions.copy(), sample.rotations.copy()
-    positions[which], rotations[which] = last.positions[which], last.rotations[which]
+    if lost[0]:
+        positions[0], rotations[0] = last.positions[0], last.rotations[0]
+    turn = about_vertical(heading_of(rotations[0]) - heading_of(last.rotations[0]))
+    hands = [index for index in (1, 2) if lost[index]]
+    positions[hands] = positions[0] + (last.positions[hands] - last.positions[0]) @ turn.T
+    rotations[hands] = turn @ last.rotations[hands]
     return Tracked(sample.time, positions, rotations)
 
 
