@@ -13,12 +13,13 @@ import tiny
 from command_line import TINY, run
 
 from memmlp.deployment import GRAPHS
-from memmlp.export import OnnxStream, export
+from memmlp.export import export
 from memmlp.features import Heading
 from memmlp.memory import CodeMemory
 from memmlp.model import WindowModel
 from memmlp.quantization import accuracy, compared, quantise, streamed
 from memmlp.runs import list_runs
+from memmlp.session import OnnxStream
 from memmlp.streaming import Stream, streaming
 
 CLIPS = [tiny.clip(60, seed=seed) for seed in range(3)]

@@ -156,7 +156,7 @@ class Stream:
             if first:  # it has no velocity: shown, but not part of the network's past, as in its training
                 self.network.peek()
             else:
-                self.network.step()
+                self.network.advance()
         self._last = self._pose(frames[-1].time, frames[-1].positions[0], _names(lost), restarted)
         return self._last
 

@@ -73,7 +73,7 @@ def _alternate(stream: Stream, onnx: Path, frames: int) -> tuple[float, float]:
 
     from memmlp.avatar.rotations import quaternion_to_matrix
     from memmlp.body import SPARSE_DIM
-    from memmlp.export import OnnxStream
+    from memmlp.session import OnnxStream
 
     random = np.random.default_rng(0)
     alone, seconds = OnnxStream(onnx), np.zeros((frames, 2))
