@@ -2,9 +2,9 @@
 
 Inputs: `tracker_positions` (1, 3, 3), metres, and `tracker_rotations` (1, 3, 3, 3), matrices, of head, left
 and right wrist, one frame at 60 Hz; and `state.*`, all zeros for a fresh start. Outputs: `rotations`
-(1, 22, 3, 3), local matrices, the root's global; `positions` (1, 22, 3), metres, by forward kinematics with
-the head on its tracker; `joints` (1, 22, 3), metres, the network's own positions; and the new `state.*` under
-the same names with the suffix `.next`. All in the frame of reference that was chosen (memmlp.avatar.spaces).
+(1, 22, 3, 3), local matrices, the root's global; `positions` (1, 22, 3), metres, by forward kinematics, the
+head on its tracker; `joints` (1, 22, 3), metres, the network's own positions; and the new `state.*` under the
+same names with the suffix `.next`. All in the frame of reference that was chosen (memmlp.avatar.spaces).
 """
 
 from __future__ import annotations
