@@ -1,0 +1,29 @@
+"""The memory slot: what the backbone is told of the past, and what is kept for the next call.
+
+A memory gives the backbone its blocks (`block`), turns the buffers of past frames into what those blocks
+see (`recall`), and updates its buffers after the network's output (`remember`). All in network space.
+"""
+
+from memmlp.memory.features import Blend, MemoryBlock, Past, ProjectedFeature, Projection, Recurred, State
+from memmlp.memory.own_past import CodeMemory, JointCodeMemory, NoCodesMemory, VQMemory
+from memmlp.memory.recurrent import GRUMemory, LSTMMemory, RecurrentMemory
+from memmlp.memory.slot import Memory, NoMemory
+
+__all__ = [
+    "Blend",
+    "CodeMemory",
+    "GRUMemory",
+    "JointCodeMemory",
+    "LSTMMemory",
+    "Memory",
+    "MemoryBlock",
+    "NoCodesMemory",
+    "NoMemory",
+    "Past",
+    "ProjectedFeature",
+    "Projection",
+    "Recurred",
+    "RecurrentMemory",
+    "State",
+    "VQMemory",
+]
