@@ -36,6 +36,10 @@ SPARSE_ROTATION = slice(0, 18)  # global rotation, 6D x 3
 SPARSE_ANGULAR_VELOCITY = slice(18, 36)  # R[t-1]^-1 R[t], 6D x 3
 SPARSE_POSITION = slice(36, 45)  # global position, metres
 SPARSE_VELOCITY = slice(45, 54)  # p[t] - p[t-1], metres per frame
+FEATURES = (
+    "joints head, left_wrist, right_wrist; 0:18 global rotation 6D, 18:36 R[t-1]^-1 R[t] 6D, "
+    "36:45 global position m, 45:54 p[t]-p[t-1] m/frame; 6D = first two columns; world Z up"
+)
 
 # One frame of motion, Theta (198).
 MOTION_DIM = 198

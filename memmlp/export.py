@@ -21,17 +21,13 @@ import torch
 from torch import Tensor, nn
 
 from memmlp import __version__
-from memmlp.body import FPS, JOINTS, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
+from memmlp.body import FEATURES, FPS, JOINTS, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.memory import Blend
 from memmlp.model import WindowModel
 from memmlp.streaming import Streaming
 
 OPSET = 18
 TOLERANCE = 1e-4
-FEATURES = (
-    "joints head, left_wrist, right_wrist; 0:18 global rotation 6D, 18:36 R[t-1]^-1 R[t] 6D, "
-    "36:45 global position m, 45:54 p[t]-p[t-1] m/frame; 6D = first two columns; world Z up"
-)
 
 
 class StreamStep(nn.Module):
@@ -68,19 +64,37 @@ def deterministic(model: nn.Module) -> Iterator[None]:
 def export(model: WindowModel | Streaming, path: Path, run_id: str) -> None:
     """Write the model's streaming step, on the CPU in float32, as one ONNX file with its metadata."""
     step = StreamStep(model.cpu().eval())
-    states = tuple(model.initial_state(1).values())
     names = [f"state.{name}" for name in step.names]
+    save(
+        step,
+        (torch.zeros(1, SPARSE_DIM), *model.initial_state(1).values()),
+        ["sparse", *names],
+        ["rotation6d", "position", *(f"{name}.next" for name in names)],
+        path,
+        metadata(model, run_id),
+    )
+
+
+def save(
+    step: nn.Module,
+    arguments: tuple[Tensor, ...],
+    inputs: list[str],
+    outputs: list[str],
+    path: Path,
+    meta: dict[str, str],
+) -> None:
+    """Write a step with named flat inputs and outputs as one ONNX file, atomically."""
     quiet = logging.getLogger("torch.onnx")
     level = quiet.level
     quiet.setLevel(logging.ERROR)
     try:
-        with warnings.catch_warnings(), deterministic(model):
+        with warnings.catch_warnings(), deterministic(step):
             warnings.simplefilter("ignore")  # the exporter's own deprecations are no news to our users
             program = torch.onnx.export(
                 step,
-                (torch.zeros(1, SPARSE_DIM), *states),
-                input_names=["sparse", *names],
-                output_names=["rotation6d", "position", *(f"{name}.next" for name in names)],
+                arguments,
+                input_names=inputs,
+                output_names=outputs,
                 opset_version=OPSET,
                 dynamo=True,
                 verbose=False,
@@ -89,7 +103,7 @@ def export(model: WindowModel | Streaming, path: Path, run_id: str) -> None:
         quiet.setLevel(level)
     assert program is not None
     graph = program.model_proto
-    onnx.helper.set_model_props(graph, metadata(model, run_id))
+    onnx.helper.set_model_props(graph, meta)
     temporary = path.with_name(path.name + ".tmp")
     onnx.save(graph, temporary)
     temporary.replace(path)
@@ -97,8 +111,12 @@ def export(model: WindowModel | Streaming, path: Path, run_id: str) -> None:
 
 def metadata(model: WindowModel | Streaming, run_id: str) -> dict[str, str]:
     """What a program needs to know to drive the file."""
+    learned = model.predictor.branches if isinstance(model, Streaming) else model.branches
     return {
         "joints": json.dumps(JOINTS),
+        "parents": json.dumps(PARENTS),
+        "rest": json.dumps(model.frame.rest.tolist()),
+        "branches": json.dumps(sorted(learned)),
         "fps": str(FPS),
         "T": str(model.frames),
         "features": FEATURES,

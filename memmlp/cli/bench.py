@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from memmlp.cli.bench_avatar import avatar, soak
 from memmlp.cli.chaos import chaos, chaos_tune
 
 
@@ -87,5 +88,7 @@ def stream(clips: int, frames: int, rounds: int, device: str, overrides: tuple[s
     )
 
 
+bench.add_command(avatar)
+bench.add_command(soak)
 bench.add_command(chaos)
 bench.add_command(chaos_tune)

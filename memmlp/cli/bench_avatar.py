@@ -1,0 +1,187 @@
+"""`memmlp bench avatar` and `memmlp bench soak`: the live stream's time, and a long stream."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from memmlp.cli.options import outputs_option
+
+if TYPE_CHECKING:
+    from memmlp.avatar.soak import Motion
+    from memmlp.avatar.stream import Stream
+    from memmlp.data.dataset import Frames
+
+
+@click.command("avatar")
+@click.option("--run", help="A finished run; without one, a network with random weights.")
+@click.option("--onnx", type=click.Path(path_type=Path), help="An ONNX file instead.")
+@click.option("--frames", default=300, show_default=True, help="Frames a round.")
+@click.option("--rounds", default=5, show_default=True, help="Rounds.")
+@click.option("--space", default="amass", show_default=True, help="Frame of reference of the poses.")
+@click.option(
+    "--rotations", default="matrix", show_default=True, help="How they come out: matrix, quaternion."
+)
+@outputs_option
+@click.argument("overrides", nargs=-1)
+def avatar(
+    run: str | None,
+    onnx: Path | None,
+    frames: int,
+    rounds: int,
+    space: str,
+    rotations: str,
+    outputs: Path,
+    overrides: tuple[str, ...],
+) -> None:
+    """A frame of the live stream beside the network's session alone: milliseconds, and the ratio.
+
+    The two take turns, frame by frame. OVERRIDES are those of `memmlp train`, for random weights; the
+    default is profile=paper. Their graph is the streaming one, where the network has it.
+    """
+    import tempfile
+
+    import numpy as np
+
+    from memmlp.avatar.stream import Stream
+    from memmlp.runs import find_run
+
+    with tempfile.TemporaryDirectory() as folder:
+        if run is not None:
+            onnx = find_run(outputs, run).onnx
+        elif onnx is None:
+            onnx = _random(overrides, Path(folder) / "step.onnx")
+        stream = Stream(onnx, space=space, rotations=rotations)
+        medians = np.array(
+            [_alternate(stream, onnx, frames) for _ in range(rounds + 1)][1:]
+        )  # one to warm up
+    ratios = medians[:, 1] / medians[:, 0]
+    session, whole = np.median(medians, 0)
+    click.echo(f"session.run  {session:7.3f} ms a frame")
+    click.echo(f"Stream.step  {whole:7.3f} ms a frame")
+    spread = f"{ratios.min():.3f} to {ratios.max():.3f} over {rounds} rounds of {frames} frames"
+    click.echo(f"ratio {np.median(ratios):.3f} ({spread})")
+
+
+def _alternate(stream: Stream, onnx: Path, frames: int) -> tuple[float, float]:
+    """Median milliseconds of the session alone and of the stream's step, in turn, over random trackers."""
+    import time
+
+    import numpy as np
+
+    from memmlp.avatar.rotations import quaternion_to_matrix
+    from memmlp.body import SPARSE_DIM
+    from memmlp.export import OnnxStream
+
+    random = np.random.default_rng(0)
+    alone, seconds = OnnxStream(onnx), np.zeros((frames, 2))
+    sparse = random.standard_normal((frames, 1, SPARSE_DIM), np.float32)
+    quaternions = random.normal(size=(frames, 3, 4))
+    turns = quaternion_to_matrix(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True))
+    places = random.normal(size=(frames, 3, 3))
+    for index in range(frames):
+        start = time.perf_counter()
+        alone.step(sparse[index])
+        middle = time.perf_counter()
+        head, left, right = zip(places[index], turns[index], strict=True)
+        stream.step(head, left, right)
+        seconds[index] = middle - start, time.perf_counter() - middle
+    session, whole = 1000 * np.median(seconds, 0)
+    return float(session), float(whole)
+
+
+def _random(overrides: tuple[str, ...], path: Path) -> Path:
+    """The ONNX file of a network with random weights."""
+    import torch
+
+    from memmlp.body import builtin_rest_joints
+    from memmlp.cli.build import build_architecture
+    from memmlp.cli.train import composed
+    from memmlp.errors import InputError
+    from memmlp.export import export
+    from memmlp.features import Frame
+    from memmlp.streaming import streaming
+
+    architecture = build_architecture(composed(["profile=paper", *overrides]))
+    torch.manual_seed(0)
+    codes = architecture.vqvae() if architecture.uses_codes else None
+    frame = Frame.raw(architecture.coordinates, torch.as_tensor(builtin_rest_joints()))
+    model = architecture.build(frame, codes).eval()
+    try:
+        export(streaming(model), path, "random")
+    except InputError:  # no streaming graph of its own
+        export(model, path, "random")
+    return path
+
+
+@click.command("soak")
+@click.argument("run", required=False)
+@click.option("--onnx", type=click.Path(path_type=Path), help="An ONNX file in the place of the run's own.")
+@click.option("--hours", default=1.0, show_default=True, help="Of motion, at least.")
+@outputs_option
+def soak(run: str | None, onnx: Path | None, hours: float, outputs: Path) -> None:
+    """Stream RUN's test clips, one after the other and over again, for hours of motion without a reset.
+
+    Whole repetitions, a multiple of ten, so that every tenth holds the same frames: prints whether all
+    numbers were finite, the MPJPE of the first and the last tenth, and the growth of memory between their
+    ends. Without RUN the motion is synthetic.
+    """
+    from memmlp.avatar.soak import repetitions
+    from memmlp.avatar.soak import soak as soaked
+    from memmlp.avatar.stream import Stream
+    from memmlp.body import FPS
+    from memmlp.errors import InputError
+    from memmlp.runs import find_run
+
+    if run is not None and onnx is None:
+        onnx = find_run(outputs, run).onnx
+    if onnx is None:
+        raise InputError("soak: neither RUN nor --onnx FILE; at least one is needed")
+    stream = Stream(onnx)
+    motion = _motion(_synthetic() if run is None else _test_clips(outputs, run))
+    times = repetitions(len(motion.joints), round(hours * 3600 * FPS))
+    result = soaked(stream, motion, times)
+    first, last = result.errors[0], result.errors[-1]
+    click.echo(f"{result.frames} frames ({result.frames / FPS / 3600:.2f} h): {times} x {len(motion.joints)}")
+    click.echo(f"all finite: {'yes' if result.finite else 'NO'}")
+    click.echo(f"MPJPE {first:.3f} cm in the first tenth, {last:.3f} cm in the last ({last - first:+.4f})")
+    click.echo(f"memory {result.growth / 2**20:+.2f} MiB from the end of the first tenth to the end")
+
+
+def _test_clips(outputs: Path, run: str) -> Frames:
+    """The test clips of a run's data."""
+    from memmlp.cli.build import build_experiment, config_of
+    from memmlp.data.dataset import Frames
+    from memmlp.runs import find_run
+
+    cache, _ = build_experiment(config_of(find_run(outputs, run))).data.prepare()
+    return Frames.open(cache, "test")
+
+
+def _synthetic() -> Frames:
+    """Test clips of synthetic motion."""
+    import tempfile
+
+    from memmlp.data.dataset import Frames
+    from memmlp.data.prepare import Source, prepare
+    from memmlp.data.splits import SeededSplit
+    from memmlp.data.synthetic import synthesize
+
+    with tempfile.TemporaryDirectory() as folder:
+        synthesize(Path(folder) / "clips", minutes=10)
+        prepare(Source(Path(folder) / "clips", SeededSplit()), Path(folder) / "cache")
+        frames = Frames.open(Path(folder) / "cache", "test")
+        return Frames(frames.frames.clone(), frames.starts, frames.lengths, frames.names)
+
+
+def _motion(frames: Frames) -> Motion:
+    """All clips one after the other, as trackers and truth."""
+    from memmlp.avatar.full import trackers_of
+    from memmlp.avatar.soak import Motion
+    from memmlp.body import N_JOINTS, POSITION, SPARSE_DIM
+
+    positions, rotations = trackers_of(frames.frames)
+    joints = frames.frames[:, SPARSE_DIM:][:, POSITION].unflatten(-1, (N_JOINTS, 3))
+    return Motion(*(part.double().numpy() for part in (positions[1:], rotations[1:], joints)))
