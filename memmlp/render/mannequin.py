@@ -31,6 +31,11 @@ class Limb(NamedTuple):
     radii: tuple[float, float]
     tip: float = 0.0
 
+    @property
+    def first(self) -> int:
+        """The joint where it begins."""
+        return self.end if self.tip else self.start
+
 
 LIMBS = (
     *(Limb(p, j, (RADII[p], RADII[j])) for j, p in enumerate(PARENTS) if p >= 0),
@@ -41,7 +46,7 @@ NEUTRAL = (0.66, 0.70, 0.74)  # of what has no error: the truth
 HEAT = ("#2b5fd9", "#27a9e1", "#3fc380", "#f2d43d", "#f28c28", "#c4161c")
 """Colours from no error to the top of the scale, evenly spaced."""
 
-SCALES = (5, 10, 15, 20, 30, 40, 50, 75, 100)  # cm at the top of a scale
+SCALES = (10, 15, 20, 30, 40, 50, 75, 100)  # cm at the top of a scale
 
 
 def ends(limb: Limb, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -53,14 +58,14 @@ def ends(limb: Limb, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return end, end + limb.tip * along
 
 
-def heat(errors: np.ndarray, top: float) -> np.ndarray:
-    """Colours (..., 3), 0 to 1, of errors (...), in the unit of the scale's top."""
+def heat(parts: np.ndarray) -> np.ndarray:
+    """Colours (..., 3), 0 to 1, of errors (...) as parts of the scale; above 1 they are as at 1."""
     anchors = np.array([[int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)] for colour in HEAT])
-    place = np.clip(np.asarray(errors) / top, 0, 1) * (len(anchors) - 1)
+    place = np.clip(parts, 0, 1) * (len(anchors) - 1)
     return np.stack([np.interp(place, range(len(anchors)), channel) for channel in anchors.T], -1)
 
 
 def scale(errors: np.ndarray) -> float:
     """The top of a scale for errors in cm: a round number that all but the largest 2 % stay below."""
     high = float(np.percentile(errors, 98))
-    return float(next((top for top in SCALES[1:] if high <= top), SCALES[-1]))
+    return float(next((top for top in SCALES if high <= top), SCALES[-1]))

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from memmlp.render.mannequin import LIMBS, Limb, ends
+from memmlp.render.mannequin import LIMBS, NEUTRAL, Limb, ends, heat
 
 SAMPLES = 2  # a pixel's side, for smooth edges
 SPHERES = 18  # of a limb
 LIGHT = np.array([-0.45, 0.65, 0.62]) / np.linalg.norm([-0.45, 0.65, 0.62])  # in the camera's axes
 AMBIENT = 0.46
 GRID = 0.5  # metres between the floor's lines
-FLOOR = 1.35  # metres around the centre in which the floor is seen; it fades out
+FLOOR = 0.56  # of a picture's width around its centre in which the floor is seen; it fades out
 SHADOW = 0.13  # metres of a shadow's blur
 
 
@@ -53,18 +53,19 @@ class Camera:
         return right[None], up[:, None]
 
 
-def draw(camera: Camera, joints: np.ndarray, colours: np.ndarray, floor: float) -> np.ndarray:
+def draw(camera: Camera, joints: np.ndarray, errors: np.ndarray | None, floor: float) -> np.ndarray:
     """A picture (height, width, 3), uint8, of one skeleton on white.
 
     Args:
-        joints: positions (22, 3), metres, world. colours: of the joints (22, 3), 0 to 1.
+        joints: positions (22, 3), metres, world.
+        errors: of the joints (22,), as parts of the colour scale; None for the truth.
         floor: its height, metres.
     """
     right, up = camera.grid()
     picture = ground(camera, joints, floor)
     depth = np.full(picture.shape[:2], -np.inf, np.float32)
     for limb in LIMBS:
-        shade(limb, camera, joints, colours, right, up, picture, depth)
+        shade(limb, camera, joints, errors, right, up, picture, depth)
     height, width = camera.height, camera.width
     smooth = picture.reshape(height, SAMPLES, width, SAMPLES, 3).mean((1, 3))
     return (smooth * 255 + 0.5).astype(np.uint8)
@@ -73,7 +74,8 @@ def draw(camera: Camera, joints: np.ndarray, colours: np.ndarray, floor: float) 
 def ground(camera: Camera, joints: np.ndarray, floor: float) -> np.ndarray:
     """White with the floor's grid and the skeleton's shadow, (height, width, 3) in samples."""
     x, y = on_floor(camera, floor)
-    fade = np.clip(1.6 * (1 - np.hypot(x - camera.centre[0], y - camera.centre[1]) / FLOOR), 0, 1)
+    far = np.hypot(x - camera.centre[0], y - camera.centre[1]) / (FLOOR * camera.width / camera.scale)
+    fade = np.clip(1.8 * (1 - far), 0, 1)
     lines = np.maximum(*(grid_lines(v, camera) for v in (x, y)))
     shadow = np.zeros_like(fade)
     for point in np.concatenate([np.linspace(*ends(limb, joints), 2) for limb in LIMBS]):
@@ -105,7 +107,7 @@ def shade(
     limb: Limb,
     camera: Camera,
     joints: np.ndarray,
-    colours: np.ndarray,
+    errors: np.ndarray | None,
     right: np.ndarray,
     up: np.ndarray,
     picture: np.ndarray,
@@ -130,8 +132,7 @@ def shade(
     normal = np.concatenate([normal, np.sqrt(np.clip(1 - (normal**2).sum(-1, keepdims=True), 0, 1))], -1)
     normal = along_tube(normal, b - a, (t > 0) & (t < 1))
     light = AMBIENT + (1 - AMBIENT) * np.clip(normal @ LIGHT, 0, 1) + 0.12 * normal[..., 2] - 0.06
-    first = colours[limb.end] if limb.tip else colours[limb.start]
-    colour = first + t[..., None] * (colours[limb.end] - first)
+    colour = np.array(NEUTRAL) if errors is None else heat(np.interp(t, (0, 1), errors[[limb.first, limb.end]]))
     picture[rows, columns][seen] = np.clip(colour * light[..., None], 0, 1)[seen]
     depth[rows, columns][seen] = near[seen]
 
