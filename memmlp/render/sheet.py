@@ -59,8 +59,8 @@ class Sheet:
 
 def palette() -> Image.Image:
     """The 256 colours of all pictures: the heat-map and the truth in light and shadow, and greys."""
-    heats = shades(heat(np.linspace(0, 1, 24)), 7)
-    colours = np.concatenate([heats, shades(np.array([NEUTRAL]), 40), shades(np.ones((1, 3)), 48)])
+    heats = shades(heat(np.linspace(0, 1, 28)), 7)
+    colours = np.concatenate([heats, shades(np.array([NEUTRAL]), 36), shades(np.ones((1, 3)), 24)])
     image = Image.new("P", (1, 1))
     image.putpalette((255 * np.clip(colours, 0, 1) + 0.5).astype(np.uint8).tobytes())
     return image
