@@ -28,7 +28,7 @@ class Browser:
             pytest.skip("Chromium is not installed (apt-get install chromium)")
         command = [
             CHROMIUM, "--headless", "--no-sandbox", "--disable-dev-shm-usage", "--no-first-run",
-            "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--host-resolver-rules=MAP * ~NOTFOUND",
+            "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
             "--remote-debugging-pipe", f"--user-data-dir={profile}", "about:blank",
         ]  # fmt: skip
         (theirs_in, self.write), (self.read, theirs_out) = os.pipe(), os.pipe()
@@ -91,6 +91,7 @@ class Browser:
     def open(self, url: str) -> None:
         """Go to a page."""
         self.call("Page.navigate", url=url)
+        self.wait(f"location.href.startsWith({url!r}) && document.readyState == 'complete'")
 
     def click(self, selector: str) -> None:
         """Press the mouse in the middle of an element."""

@@ -25,7 +25,7 @@ function greet(words) {
   $('ramp').style.background = `linear-gradient(to right, ${words.heat.join(', ')})`;
   document.querySelector('.prediction').style.background = words.heat[1];
   $('top').textContent = `${words.top}+`;
-  $('budget').textContent = `of ${(1000 / words.fps).toFixed(1)} ms between frames at ${words.fps} Hz`;
+  $('budget').textContent = `of ${(1000 / words.fps).toFixed(1)} ms at ${words.fps} Hz`;
   try {
     stage ??= new Stage(document.querySelector('canvas'), words);
   } catch (error) {

@@ -6,6 +6,7 @@ import { OrbitControls } from './three/OrbitControls.js';
 const ROUND = 20; // sides of a limb
 const RINGS = 6; // along a limb, so that its colour follows the scale
 const UP = new THREE.Vector3(0, 1, 0);
+const SUN = new THREE.Vector3(1.4, 4, 1.8); // from there too
 const START = new THREE.Vector3(1.1, 0.5, 3.2); // of the camera, from the person's middle
 
 export class Stage {
@@ -45,9 +46,9 @@ export class Stage {
     const style = getComputedStyle(document.documentElement);
     const colour = name => new THREE.Color(style.getPropertyValue(name).trim());
     this.scene.background = colour('--stage');
-    this.scene.fog = new THREE.Fog(this.scene.background, 7, 16);
+    this.scene.fog = new THREE.Fog(this.scene.background, 4, 8);
     this.scene.remove(this.grid);
-    this.grid = new THREE.GridHelper(28, 56, colour('--grid'), colour('--grid'));
+    this.grid = new THREE.GridHelper(6, 12, colour('--grid'), colour('--grid'));
     this.scene.add(this.grid);
     this.grey = colour('--truth');
   }
@@ -61,20 +62,21 @@ export class Stage {
     this.follow(truth ?? joints, frame.restarted);
   }
 
-  // Camera and light stay where they are from the person's middle.
+  // Camera and light stay where they are from the person's middle; a jump is not followed slowly.
   follow(joints, jump) {
     const lowest = Math.min(...joints.filter((_, i) => i % 3 === 1));
-    this.ground = this.ground === undefined ? lowest : Math.min(lowest, this.ground + 0.0005);
-    this.floor.position.y = this.grid.position.y = this.ground - 0.03;
-    const wanted = new THREE.Vector3(joints[0], this.ground + 0.92, joints[2]);
-    const first = this.sun.position.lengthSq() === 0 || !this.met;
-    const moved = wanted.sub(this.controls.target).multiplyScalar(first || jump ? 1 : 0.08);
-    this.controls.target.add(moved);
-    if (first) this.camera.position.copy(this.controls.target).add(this.front(joints));
-    else this.camera.position.add(moved);
-    this.sun.target.position.copy(this.controls.target);
-    this.sun.position.copy(this.controls.target).add(new THREE.Vector3(1.4, 4, 1.8));
-    this.met = true;
+    this.ground = Math.min(lowest, this.ground ?? lowest);
+    const target = this.controls.target;
+    const moved = new THREE.Vector3(joints[0], this.ground + 0.88, joints[2]).sub(target);
+    const now = performance.now();
+    if (this.met && !jump) moved.multiplyScalar(1 - Math.exp(-(now - this.met) / 250));
+    target.add(moved);
+    this.camera.position.add(this.met ? moved : target.clone().add(this.front(joints)));
+    this.met = now;
+    this.sun.target.position.copy(target);
+    this.sun.position.copy(target).add(SUN);
+    this.floor.position.set(target.x, this.ground - 0.03, target.z);
+    this.grid.position.set(Math.round(2 * target.x) / 2, this.ground - 0.03, Math.round(2 * target.z) / 2);
   }
 
   // The camera's place from the person's middle, so that she is seen from the front, a little from the side.
