@@ -11,6 +11,8 @@ import click
 from memmlp.cli.options import outputs_option
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from memmlp.player.sources import Clip, ClipSource, Source
 
 PORT = click.IntRange(1, 65535)
@@ -26,7 +28,11 @@ PORT = click.IntRange(1, 65535)
     help="Frame of reference of the packets.",
 )  # fmt: skip
 @click.option(
-    "--hz", default=60.0, show_default=True, type=click.FloatRange(10, 1000), help="Samples a second of a clip."
+    "--hz",
+    default=60.0,
+    show_default=True,
+    type=click.FloatRange(10, 1000),
+    help="Samples a second of a clip.",
 )
 @click.option("--port", default=8765, show_default=True, type=click.IntRange(0, 65535), help="Of the page.")
 @click.option("--no-browser", is_flag=True, help="Only say where the page is.")
@@ -46,8 +52,8 @@ def live(
 ) -> None:
     """A finished run (id, its beginning, or folder) or an ONNX file, live, on a page of this machine.
 
-    It is fed a clip in real time, over and over, or tracker poses that arrive as packets (the README has their
-    format). Ctrl-C ends it.
+    It is fed a clip in real time, over and over, or tracker poses that arrive as packets (memmlp.player.packets
+    and the README tell their format). Ctrl-C ends it.
     """
     from memmlp.errors import InputError
     from memmlp.player.packets import needs_osc
@@ -63,7 +69,9 @@ def live(
         if send:
             sent(clip_source(network, clip, hz, outputs, rounds=1), udp, osc)
         else:
-            watched(network, source_of(network, clip, udp, osc, space, hz, outputs), port, no_browser, outputs)
+            watched(
+                network, source_of(network, clip, udp, osc, space, hz, outputs), port, no_browser, outputs
+            )
 
 
 def source_of(
@@ -97,7 +105,9 @@ def clip_of(network: str, clip: str | None, outputs: Path) -> Clip:
     if clip is not None and clip.endswith(".npz"):
         return Clip(Path(clip).stem, npz_frames(Path(clip)))
     if network.endswith(".onnx"):
-        raise InputError(f"{network}: has no test clips; allowed with it are --clip FILE.npz, --udp and --osc")
+        raise InputError(
+            f"{network}: has no test clips; allowed with it are --clip FILE.npz, --udp and --osc"
+        )
     from memmlp.cli.opened import clip_index, opened
 
     test = opened(outputs, network).test
@@ -105,7 +115,7 @@ def clip_of(network: str, clip: str | None, outputs: Path) -> Clip:
     return Clip(test.names[index], test.clip(index).numpy())
 
 
-def npz_frames(path: Path):  # type: ignore[no-untyped-def]
+def npz_frames(path: Path) -> np.ndarray:
     """Frames (N, 252) at 60 Hz of an AMASS npz on the built-in body."""
     import torch
 
@@ -143,10 +153,13 @@ def watched(network: str, source: Source, port: int, no_browser: bool, outputs: 
     from memmlp.runs import find_run
 
     with contextlib.closing(source):
-        is_file = network.endswith(".onnx")
-        run = Path(network) if is_file else find_run(outputs, network)
-        stream = Stream(run, space=source.space)
-        hub = Hub(greeting(source, Path(network).name if is_file else f"run {run.id[:8]}"))
+        if network.endswith(".onnx"):
+            file, name = Path(network), Path(network).name
+        else:
+            run = find_run(outputs, network)
+            file, name = run.onnx, f"run {run.id[:8]}"
+        stream = Stream(file, space=source.space)
+        hub = Hub(greeting(source, name))
         with Server(hub, port) as server:
             click.echo(f"{server.url}  {source.name}; Ctrl-C ends")
             if not no_browser:

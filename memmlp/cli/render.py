@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from memmlp.cli.opened import Opened
+    from memmlp.render.take import Take
 
 SUFFIXES = (".png", ".gif", ".mp4")
 
@@ -29,10 +30,16 @@ SUFFIXES = (".png", ".gif", ".mp4")
     help="Forward kinematics of the rotations with the head on its tracker, or the positions as they are.",
 )  # fmt: skip
 @click.option("--mode", default="stream", show_default=True, type=click.Choice(["stream", "window"]))
-@click.option("--from", "begin", default=0.0, show_default=True, type=click.FloatRange(min=0), help="Seconds.")
+@click.option(
+    "--from", "begin", default=0.0, show_default=True, type=click.FloatRange(min=0), help="Seconds."
+)
 @click.option("--to", "end", type=click.FloatRange(min=0, min_open=True), help="Seconds.  [default: the end]")
 @click.option(
-    "--frames", default=6, show_default=True, type=click.IntRange(1, 20), help="Poses of a PNG, evenly spaced."
+    "--frames",
+    default=6,
+    show_default=True,
+    type=click.IntRange(1, 20),
+    help="Poses of a PNG, evenly spaced.",
 )
 @outputs_option
 def render(
@@ -83,7 +90,7 @@ def check(out: Path, runs: tuple[str, ...], labels: tuple[str, ...]) -> None:
         raise InputError(f"{'--label' if labels else 'RUNS'}: one is there twice; allowed are different ones")
 
 
-def taken(runs: list[Opened], labels: tuple[str, ...], clip: str | None, branch: str, mode: str):  # type: ignore[no-untyped-def]
+def taken(runs: list[Opened], labels: tuple[str, ...], clip: str | None, branch: str, mode: str) -> Take:
     """The whole clip as these runs predict it."""
     import numpy as np
 
@@ -96,7 +103,9 @@ def taken(runs: list[Opened], labels: tuple[str, ...], clip: str | None, branch:
         truth, predictions[label] = predicted(run, title, branch, mode)
         truths.append(truth)
         if truth.shape != truths[0].shape or not np.array_equal(truth, truths[0]):
-            raise InputError(f"run {run.run.id}: {title} is another motion or body there than in the first run")
+            raise InputError(
+                f"run {run.run.id}: {title} is another motion or body there than in the first run"
+            )
     return Take(title, truths[0], predictions)
 
 
@@ -116,7 +125,7 @@ def predicted(run: Opened, clip: str, branch: str, mode: str) -> tuple[np.ndarra
     return evaluation.joint_positions(frames[:, SPARSE_DIM:]).numpy(), positions.numpy()
 
 
-def cut(take, begin: float, end: float | None):  # type: ignore[no-untyped-def]
+def cut(take: Take, begin: float, end: float | None) -> Take:
     """The piece of a clip between two times, seconds."""
     from dataclasses import replace
 

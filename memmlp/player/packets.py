@@ -25,7 +25,8 @@ POSE = 7  # numbers
 PREFIX = "/memmlp/"
 FARTHEST = 1e6  # of any number in a pose
 
-Tracker = tuple[np.ndarray, np.ndarray]
+Tracker = tuple[np.ndarray, np.ndarray] | None
+Trackers = tuple[Tracker, Tracker, Tracker]
 
 
 class Packet(NamedTuple):
@@ -37,7 +38,7 @@ class Packet(NamedTuple):
         seq: the sample's number; None where it sent none.
     """
 
-    trackers: tuple[Tracker | None, ...]
+    trackers: Trackers
     time: float | None = None
     seq: int | None = None
 
@@ -100,7 +101,8 @@ def packet(fields: Mapping[str, Any]) -> Packet:
         raise ValueError("time: no number")
     if seq is not None and (not isinstance(seq, int) or isinstance(seq, bool)):
         raise ValueError("seq: no integer")
-    return Packet(tuple(_tracker(name, fields.get(name)) for name in TRACKERS), time, seq)
+    head, left, right = (_tracker(name, fields.get(name)) for name in TRACKERS)
+    return Packet((head, left, right), time, seq)
 
 
 def needs_osc() -> None:
@@ -108,10 +110,12 @@ def needs_osc() -> None:
     try:
         import pythonosc  # noqa: F401
     except ImportError:
-        raise InputError("--osc: needs python-osc, pip install 'memmlp[osc]'; allowed without: --udp") from None
+        raise InputError(
+            "--osc: needs python-osc, pip install 'memmlp[osc]'; allowed without: --udp"
+        ) from None
 
 
-def _tracker(name: str, values: Any) -> Tracker | None:
+def _tracker(name: str, values: Any) -> Tracker:
     if values is None:
         return None
     if not isinstance(values, list) or len(values) != POSE or not all(map(_number, values)):

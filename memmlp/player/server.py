@@ -153,7 +153,7 @@ class Server(ThreadingHTTPServer):
         """Bind to the port of this machine."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         bound(self.socket, self.wanted)
-        self.server_address = self.socket.getsockname()
+        self.server_address = (HOST, self.socket.getsockname()[1])
         self.server_name, self.server_port = self.server_address
 
     @property

@@ -15,7 +15,7 @@ from memmlp.avatar.rotations import matrix_to_quaternion, sixd_to_matrix
 from memmlp.avatar.trackers import Tracked, between
 from memmlp.body import FPS, MOTION_DIM, N_JOINTS, POSITION, SPARSE_DIM, SPARSE_POSITION, SPARSE_ROTATION
 from memmlp.errors import InputError
-from memmlp.player.packets import Packet, Parse, Tracker
+from memmlp.player.packets import Packet, Parse, Trackers
 
 HOST = "127.0.0.1"
 WAIT = 0.25  # seconds that `read` waits at most
@@ -27,7 +27,7 @@ class Sample(NamedTuple):
     """What a source gives: the trackers at a time (seconds), and how many samples were lost before it."""
 
     time: float
-    trackers: tuple[Tracker | None, ...]
+    trackers: Trackers
     dropped: int = 0
 
 
@@ -35,13 +35,12 @@ class Source(Protocol):
     """Tracker poses, one sample after the other.
 
     Attributes:
-        name: in words. space: frame of reference of its poses. hz: samples a second; None if not known.
+        name: in words. space: frame of reference of its poses.
         malformed: how many packets were none.
     """
 
     name: str
     space: str
-    hz: float | None
     malformed: int
 
     def read(self) -> Sample | None:
@@ -69,12 +68,13 @@ class Clip:
         self.joints = frames[:, SPARSE_DIM : SPARSE_DIM + MOTION_DIM][:, POSITION].reshape(-1, N_JOINTS, 3)
         self.seconds = (len(frames) - 1) / FPS
 
-    def trackers(self, time: float) -> tuple[Tracker, ...]:
-        """Position and quaternion xyzw of head, left and right wrist at a time, between the frames beside it."""
+    def trackers(self, time: float) -> Trackers:
+        """Position and quaternion xyzw of head, left and right wrist at a time, between frames."""
         first, _ = self._place(time)
         a, b = (Tracked(i / FPS, self.positions[i], self.rotations[i]) for i in (first, first + 1))
         sample = between(a, b, time)
-        return tuple(zip(sample.positions, matrix_to_quaternion(sample.rotations), strict=True))
+        head, left, right = zip(sample.positions, matrix_to_quaternion(sample.rotations), strict=True)
+        return head, left, right
 
     def truth(self, time: float) -> np.ndarray:
         """Joints (22, 3), metres, world, at a time."""
@@ -154,8 +154,6 @@ class PacketSource:
         InputError: where the port is taken.
     """
 
-    hz = None
-
     def __init__(self, name: str, port: int, parse: Parse, space: str):
         self.parse, self.space, self.malformed = parse, space, 0
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -202,7 +200,9 @@ def bound(listener: socket.socket, port: int) -> None:
         listener.close()
         if error.errno not in (errno.EADDRINUSE, errno.EACCES):
             raise
-        raise InputError(f"port {port}: taken, or not allowed; allowed is another one, 1024 to 65535") from None
+        raise InputError(
+            f"port {port}: taken, or not allowed; allowed is another one, 1024 to 65535"
+        ) from None
 
 
 def send(source: ClipSource, port: int, pack: Callable[[Packet], bytes]) -> int:

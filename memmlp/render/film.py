@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from io import BytesIO
 from itertools import chain, cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +47,10 @@ def pictures(take: Take) -> Iterator[np.ndarray]:
     for x, label in zip(middles, labels, strict=True):
         sheet.text(x, 64, label, 19, weight="bold")
     panels = [sheet.panel(column * WIDTH, TOP, WIDTH, HEIGHT) for column in range(len(labels))]
-    means = {k: sheet.text(x, TOP + HEIGHT + 18, "", 18, color=FAINT) for x, k in zip(middles[1:], labels[1:], strict=True)}
+    means = {
+        k: sheet.text(x, TOP + HEIGHT + 18, "", 18, color=FAINT)
+        for x, k in zip(middles[1:], labels[1:], strict=True)
+    }
     sheet.colour_bar(len(labels) * WIDTH + 16, TOP + 60, 16, HEIGHT - 120, take.top)
     path, azimuth = take.path(), take.azimuth(len(take.truth) // 2)
     for frame in track(range(0, len(take.truth), EVERY), "pictures"):
@@ -81,7 +85,7 @@ def mp4(pictures: Iterable[np.ndarray]) -> bytes:
     return buffer.getvalue()
 
 
-def pyav():  # type: ignore[no-untyped-def]
+def pyav() -> Any:
     """The module `av`. Raises InputError where it is not installed."""
     try:
         import av

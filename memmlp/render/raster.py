@@ -1,4 +1,4 @@
-"""Skeletons as shaded bodies on a floor, in NumPy: rows of spheres, a depth buffer, a camera without vanishing point."""
+"""Skeletons as shaded bodies on a floor, in NumPy: rows of spheres, a depth buffer, parallel projection."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def on_floor(camera: Camera, floor: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def grid_lines(along: np.ndarray, camera: Camera) -> np.ndarray:
-    """How much (height, width), 0 to 1, of each pixel lies on the grid's lines across a floor's coordinate."""
+    """How much (height, width), 0 to 1, of each pixel lies on the grid's lines of a coordinate."""
     off = np.abs((along / GRID + 0.5) % 1 - 0.5) * GRID
     pixel = np.hypot(*np.gradient(along))  # metres of the floor that a pixel covers
     return np.clip(1.2 - off / np.maximum(pixel, 1e-6), 0, 1)
@@ -132,12 +132,16 @@ def shade(
     normal = np.concatenate([normal, np.sqrt(np.clip(1 - (normal**2).sum(-1, keepdims=True), 0, 1))], -1)
     normal = along_tube(normal, b - a, (t > 0) & (t < 1))
     light = AMBIENT + (1 - AMBIENT) * np.clip(normal @ LIGHT, 0, 1) + 0.12 * normal[..., 2] - 0.06
-    colour = np.array(NEUTRAL) if errors is None else heat(np.interp(t, (0, 1), errors[[limb.first, limb.end]]))
+    colour = (
+        np.array(NEUTRAL) if errors is None else heat(np.interp(t, (0, 1), errors[[limb.first, limb.end]]))
+    )
     picture[rows, columns][seen] = np.clip(colour * light[..., None], 0, 1)[seen]
     depth[rows, columns][seen] = near[seen]
 
 
-def box(centre: list[np.ndarray], radius: np.ndarray, right: np.ndarray, up: np.ndarray) -> tuple[slice, slice]:
+def box(
+    centre: list[np.ndarray], radius: np.ndarray, right: np.ndarray, up: np.ndarray
+) -> tuple[slice, slice]:
     """Rows and columns of the samples that spheres can cover."""
     columns = np.searchsorted(right[0], [(centre[0] - radius).min(), (centre[0] + radius).max()])
     rows = np.searchsorted(-up[:, 0], [(-centre[1] - radius).min(), (-centre[1] + radius).max()])

@@ -56,7 +56,6 @@ class Sheet:
         return np.asarray(self.canvas.buffer_rgba())[..., :3]
 
 
-
 def palette() -> Image.Image:
     """The 256 colours of all pictures: the heat-map and the truth in light and shadow, and greys."""
     heats = shades(heat(np.linspace(0, 1, 28)), 7)
