@@ -67,7 +67,9 @@ def test_frames_come_at_60_hz_whatever_the_trackers(network: Path, clip: Clip):
 def test_truth_and_prediction_in_the_pages_axes(network: Path, clip: Clip):
     message = played(network, clip, 90)[30]
     truth = clip.truth(0.5)
-    assert message["truth"] == pytest.approx(1000 * truth[:, [0, 2, 1]].ravel() * np.tile([1, 1, -1], 22), abs=1)
+    assert message["truth"] == pytest.approx(
+        1000 * truth[:, [0, 2, 1]].ravel() * np.tile([1, 1, -1], 22), abs=1
+    )
     joints = np.array(message["joints"]).reshape(22, 3)
     assert joints[15] == pytest.approx(np.array(message["truth"]).reshape(22, 3)[15], abs=1)
     assert message["ms"] > 0

@@ -106,7 +106,13 @@ def test_malformed_and_missing_packets_are_counted():
     arrives = PacketSource("UDP", 0, from_json, "amass")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         head = '"head": [0, 0, 1.6, 0, 0, 0, 1]'
-        for text in (f'{{{head}, "seq": 4}}', "nonsense", "", f'{{{head}, "seq": 8}}', f'{{{head}, "seq": 2}}'):
+        for text in (
+            f'{{{head}, "seq": 4}}',
+            "nonsense",
+            "",
+            f'{{{head}, "seq": 8}}',
+            f'{{{head}, "seq": 2}}',
+        ):
             sender.sendto(text.encode(), (HOST, arrives.port))
         samples = [arrives.read() for _ in range(5)]
     assert [s and s.dropped for s in samples] == [0, None, None, 3, 0]

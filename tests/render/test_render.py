@@ -116,7 +116,9 @@ def test_png(tmp_path: Path, take: Take):
         )
         pixels = np.asarray(image.convert("RGB"))
     step = figure.HEIGHT + figure.CAPTION
-    rows = [pixels[figure.TOP + row * step :][: figure.HEIGHT, figure.LEFT : -figure.RIGHT] for row in range(3)]
+    rows = [
+        pixels[figure.TOP + row * step :][: figure.HEIGHT, figure.LEFT : -figure.RIGHT] for row in range(3)
+    ]
     vivid = [(row.max(-1).astype(int) - row.min(-1) > 60).mean() for row in rows]
     assert vivid[0] < 0.001 < vivid[1]
     assert colour(rows[1]).argmax() == 2
