@@ -84,7 +84,7 @@ def evaluate(
     The mean is over clips of each clip's mean over frames. At most `batch` clips stand side by side. What
     `ik` makes of the two branches is a branch more.
     """
-    clips = [frames.clip(i) for i in range(len(frames.names))]
+    clips = frames.clips()
     rows: list[dict[str, Any]] = [
         {"name": name, "frames": len(clip)} for name, clip in zip(frames.names, clips, strict=True)
     ]
@@ -130,7 +130,7 @@ def joint_positions(motion: Tensor) -> Tensor:
 
 def chunks(frames: Frames, length: int, least: int) -> list[Tensor]:
     """A split's clips cut into pieces of `length` frames, those under `least` left out unless alone."""
-    pieces = [p for i in range(len(frames.names)) for p in frames.clip(i).split(length)]
+    pieces = [piece for clip in frames.clips() for piece in clip.split(length)]
     return [p for p in pieces if len(p) >= least] or pieces
 
 

@@ -24,7 +24,7 @@ from memmlp import __version__
 from memmlp.body import FEATURES, FPS, JOINTS, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.memory import Blend
 from memmlp.model import WindowModel
-from memmlp.streaming import Streaming
+from memmlp.streaming import Stream
 
 OPSET = 18
 TOLERANCE = 1e-4
@@ -33,7 +33,7 @@ TOLERANCE = 1e-4
 class StreamStep(nn.Module):
     """One step of the live stream with flat inputs and outputs."""
 
-    def __init__(self, model: WindowModel | Streaming):
+    def __init__(self, model: WindowModel | Stream):
         super().__init__()
         self.model = model
         self.names = list(model.initial_state(1))
@@ -61,7 +61,7 @@ def deterministic(model: nn.Module) -> Iterator[None]:
             blend.value = value
 
 
-def export(model: WindowModel | Streaming, path: Path, run_id: str) -> None:
+def export(model: WindowModel | Stream, path: Path, run_id: str) -> None:
     """Write the model's streaming step, on the CPU in float32, as one ONNX file with its metadata."""
     step = StreamStep(model.cpu().eval())
     names = [f"state.{name}" for name in step.names]
@@ -109,14 +109,13 @@ def save(
     temporary.replace(path)
 
 
-def metadata(model: WindowModel | Streaming, run_id: str) -> dict[str, str]:
+def metadata(model: WindowModel | Stream, run_id: str) -> dict[str, str]:
     """What a program needs to know to drive the file."""
-    learned = model.predictor.branches if isinstance(model, Streaming) else model.branches
     return {
         "joints": json.dumps(JOINTS),
         "parents": json.dumps(PARENTS),
         "rest": json.dumps(model.frame.rest.tolist()),
-        "branches": json.dumps(sorted(learned)),
+        "branches": json.dumps(sorted(model.branches)),
         "fps": str(FPS),
         "T": str(model.frames),
         "features": FEATURES,
@@ -126,11 +125,17 @@ def metadata(model: WindowModel | Streaming, run_id: str) -> dict[str, str]:
 
 
 class OnnxStream:
-    """The exported step in ONNX Runtime on one thread, with its state."""
+    """The exported step in ONNX Runtime on one thread, with its state.
 
-    def __init__(self, path: Path):
+    Args:
+        path: the ONNX file. profile: where ONNX Runtime's profile goes, if anywhere: the start of the path.
+    """
+
+    def __init__(self, path: Path, profile: Path | None = None):
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
+        if profile is not None:
+            options.enable_profiling, options.profile_file_prefix = True, str(profile)
         self.session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         self.shapes = {i.name: i.shape for i in self.session.get_inputs() if i.name != "sparse"}
         self.reset()

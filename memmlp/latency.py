@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import tempfile
 import time
+from collections import defaultdict
+from collections.abc import Hashable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import onnx
@@ -16,8 +20,11 @@ from torch.utils.flop_counter import FlopCounterMode
 from memmlp.body import SPARSE_DIM
 from memmlp.export import OnnxStream
 from memmlp.model import WindowModel
+from memmlp.streaming import Stream
 
 WARM_UP = 30
+SETTLING = 3
+Key = TypeVar("Key", bound=Hashable)
 REFERENCE_SHAPE = (41, 512, 8)  # rows, width, layers: 86 M multiply-adds of plain matrix products
 
 
@@ -48,10 +55,51 @@ def measure(path: Path, steps: int = 200) -> dict[str, Any]:
     }
 
 
-def size(model: WindowModel, path: Path) -> dict[str, Any]:
-    """Parameters, MACs and FLOPs of one streaming step, and the file's bytes.
+def interleaved(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, np.ndarray]:
+    """Seconds (rounds, steps) a step of each exported file, one thread, the files in turn in each round.
+
+    A file's first steps of a round, in which the caches fill, do not count.
+    """
+    streams = {key: OnnxStream(path) for key, path in paths.items()}
+    seconds = {key: np.zeros((rounds, steps)) for key in paths}
+    sparse = np.random.default_rng(0).standard_normal((1, SPARSE_DIM), np.float32)
+    for index in range(rounds):
+        for key, stream in streams.items():
+            for step in range(-SETTLING, steps):
+                start = time.perf_counter()
+                stream.step(sparse)
+                if step >= 0:
+                    seconds[key][index, step] = time.perf_counter() - start
+    return seconds
+
+
+def profile(path: Path, steps: int = 100) -> list[tuple[str, str, float, float]]:
+    """Where a step's time goes: operation, shape of its first input, times a step, microseconds each.
+
+    The median of each, by ONNX Runtime's own profile, which adds one or two microseconds to each; the
+    costliest first.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        stream = OnnxStream(path, profile=Path(folder) / "profile")
+        for _ in range(WARM_UP + steps):
+            stream.step(np.zeros((1, SPARSE_DIM), np.float32))
+        events = json.loads(Path(stream.session.end_profiling()).read_text())
+    found: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for event in events:
+        if event.get("cat") == "Node" and event["name"].endswith("kernel_time"):
+            shapes = [next(iter(shape.values())) for shape in event["args"].get("input_type_shape", [])]
+            found[event["args"]["op_name"], str(shapes[0]) if shapes else ""].append(event["dur"])
+    rows = [(*key, len(us) / (WARM_UP + steps), float(np.median(us))) for key, us in found.items()]
+    return sorted(rows, key=lambda row: -row[2] * row[3])
+
+
+def size(model: WindowModel, step: WindowModel | Stream, path: Path) -> dict[str, Any]:
+    """Parameters, MACs and FLOPs of the network, which the papers count, MACs of the step, the file's bytes.
 
     A FLOP is a multiplication or an addition of the matrix products, a MAC one of each.
+
+    Args:
+        model: the network as it was trained. step: what was exported of it. path: that file.
     """
     multiplied = macs(model.cpu().eval())
     return {
@@ -59,12 +107,13 @@ def size(model: WindowModel, path: Path) -> dict[str, Any]:
         "parameters_with_vqvae": sum(p.numel() for p in model.parameters()),
         "macs": multiplied,
         "flops": 2 * multiplied,
+        "step_macs": macs(step.cpu().eval()),
         "onnx_bytes": path.stat().st_size,
     }
 
 
 @torch.no_grad()
-def macs(model: WindowModel) -> int:
+def macs(model: WindowModel | Stream) -> int:
     """Multiply-adds of the matrix products of one streaming step."""
     with FlopCounterMode(display=False) as counter:
         model.advance(torch.zeros(1, 1, SPARSE_DIM), model.initial_state(1), 1)

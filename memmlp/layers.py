@@ -58,15 +58,6 @@ class ResidualFusion(MLPBlock):
         h = h + F.silu(self.time_mix(self.time_norm(h)))
         return h + F.silu(self.linear(torch.cat([self.norm(h), z], -1)))
 
-    def share(self) -> tuple[Tensor, Tensor]:
-        """Weight (d, k) and bias (d,) of what a memory feature adds within `fuse`, frame by frame."""
-        return self.linear.weight[:, self.norm.normalized_shape[0] :], self.linear.bias
-
-    def inject(self, h: Tensor, injection: Tensor) -> Tensor:
-        """`fuse` with that share (B, T, d) computed before: the same to rounding."""
-        h = h + F.silu(self.time_mix(self.time_norm(h)))
-        return h + F.silu(F.linear(self.norm(h), self.linear.weight[:, : h.shape[-1]]) + injection)
-
 
 class PlainFusion(MLPBlock):
     """An MLP block, then Linear([h; z]) from d + k to d without a residual: the literal concatenation."""
@@ -78,11 +69,3 @@ class PlainFusion(MLPBlock):
     def fuse(self, h: Tensor, z: Tensor) -> Tensor:
         """Hidden state (B, T, d) and memory feature (B, T, k) -> (B, T, d)."""
         return self.merge(torch.cat([super().forward(h), z], -1))
-
-    def share(self) -> tuple[Tensor, Tensor]:
-        """Weight (d, k) and bias (d,) of what a memory feature adds within `fuse`, frame by frame."""
-        return self.merge.weight[:, self.norm.normalized_shape[0] :], self.merge.bias
-
-    def inject(self, h: Tensor, injection: Tensor) -> Tensor:
-        """`fuse` with that share (B, T, d) computed before: the same to rounding."""
-        return F.linear(super().forward(h), self.merge.weight[:, : h.shape[-1]]) + injection

@@ -6,9 +6,8 @@ see (`recall`), and updates its buffers after the network's output (`remember`).
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -71,34 +70,8 @@ class Blend(nn.Module):
         return self.value
 
 
-class Projections(nn.Module):
-    """The projections that several blocks make of one input, at once, for a stream of one frame a call."""
-
-    def __init__(self, parts: Sequence[Projection]):
-        super().__init__()
-        self.shape = len(parts), parts[0].norm.normalized_shape[0]
-        self.weight = nn.Parameter(torch.cat([part.linear.weight for part in parts]))
-        self.bias = nn.Parameter(torch.cat([part.linear.bias for part in parts]))
-        self.scale = nn.Parameter(torch.stack([part.norm.weight for part in parts]))
-        self.offset = nn.Parameter(torch.stack([part.norm.bias for part in parts]))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(1, 1, size) -> (1, blocks, k)."""
-        y = F.linear(x[0], self.weight, self.bias).view(1, *self.shape)
-        return F.silu(F.layer_norm(y, self.shape[1:]) * self.scale + self.offset)
-
-
 class ProjectedFeature(nn.Module):
     """A memory feature made of projections."""
-
-    @staticmethod
-    def together(features: Sequence[nn.Module]) -> nn.Module:
-        """What gives the features (1, blocks, k) of all blocks at once, from the past of one frame."""
-        whole = copy.deepcopy(features[0])
-        for name, child in list(whole.named_children()):
-            if isinstance(child, Projection):
-                setattr(whole, name, Projections([getattr(feature, name) for feature in features]))
-        return whole
 
 
 class CodeFeature(ProjectedFeature):
@@ -163,16 +136,6 @@ class Memory(nn.Module):
     length: int
     frames: int
     settled: bool = True
-
-    def frame_by_frame(self) -> Self:
-        """The same memory, its modules shared, over windows of one frame: what each new frame brings in."""
-        narrow = copy.copy(self)
-        narrow.frames, narrow.length = 1, self.length - self.frames + 1
-        return narrow
-
-    def before(self, first: Tensor) -> Tensor:
-        """The memory features of the frames before the first one, given that of the first."""
-        return first
 
     def block(self, layer: int) -> nn.Module:
         """The backbone's block of that layer (1-based)."""
@@ -470,23 +433,6 @@ class RecurredFeature(nn.Module):
         """The memory feature (B, T, k)."""
         return past.features[:, self.index]
 
-    @staticmethod
-    def together(features: Sequence[Any]) -> nn.Module:
-        """What gives the features (1, blocks, k) of all blocks at once, from the past of one frame."""
-        return AllRecurred([feature.index for feature in features])
-
-
-class AllRecurred(nn.Module):
-    """The features of recurrent layers, in the order of those indices, at one frame."""
-
-    def __init__(self, indices: Sequence[int]):
-        super().__init__()
-        self.indices = list(indices)
-
-    def forward(self, past: Recurred) -> Tensor:
-        """(1, blocks, k)."""
-        return past.features[:, self.indices, -1]
-
 
 class RecurrentMemory(FeatureMemory):
     """A recurrent layer for each block in place of the paper's memory (Table 15, reading 19).
@@ -529,10 +475,6 @@ class RecurrentMemory(FeatureMemory):
         blocks = len(self.recurrences)
         states = {name: torch.zeros(batch, blocks, self.width) for name in self.recurrence.carried}
         return states | {"features": torch.zeros(batch, blocks, self.frames - 1, self.width)}
-
-    def before(self, first: Tensor) -> Tensor:
-        """Zeros, the outputs of a layer that has seen nothing."""
-        return torch.zeros_like(first)
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
         """Hidden states from the last of inputs (B, length, 54)."""

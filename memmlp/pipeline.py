@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from memmlp import checkpoint, evaluation, latency
+from memmlp import checkpoint, evaluation
 from memmlp.body import SPARSE_DIM
 from memmlp.data.dataset import Frames
 from memmlp.data.motion import Motion
 from memmlp.data.prepare import Manifest
-from memmlp.export import TOLERANCE, export, parity
+from memmlp.deployment import Deployment
 from memmlp.features import Frame, World
 from memmlp.files import write_json
 from memmlp.identity import run_id
@@ -142,7 +142,7 @@ class Experiment:
     modes: Sequence[str]
     evaluation_batch: int
     ik: IK
-    latency_steps: int
+    deployment: Deployment
     save_predictions: Path | None
     tracker: Tracker
 
@@ -242,13 +242,13 @@ def motion_run(
     write_json(run.clips, results["clips"])
     picture(model, test, run)
     seconds["evaluate"], started = time.monotonic() - started, time.monotonic()
-    export_checked(model, run, test.clip(0))
-    measured = latency.measure(run.onnx, experiment.latency_steps) | latency.size(model, run.onnx)
+    train = Frames.open(cache, "train").clips()
+    measured = experiment.deployment.ship(model, run, train, test.clips())
     write_json(run.latency, measured)
     seconds["export"] = time.monotonic() - started
     write_json(run.results_path, {**results["mean"], "latency": measured})
     run.write_manifest({"seconds": {name: round(value, 1) for name, value in seconds.items()}})
-    run.finish(MOTION_ARTIFACTS)
+    run.finish([*MOTION_ARTIFACTS, *(["step.int8.onnx"] if run.int8.exists() else [])])
 
 
 def trained(
@@ -281,15 +281,6 @@ def trained(
     return model.eval()
 
 
-def export_checked(model: WindowModel, run: Run, clip: Tensor) -> None:
-    """Write the run's ONNX file and prove it on a whole clip (N, 252)."""
-    export(model, run.onnx, run.id)
-    worst = parity(model, run.onnx, clip)
-    run.write_manifest({"onnx_parity": worst})
-    if not worst <= TOLERANCE:
-        raise RuntimeError(f"{run.onnx}: ONNX Runtime differs from torch by {worst:.2e} (> {TOLERANCE:.0e})")
-
-
 def picture(model: WindowModel, test: Frames, run: Run) -> None:
     """Draw the start of the first test clip, streamed."""
     device = model.frame.rest.device
@@ -304,7 +295,7 @@ def save_predictions(experiment: Experiment, model: WindowModel, cache: Path) ->
     """Write `<folder>/<mode>/<clip>.npz` for every test clip: positions (N, 22, 3) and rotations."""
     assert experiment.save_predictions is not None
     test = Frames.open(cache, "test").to(experiment.device)
-    clips = [test.clip(i) for i in range(len(test.names))]
+    clips = test.clips()
     for mode in experiment.modes:
         motions = evaluation.predict(model, clips, mode, experiment.evaluation_batch)
         for name, clip, motion in zip(test.names, clips, motions, strict=True):

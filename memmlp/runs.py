@@ -67,6 +67,7 @@ class Run:
         "clips.json",
         "results.json",
         "step.onnx",
+        "step.int8.onnx",
         "latency.json",
         "poses.png",
         "FAILED",
@@ -83,6 +84,7 @@ class Run:
         self.clips = self.folder / "clips.json"
         self.results_path = self.folder / "results.json"
         self.onnx = self.folder / "step.onnx"
+        self.int8 = self.folder / "step.int8.onnx"
         self.latency = self.folder / "latency.json"
         self.marker = self.folder / "DONE"
         self._repaired = False

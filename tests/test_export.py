@@ -78,7 +78,7 @@ def test_latency_and_size(exported):
     assert measured["steps"] == 200
     assert 0 < measured["median_ms"] <= measured["p95_ms"]
     assert measured["ratio_to_reference"] > 0
-    size = latency.size(model, path)
+    size = latency.size(model, model, path)
     assert size["flops"] == 2 * size["macs"] > 0
     assert size["onnx_bytes"] == path.stat().st_size
 

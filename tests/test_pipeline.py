@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -100,10 +101,23 @@ def test_eval_repeats_the_runs_numbers_and_saves_predictions(home):
     assert run.done
 
 
+def test_the_live_stream_of_a_run(home):
+    run = motion_run(home)
+    out = command(home, "bench", "soak", run.id, "--hours", "0.001")
+    assert "all finite: yes" in out
+    first, last = re.search(r"MPJPE (\S+) cm in the first tenth, (\S+) cm in the last", out).groups()
+    assert float(last) == pytest.approx(float(first), rel=0.05)
+    assert "ratio" in command(home, "bench", "avatar", "--run", run.id, "--frames", "5", "--rounds", "1")
+    assert "neither RUN nor --onnx" in command(home, "bench", "soak", code=2)
+
+
 def test_export_again_and_bad_names(home):
     run = motion_run(home)
     assert "differs from torch" in command(home, "export", run.id, "--out", "again.onnx")
     onnx.checker.check_model(onnx.load(home / "again.onnx"))
+    full = ["export", run.id, "--out", "full.onnx", "--space", "unity"]
+    assert "differs from torch" in command(home, *full, "--scope", "full")
+    assert "allowed with --scope full" in command(home, *full, code=2)
     assert "run 'zzz'" in command(home, "eval", "zzz", code=2)
     assert "--out" in command(home, "export", run.id, "--out", "no/where.onnx", code=2)
     vqvae = run.manifest["upstream"]

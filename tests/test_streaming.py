@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from memmlp.export import OnnxStream, export, parity
 from memmlp.features import Heading, HeadRelative, World
 from memmlp.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory
 from memmlp.predictor import RotationOnly, TwoBranch, TwoBranchMemory
-from memmlp.streaming import Streaming, streaming
+from memmlp.streaming import Stream, streaming
 
 MEMORIES = [
     (NoMemory, {}),
@@ -50,6 +51,13 @@ def test_the_stream_is_the_network(kind, changes, predictor):
     assert largest_difference(tiny.model(kind, predictor, **changes).double(), CLIP.double()) < 1e-11
 
 
+@pytest.mark.parametrize("name", tiny.REFERENCES)
+@pytest.mark.parametrize("depth", [1, 3])
+@torch.no_grad()
+def test_the_stream_of_a_reference_is_the_network(name, depth):
+    assert largest_difference(tiny.reference(name, depth=depth).double(), CLIP.double()) < 1e-11
+
+
 @pytest.mark.parametrize("coordinates", [World(), HeadRelative(), Heading()])
 @torch.no_grad()
 def test_in_all_coordinates(coordinates):
@@ -63,7 +71,7 @@ def test_the_network_itself_stays_as_it_is():
     model = tiny.model()
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     live = streaming(model)
-    assert isinstance(live, Streaming)
+    assert isinstance(live, Stream)
     assert not any(parameter.requires_grad for parameter in live.parameters())
     assert model.memory.frames == model.frames
     for name, tensor in model.state_dict().items():
@@ -71,9 +79,9 @@ def test_the_network_itself_stays_as_it_is():
     assert any(parameter.requires_grad for parameter in model.parameters())
 
 
+@pytest.mark.parametrize("model", [tiny.model(), *map(tiny.reference, tiny.REFERENCES)])
 @torch.no_grad()
-def test_less_work():
-    model = tiny.model()
+def test_less_work(model):
     counts = []
     for network in (model, streaming(model)):
         with FlopCounterMode(display=False) as counter:
@@ -87,10 +95,17 @@ def test_what_has_no_stream_is_refused():
         streaming(tiny.model(CodeMemory, history="latest"))
 
 
-@pytest.mark.parametrize("kind", [CodeMemory, LSTMMemory])
-def test_its_file_is_the_network_in_onnx_runtime(tmp_path: Path, kind):
-    model = tiny.model(kind, coordinates=Heading())
+NETWORKS = {
+    "codes": partial(tiny.model, CodeMemory, coordinates=Heading()),
+    "lstm": partial(tiny.model, LSTMMemory, coordinates=Heading()),
+    **{name: partial(tiny.reference, name) for name in tiny.REFERENCES},
+}
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+def test_its_file_is_the_network_in_onnx_runtime(tmp_path: Path, network):
+    model = NETWORKS[network]()
     path = tmp_path / "stream.onnx"
     export(streaming(model), path, "0123456789abcdef")
     assert parity(model, path, tiny.clip(40)) < 1e-4
-    assert "state.stem" in OnnxStream(path).state
+    assert "state.count" in OnnxStream(path).state

@@ -35,7 +35,7 @@ from memmlp.export import deterministic, metadata, save
 from memmlp.features import Frame, sparse_features
 from memmlp.geometry import sixd_to_matrix
 from memmlp.model import WindowModel
-from memmlp.streaming import Streaming
+from memmlp.streaming import Stream
 
 TRACKERS = ("tracker_positions", "tracker_rotations")
 OUTPUTS = ("rotations", "positions", "joints")
@@ -55,7 +55,7 @@ class FullStep(nn.Module):
     body: Tensor
     offsets: Tensor
 
-    def __init__(self, model: WindowModel | Streaming, space: Space):
+    def __init__(self, model: WindowModel | Stream, space: Space):
         super().__init__()
         self.model = model
         self.names = list(model.initial_state(1))
@@ -106,7 +106,7 @@ class FullStep(nn.Module):
         return transforms[:, :N_JOINTS, :3, 3]
 
 
-def export_full(model: WindowModel | Streaming, path: Path, run_id: str, space: str = "amass") -> None:
+def export_full(model: WindowModel | Stream, path: Path, run_id: str, space: str = "amass") -> None:
     """Write the whole step, on the CPU in float32, as one ONNX file with its metadata.
 
     Raises InputError for an unknown space.

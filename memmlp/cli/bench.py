@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from memmlp.cli.bench_avatar import avatar, soak
+from memmlp.cli.bench_latency import latency
 from memmlp.cli.chaos import chaos, chaos_tune
 
 
@@ -90,5 +91,6 @@ def stream(clips: int, frames: int, rounds: int, device: str, overrides: tuple[s
 
 bench.add_command(avatar)
 bench.add_command(soak)
+bench.add_command(latency)
 bench.add_command(chaos)
 bench.add_command(chaos_tune)

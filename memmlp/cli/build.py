@@ -15,6 +15,7 @@ from memmlp import pipeline
 from memmlp.cli.motion import build_motion
 from memmlp.cli.report import show
 from memmlp.cli.schema import Config, check
+from memmlp.deployment import Deployment
 from memmlp.errors import InputError
 from memmlp.features import Heading, HeadRelative, World
 from memmlp.ik import IK, LBFGS, NoIK
@@ -57,7 +58,7 @@ def build_experiment(cfg: DictConfig) -> pipeline.Experiment:
         modes=list(cfg.evaluation.modes),
         evaluation_batch=cfg.evaluation.batch,
         ik=build_ik(cfg),
-        latency_steps=cfg.export.latency_steps,
+        deployment=Deployment(**config["export"]),
         save_predictions=Path(cfg.save_predictions) if cfg.save_predictions else None,
         tracker=build_tracker(cfg),
     )

@@ -494,6 +494,8 @@ class Evaluation:
 @dataclass
 class Export:
     latency_steps: int = at_least(1)
+    graph: str = one_of("auto", "streaming", "naive")
+    precision: str = one_of("fp32", "int8")
 
 
 @dataclass

@@ -79,6 +79,10 @@ class Frames:
         start, length = int(self.starts[index]), int(self.lengths[index])
         return self.frames[start : start + length]
 
+    def clips(self) -> list[Tensor]:
+        """All frames (N, 252) of each clip, not copied."""
+        return [self.clip(index) for index in range(len(self.names))]
+
 
 class WindowSampler:
     """Random windows; a draw depends on seed and step alone, so a sampler's position is the step.

@@ -28,12 +28,13 @@ class Attention(nn.Module):
 
     def forward(self, h: Tensor) -> Tensor:
         """(B, T, d) -> (B, T, d)."""
-        query, key, value = (layer(h).unflatten(-1, (self.heads, -1)).transpose(1, 2) for layer in self._in())
+        return self.attend(self.query(h), self.key(h), self.value(h))
+
+    def attend(self, *parts: Tensor) -> Tensor:
+        """Queries (B, n, d), keys and values (B, T, d) -> (B, n, d)."""
+        query, key, value = (part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in parts)
         scores = query @ key.transpose(-1, -2) * query.shape[-1] ** -0.5
         return self.out((scores.softmax(-1) @ value).transpose(1, 2).flatten(-2))
-
-    def _in(self) -> tuple[nn.Module, nn.Module, nn.Module]:
-        return self.query, self.key, self.value
 
 
 class EncoderLayer(nn.Module):
@@ -53,7 +54,11 @@ class EncoderLayer(nn.Module):
 
     def forward(self, h: Tensor) -> Tensor:
         """(B, T, d) -> (B, T, d)."""
-        h = self.attention_norm(h + self.dropout(self.attention(h)))
+        return self.finish(h, self.attention(h))
+
+    def finish(self, h: Tensor, attended: Tensor) -> Tensor:
+        """What follows the attention, frame by frame."""
+        h = self.attention_norm(h + self.dropout(attended))
         wide = self.dropout(F.relu(self.widen(h)))
         return self.norm(h + self.dropout(self.narrow(wide)))
 
@@ -101,7 +106,10 @@ class AvatarPoser(WindowModel):
         h = self.embedding(encoded)
         for layer in self.layers:
             h = layer(h)
-        newest = h[:, -1]
+        return self.read(h[:, -1])
+
+    def read(self, newest: Tensor) -> Tensor:
+        """The newest frame's feature (..., d) -> rotations (..., 132)."""
         return torch.cat([self.orientation(newest), self.rotation(newest)], -1)
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:

@@ -52,11 +52,14 @@ class Diffusion(nn.Module):
             noise: where it starts from (B, ...).
         """
         x = noise
-        for time, following in zip(self.times, [*self.times[1:], None], strict=True):
+        for index, time in enumerate(self.times):
             clean = denoise(x, torch.full((len(x),), time, device=x.device))
-            if following is None:
-                break
-            here, there = self.signal[time], self.signal[following]
-            direction = (x - here.sqrt() * clean) / (1 - here).sqrt()
-            x = there.sqrt() * clean + (1 - there).sqrt() * direction
+            if index + 1 < len(self.times):
+                x = self.stepped(x, clean, index)
         return clean
+
+    def stepped(self, x: Tensor, clean: Tensor, index: int) -> Tensor:
+        """The noisy signal one sampling step on, of x and the estimate made from it at step `index`."""
+        here, there = (self.signal[time] for time in self.times[index : index + 2])
+        direction = (x - here.sqrt() * clean) / (1 - here).sqrt()
+        return there.sqrt() * clean + (1 - there).sqrt() * direction

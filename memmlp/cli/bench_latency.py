@@ -1,0 +1,183 @@
+"""`memmlp bench latency`: one step of each network, as it was trained, as a stream, in int8; side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from memmlp.model import WindowModel
+
+BASE = ("avatar_poser", "naive")
+"""What the others are compared with: AvatarPoser as published."""
+
+MODELS: dict[str, tuple[str, ...]] = {
+    "avatar_poser": ("model=avatar_poser",),
+    "agrol_mlp_196": ("model=agrol_mlp",),
+    "agrol_mlp_41": ("model=agrol_mlp", "model.frames=41"),
+    "agrol_diffusion": ("model=agrol_diffusion", "model.sampling_steps=5"),
+    "mem_mlp_41": (),
+    "mem_mlp_60": ("model.frames=60",),
+}
+VARIANTS = ("naive", "streaming", "int8")
+
+
+@click.command("latency")
+@click.option("--rounds", default=5, show_default=True, type=click.IntRange(5), help="Rounds.")
+@click.option("--steps", default=20, show_default=True, type=click.IntRange(2), help="Steps a round, each.")
+@click.option("--models", default=",".join(MODELS), show_default=True, help="Which, by comma.")
+@click.option("--json", "file", type=click.Path(path_type=Path), help="Write the rows to this file.")
+@click.option("--profile", help="Show where the time goes in one of them, e.g. mem_mlp_41:int8.")
+@click.argument("overrides", nargs=-1)
+def latency(
+    rounds: int, steps: int, models: str, file: Path | None, profile: str | None, overrides: tuple[str, ...]
+) -> None:
+    """Milliseconds a step of every network in ONNX Runtime, in turn in one process, on one thread.
+
+    OVERRIDES are those of `memmlp train`; the default is profile=paper. Weights are random: they do not
+    matter for the time. The ratio is to AvatarPoser as published, of each round's medians.
+    """
+    import tempfile
+
+    from memmlp.errors import InputError
+
+    chosen = [name.strip() for name in models.split(",")]
+    allowed = [f"{name}:{variant}" for name in MODELS for variant in VARIANTS]
+    if not set(chosen) <= set(MODELS) or BASE[0] not in chosen:
+        raise InputError(
+            f"--models {models}: allowed are {', '.join(MODELS)}, with {BASE[0]} for the comparison"
+        )
+    if profile and profile not in allowed:
+        raise InputError(f"--profile {profile}: allowed are {', '.join(allowed)}")
+    if file and not file.absolute().parent.is_dir():
+        raise InputError(f"--json {file}: there is no folder {file.parent}")
+    with tempfile.TemporaryDirectory() as folder:
+        paths = dict(exported(chosen, overrides, Path(folder)))
+        rows = timed(paths, rounds, steps)
+        show(rows, rounds)
+        if file:
+            from memmlp.files import write_json
+
+            write_json(file, rows)
+        if profile:
+            name, variant = profile.split(":")
+            show_profile(paths[name, variant])
+
+
+def exported(
+    models: list[str], overrides: tuple[str, ...], folder: Path
+) -> Iterator[tuple[tuple[str, str], Path]]:
+    """The ONNX files of models in all variants, with a bar."""
+    from memmlp.export import export
+    from memmlp.progress import track
+    from memmlp.quantization import quantise
+    from memmlp.streaming import streaming
+
+    clips = calibration()
+    for name in track(models, "exporting"):
+        model = untrained(("profile=paper", *overrides, *MODELS[name]))
+        paths = {variant: folder / f"{name}.{variant}.onnx" for variant in VARIANTS}
+        stream = streaming(model)
+        export(model, paths["naive"], "random")
+        export(stream, paths["streaming"], "random")
+        quantise(paths["streaming"], paths["int8"], stream.ends, clips)
+        for variant, path in paths.items():
+            yield (name, variant), path
+
+
+def untrained(overrides: tuple[str, ...]) -> WindowModel:
+    """The network of overrides with random weights."""
+    import torch
+
+    from memmlp.body import builtin_rest_joints
+    from memmlp.cli.build import build_architecture
+    from memmlp.cli.train import composed
+    from memmlp.features import Frame
+
+    architecture = build_architecture(composed(list(overrides)))
+    torch.manual_seed(0)
+    codes = architecture.vqvae() if architecture.uses_codes else None
+    frame = Frame.raw(architecture.coordinates, torch.as_tensor(builtin_rest_joints()))
+    return architecture.build(frame, codes).eval()
+
+
+def calibration() -> list[Any]:
+    """A short clip of motion."""
+    import torch
+
+    from memmlp.body import FRAME_DIM
+
+    return [0.1 * torch.randn(60, FRAME_DIM, generator=torch.Generator().manual_seed(0))]
+
+
+def timed(paths: dict[tuple[str, str], Path], rounds: int, steps: int) -> list[dict[str, Any]]:
+    """A row of each file: median and p95 milliseconds, the ratio to AvatarPoser and its spread."""
+    import numpy as np
+
+    from memmlp.latency import interleaved
+
+    seconds = interleaved(paths, rounds, steps)
+    base = np.median(seconds[BASE], 1)
+    return [
+        row(model, variant, times, np.median(times, 1) / base) for (model, variant), times in seconds.items()
+    ]
+
+
+def row(model: str, variant: str, seconds: np.ndarray, ratios: np.ndarray) -> dict[str, Any]:
+    """Of the seconds (rounds, steps) and the ratios (rounds,)."""
+    import numpy as np
+
+    return {
+        "model": model,
+        "variant": variant,
+        "median_ms": 1000 * float(np.median(seconds)),
+        "p95_ms": 1000 * float(np.percentile(seconds, 95)),
+        "ratio_to_avatar_poser": float(np.median(ratios)),
+        "ratio_least": float(ratios.min()),
+        "ratio_most": float(ratios.max()),
+    }
+
+
+def show(rows: list[dict[str, Any]], rounds: int) -> None:
+    """Print the rows as a table."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"one step on one thread, {rounds} rounds in turn", title_justify="left")
+    for name, side in (("network", "left"), ("graph", "left"), ("median ms", "right"), ("p95 ms", "right")):
+        table.add_column(name, justify=side)  # type: ignore[arg-type]
+    table.add_column("to AvatarPoser", justify="right")
+    table.add_column("over rounds", justify="right")
+    for r in rows:
+        table.add_row(
+            r["model"],
+            r["variant"],
+            f"{r['median_ms']:.2f}",
+            f"{r['p95_ms']:.2f}",
+            f"{r['ratio_to_avatar_poser']:.2f}",
+            f"{r['ratio_least']:.2f} to {r['ratio_most']:.2f}",
+            end_section=r["variant"] == VARIANTS[-1],
+        )
+    Console().print(table)
+
+
+def show_profile(path: Path) -> None:
+    """Print where a step's time goes, by kind of operation and shape."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from memmlp.latency import profile
+
+    table = Table(title=f"{path.name.removesuffix('.onnx')}: microseconds a step", title_justify="left")
+    table.add_column("operation")
+    table.add_column("first input")
+    for name in ("times", "us each", "us a step"):
+        table.add_column(name, justify="right")
+    for kind, shape, times, each in profile(path)[:20]:
+        table.add_row(kind, shape, f"{times:.0f}", f"{each:.1f}", f"{times * each:.0f}")
+    Console().print(table)

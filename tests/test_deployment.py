@@ -1,0 +1,142 @@
+"""What a network is shipped as: its graph, int8 and what that costs, and what a run records of it."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import tiny
+from command_line import TINY, run
+
+from memmlp.deployment import GRAPHS
+from memmlp.export import OnnxStream, export
+from memmlp.features import Heading
+from memmlp.memory import CodeMemory
+from memmlp.model import WindowModel
+from memmlp.quantization import accuracy, compared, quantise, streamed
+from memmlp.runs import list_runs
+from memmlp.streaming import Stream, streaming
+
+CLIPS = [tiny.clip(60, seed=seed) for seed in range(3)]
+
+
+def files(folder: Path, model: WindowModel) -> tuple[Path, Path]:
+    """A model's stream in float32 and in int8."""
+    exact, quantised, stream = folder / "fp32.onnx", folder / "int8.onnx", streaming(model)
+    export(stream, exact, "0123456789abcdef")
+    quantise(exact, quantised, stream.ends, CLIPS)
+    return exact, quantised
+
+
+def test_auto_is_the_stream_where_there_is_one():
+    assert isinstance(GRAPHS["auto"](tiny.model()), Stream)
+    revised = tiny.model(CodeMemory, history="latest")
+    assert GRAPHS["auto"](revised) is revised
+    assert GRAPHS["naive"](revised) is revised
+
+
+def weights(graph: onnx.ModelProto) -> dict[str, int]:
+    """The number type of each layer's weight that a product takes in, directly or dequantised."""
+    types = {tensor.name: tensor.data_type for tensor in graph.graph.initializer}
+    sources = {
+        node.output[0]: node.input[0] for node in graph.graph.node if node.op_type == "DequantizeLinear"
+    }
+    found = {}
+    for node in graph.graph.node:
+        if node.op_type in ("Gemm", "MatMul"):
+            name = sources.get(node.input[1], node.input[1])
+            found[name.removesuffix("_quantized")] = types.get(name, 0)
+    return found
+
+
+@pytest.mark.parametrize("network", ["mem_mlp", *tiny.REFERENCES])
+def test_inner_layers_are_int8_and_the_ends_are_not(tmp_path, network):
+    model = tiny.model() if network == "mem_mlp" else tiny.reference(network)
+    _, quantised = files(tmp_path, model)
+    kinds = weights(onnx.load(quantised))
+    inner = [kind for name, kind in kinds.items() if ".blocks." in name or ".layers." in name]
+    assert inner
+    assert set(inner) == {onnx.TensorProto.INT8}
+    ends = {
+        "mem_mlp": {"model.stem.weight", "model.predictor.rotation.linear.weight"},
+        "avatar_poser": {"model.model.embedding.weight", "model.model.orientation.0.weight"},
+    }.get(network, {"model.model.head.weight"})
+    assert {kinds[name] for name in ends} == {onnx.TensorProto.FLOAT}
+
+
+def test_int8_is_near_and_keeps_the_metadata(tmp_path):
+    exact, quantised = files(tmp_path, tiny.model(coordinates=Heading()))
+    before, after = (streamed(OnnxStream(path), CLIPS[0]) for path in (exact, quantised))
+    assert 1e-6 < float((before - after).abs().mean()) < 0.02
+    props = [{p.key: p.value for p in onnx.load(path).metadata_props} for path in (exact, quantised)]
+    assert props[0].items() <= props[1].items()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fp32.onnx", "int8.onnx"]
+
+
+def test_int8_may_stand_for_float32_only_if_it_is_as_good(tmp_path):
+    model = tiny.model()
+    exact, quantised = files(tmp_path, model)
+    cost = compared(exact, quantised, model.frame, CLIPS)
+    assert cost["growth"] == pytest.approx(cost["int8"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
+    assert cost["default"] == (cost["growth"] <= 0.01)
+    other = tmp_path / "other.onnx"  # of two networks the better one may stand for the other alone
+    export(streaming(tiny.model(seed=1)), other, "0")
+    both = [compared(*pair, model.frame, CLIPS) for pair in ((exact, other), (other, exact))]
+    assert sorted(cost["default"] for cost in both) == [False, True]
+    assert (1 + both[0]["growth"]) * (1 + both[1]["growth"]) == pytest.approx(1)
+    assert compared(exact, exact, model.frame, CLIPS)["default"]
+
+
+def test_accuracy_is_that_of_the_evaluation(tmp_path):
+    from memmlp import evaluation
+
+    model = tiny.model()
+    exact, _ = files(tmp_path, model)
+    found = accuracy(exact, model.frame, CLIPS)
+    motions = evaluation.stream(model, CLIPS)
+    rows = [
+        evaluation.rotations_report(model.frame, motion, clip)
+        for motion, clip in zip(motions, CLIPS, strict=True)
+    ]
+    for name, value in found.items():
+        assert value == pytest.approx(np.mean([row[name] for row in rows]), rel=1e-3), name
+
+
+def test_a_run_in_int8_records_what_it_costs(tmp_path):
+    run(tmp_path, "train", *TINY, "export.precision=int8")
+    (made,) = (found for found in list_runs(tmp_path / "outputs") if found.manifest["kind"] == "memmlp")
+    record = json.loads(made.latency.read_text())
+    assert record["graph"] == "streaming"
+    assert 0 < record["step_macs"] < record["macs"]
+    cost = record["int8"]
+    assert cost["growth"] == pytest.approx(cost["int8"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
+    assert cost["median_ms"] > 0
+    assert cost["onnx_bytes"] == made.int8.stat().st_size
+    assert made.verify() == []
+    assert math.isclose(cost["fp32"]["MPJPE"], made.results["stream"]["rotation"]["MPJPE"], rel_tol=1e-3)
+    made.int8.write_bytes(b"")
+    assert made.verify() == ["step.int8.onnx"]
+
+    out = tmp_path / "int8.onnx"
+    said = run(tmp_path, "export", made.id, "--out", str(out), "--precision", "int8", "--max-growth", "50")
+    assert "MPJPE" in said
+    out.unlink()
+    said = run(
+        tmp_path, "export", made.id, "--out", str(out), "--precision", "int8", "--max-growth", "-100", code=1
+    )
+    assert "not written" in said
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["outputs"]
+    line = ["export", made.id, "--out", str(out), "--precision", "int8"]
+    assert "allowed" in run(tmp_path, *line, "--graph", "naive", code=2)
+
+
+def test_the_naive_graph_by_switch(tmp_path):
+    run(tmp_path, "train", *TINY, "export.graph=naive")
+    (made,) = (found for found in list_runs(tmp_path / "outputs") if found.manifest["kind"] == "memmlp")
+    record = json.loads(made.latency.read_text())
+    assert record["graph"] == "naive"
+    assert record["step_macs"] == record["macs"]
