@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnxruntime
 import torch
 from torch import Tensor, nn
 
@@ -24,6 +23,7 @@ from memmlp import __version__
 from memmlp.body import FEATURES, FPS, JOINTS, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.memory import Blend
 from memmlp.model import WindowModel
+from memmlp.session import OnnxStream
 from memmlp.streaming import Stream
 
 OPSET = 18
@@ -122,33 +122,6 @@ def metadata(model: WindowModel | Stream, run_id: str) -> dict[str, str]:
         "memmlp_version": __version__,
         "run_id": run_id,
     }
-
-
-class OnnxStream:
-    """The exported step in ONNX Runtime on one thread, with its state.
-
-    Args:
-        path: the ONNX file. profile: where ONNX Runtime's profile goes, if anywhere: the start of the path.
-    """
-
-    def __init__(self, path: Path, profile: Path | None = None):
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        if profile is not None:
-            options.enable_profiling, options.profile_file_prefix = True, str(profile)
-        self.session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        self.shapes = {i.name: i.shape for i in self.session.get_inputs() if i.name != "sparse"}
-        self.reset()
-
-    def reset(self) -> None:
-        """A fresh start."""
-        self.state = {name: np.zeros(shape, np.float32) for name, shape in self.shapes.items()}
-
-    def step(self, sparse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """sparse (1, 54) -> rotation6d (1, 22, 6) and position (1, 22, 3)."""
-        rotation, position, *state = self.session.run(None, {"sparse": sparse, **self.state})
-        self.state = dict(zip(self.state, state, strict=True))
-        return rotation, position
 
 
 @torch.no_grad()

@@ -18,8 +18,8 @@ from onnx import TensorProto, helper
 from torch.utils.flop_counter import FlopCounterMode
 
 from memmlp.body import SPARSE_DIM
-from memmlp.export import OnnxStream
 from memmlp.model import WindowModel
+from memmlp.session import OnnxStream
 from memmlp.streaming import Stream
 
 WARM_UP = 30

@@ -21,8 +21,8 @@ from torch import Tensor
 
 from memmlp.body import SPARSE_DIM
 from memmlp.evaluation import rotations_report
-from memmlp.export import OnnxStream
 from memmlp.features import Frame
+from memmlp.session import OnnxStream
 
 MAX_GROWTH = 0.01
 """Of MPJPE, up to which int8 may stand for float32."""

@@ -94,6 +94,12 @@ class Run:
         """The run of that id below an outputs folder, whether it exists or not."""
         return cls(Path(outputs) / "runs" / run_id)
 
+    @property
+    def deployed(self) -> Path:
+        """The ONNX file to use: in int8 where the run has one that is as accurate (`export.precision`)."""
+        record = read_json(self.latency) if self.int8.exists() else {}
+        return self.int8 if record.get("int8", {}).get("default") else self.onnx
+
     def __repr__(self) -> str:
         return f"Run({str(self.folder)!r})"
 

@@ -12,13 +12,15 @@ import pytest
 import tiny
 from command_line import TINY, run
 
+import memmlp
 from memmlp.deployment import GRAPHS
-from memmlp.export import OnnxStream, export
+from memmlp.export import export
 from memmlp.features import Heading
 from memmlp.memory import CodeMemory
 from memmlp.model import WindowModel
 from memmlp.quantization import accuracy, compared, quantise, streamed
 from memmlp.runs import list_runs
+from memmlp.session import OnnxStream
 from memmlp.streaming import Stream, streaming
 
 CLIPS = [tiny.clip(60, seed=seed) for seed in range(3)]
@@ -109,7 +111,8 @@ def test_accuracy_is_that_of_the_evaluation(tmp_path):
 def test_a_run_in_int8_records_what_it_costs(tmp_path):
     run(tmp_path, "train", *TINY, "export.precision=int8")
     (made,) = (found for found in list_runs(tmp_path / "outputs") if found.manifest["kind"] == "memmlp")
-    record = json.loads(made.latency.read_text())
+    written = made.latency.read_text()
+    record = json.loads(written)
     assert record["graph"] == "streaming"
     assert 0 < record["step_macs"] < record["macs"]
     cost = record["int8"]
@@ -118,6 +121,14 @@ def test_a_run_in_int8_records_what_it_costs(tmp_path):
     assert cost["onnx_bytes"] == made.int8.stat().st_size
     assert made.verify() == []
     assert math.isclose(cost["fp32"]["MPJPE"], made.results["stream"]["rotation"]["MPJPE"], rel_tol=1e-3)
+    for default, used in ((True, made.int8), (False, made.onnx)):
+        cost["default"] = default
+        made.latency.write_text(json.dumps(record))
+        assert made.deployed == used
+        assert memmlp.Stream(made).network.path == used
+        assert memmlp.Stream(str(made.folder)).network.path == used
+    made.latency.write_text(written)
+    assert made.verify() == []
     made.int8.write_bytes(b"")
     assert made.verify() == ["step.int8.onnx"]
 

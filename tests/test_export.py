@@ -10,10 +10,11 @@ import torch
 
 from memmlp import latency
 from memmlp.body import JOINTS, SPARSE_DIM
-from memmlp.export import TOLERANCE, OnnxStream, export, parity
+from memmlp.export import TOLERANCE, export, parity
 from memmlp.features import Heading
 from memmlp.memory import NoMemory
 from memmlp.predictor import RotationOnly
+from memmlp.session import OnnxStream
 
 CLIP = tiny.clip(50)
 CASES = {

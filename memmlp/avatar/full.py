@@ -16,7 +16,6 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.avatar.rotations import Skeleton
-from memmlp.avatar.session import open_session
 from memmlp.avatar.spaces import Space, space_of
 from memmlp.body import (
     HEAD,
@@ -35,6 +34,7 @@ from memmlp.export import deterministic, metadata, save
 from memmlp.features import Frame, sparse_features
 from memmlp.geometry import sixd_to_matrix
 from memmlp.model import WindowModel
+from memmlp.session import OnnxStream
 from memmlp.streaming import Stream
 
 TRACKERS = ("tracker_positions", "tracker_rotations")
@@ -124,26 +124,6 @@ def export_full(model: WindowModel | Stream, path: Path, run_id: str, space: str
     )
 
 
-class FullStream:
-    """A file of scope full in ONNX Runtime on one thread, with its state."""
-
-    def __init__(self, path: Path):
-        self.session = open_session(path)
-        self.shapes = {i.name: i.shape for i in self.session.get_inputs() if i.name not in TRACKERS}
-        self.reset()
-
-    def reset(self) -> None:
-        """A fresh start."""
-        self.state = {name: np.zeros(shape, np.float32) for name, shape in self.shapes.items()}
-
-    def step(self, positions: np.ndarray, rotations: np.ndarray) -> list[np.ndarray]:
-        """Trackers (1, 3, 3) and (1, 3, 3, 3), float32 -> rotations, positions and joints of the body."""
-        trackers = dict(zip(TRACKERS, (positions, rotations), strict=True))
-        outputs = self.session.run(None, trackers | self.state)
-        self.state = dict(zip(self.state, outputs[len(OUTPUTS) :], strict=True))
-        return outputs[: len(OUTPUTS)]
-
-
 def trackers_of(frames: Tensor) -> tuple[Tensor, Tensor]:
     """Positions (N + 1, 3, 3) and rotations (N + 1, 3, 3, 3) of the trackers of frames (N, 252 or 54).
 
@@ -166,7 +146,7 @@ def full_parity(model: WindowModel, path: Path, clip: Tensor, space: str = "amas
     model, there = model.cpu().eval(), space_of(space)
     positions, rotations = trackers_of(clip[:, :SPARSE_DIM].cpu())
     given = [there.positions_out(positions.numpy()), there.rotations_out(rotations.numpy())]
-    stream, state, worst = FullStream(path), model.initial_state(1), 0.0
+    stream, state, worst = OnnxStream(path), model.initial_state(1), 0.0
     stream.step(*(part[:1] for part in given))
     with deterministic(model):
         for index, sparse in enumerate(sparse_features(rotations, positions), start=1):

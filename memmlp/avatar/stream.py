@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +16,7 @@ from memmlp.avatar.session import Network
 from memmlp.avatar.spaces import space_of
 from memmlp.avatar.trackers import Features, Lost, Trackers, t_pose
 from memmlp.errors import InputError
+from memmlp.runs import Run
 
 if TYPE_CHECKING:
     from memmlp.ik import LBFGS
@@ -27,12 +28,6 @@ NEUTRAL = np.concatenate([np.zeros(3), IDENTITY.reshape(9)])
 UNIT = 1e-2  # by how much a quaternion's norm, or a matrix' columns, may be off
 
 Tracker = tuple[ArrayLike, ArrayLike] | None
-
-
-class HasOnnx(Protocol):
-    """A finished run, as `memmlp.runs.Run`."""
-
-    onnx: Path
 
 
 class Pose(NamedTuple):
@@ -96,7 +91,7 @@ class Stream:
 
     def __init__(
         self,
-        source: str | PathLike[str] | HasOnnx,
+        source: str | PathLike[str] | Run,
         *,
         space: str = "amass",
         rotations: str = "matrix",
@@ -156,7 +151,7 @@ class Stream:
             if first:  # it has no velocity: shown, but not part of the network's past, as in its training
                 self.network.peek()
             else:
-                self.network.step()
+                self.network.advance()
         self._last = self._pose(frames[-1].time, frames[-1].positions[0], _names(lost), restarted)
         return self._last
 
@@ -300,7 +295,7 @@ def _names(lost: Lost) -> tuple[str, ...]:
     return tuple(name for name, gone in zip(TRACKERS, lost, strict=True) if gone)
 
 
-def _file(source: str | PathLike[str] | HasOnnx) -> Path:
+def _file(source: str | PathLike[str] | Run) -> Path:
     """The ONNX file of a run, of its folder, or itself."""
-    path = Path(source) if isinstance(source, str | PathLike) else source.onnx
-    return path / "step.onnx" if path.is_dir() else path
+    run = source if isinstance(source, Run) else Run(Path(source))
+    return run.deployed if run.folder.is_dir() else run.folder

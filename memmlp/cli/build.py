@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,17 @@ from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from memmlp import pipeline
+from memmlp.body import builtin_rest_joints
 from memmlp.cli.motion import build_motion
 from memmlp.cli.report import show
 from memmlp.cli.schema import Config, check
 from memmlp.deployment import Deployment
 from memmlp.errors import InputError
-from memmlp.features import Heading, HeadRelative, World
+from memmlp.features import Frame, Heading, HeadRelative, World
 from memmlp.ik import IK, LBFGS, NoIK
 from memmlp.losses import Loss, MotionLoss
 from memmlp.memory import Memory
+from memmlp.model import WindowModel
 from memmlp.runs import Run
 from memmlp.tracking import Tracker
 from memmlp.training import Optim
@@ -62,6 +64,17 @@ def build_experiment(cfg: DictConfig) -> pipeline.Experiment:
         save_predictions=Path(cfg.save_predictions) if cfg.save_predictions else None,
         tracker=build_tracker(cfg),
     )
+
+
+def untrained(overrides: Sequence[str]) -> WindowModel:
+    """The network of a command line's overrides with random weights, on the built-in body."""
+    from memmlp.cli.train import composed
+
+    architecture = build_architecture(composed(list(overrides)))
+    torch.manual_seed(0)
+    codes = architecture.vqvae() if architecture.uses_codes else None
+    frame = Frame.raw(architecture.coordinates, torch.as_tensor(builtin_rest_joints()))
+    return architecture.build(frame, codes).eval()
 
 
 def build_tracker(cfg: DictConfig) -> Tracker:

@@ -103,7 +103,7 @@ class Recall(nn.Module):
         return first
 
     def _shares(self, z: Tensor) -> Pieces:
-        return [part(z[:, index]) for index, part in enumerate(self.parts)]
+        return [part(of) for part, of in zip(self.parts, z.flatten(0, 1).split(1), strict=True)]
 
 
 class OwnPast(Recall):

@@ -15,8 +15,8 @@ from memmlp.model import WindowModel
 class Ring(NamedTuple):
     """Where the newest of T frames stands in windows whose frames stay in place, the oldest one overwritten.
 
-    slot: the newest frame's index (1,). entered: the indices (T,) that a step writes to: that slot, again and
-    again, and at a fresh start all of them.
+    slot: the newest frame's index (1,). entered: the indices that a step writes to: that slot, and at a fresh
+    start all of them.
     """
 
     slot: Tensor
@@ -26,7 +26,8 @@ class Ring(NamedTuple):
     def at(cls, count: Tensor, frames: int) -> Ring:
         """The ring of `frames` slots after a count (1,) of steps; see `counted`."""
         slot = count.remainder(frames).long()
-        return cls(slot, torch.where(count > 0, slot, torch.arange(frames, device=count.device)))
+        slots = torch.arange(frames, device=count.device)
+        return cls(slot, torch.nonzero((slots == slot) | (count == 0))[:, 0])
 
     def put(self, window: Tensor, entering: Tensor, before: Tensor) -> Tensor:
         """The window (T, size) with a frame (1, size); at a fresh start `before` it in all others."""
@@ -44,7 +45,7 @@ def counted(count: Tensor, frames: int) -> Tensor:
 
 
 def _written(window: Tensor, index: Tensor, frame: Tensor) -> Tensor:
-    return window.index_put((index,), frame.expand(len(index), -1))
+    return window.index_put((index,), frame.expand(index.shape[0], -1))
 
 
 class Stream(nn.Module):

@@ -12,13 +12,14 @@ import pytest
 import tiny
 import torch
 
-from memmlp.avatar.full import FullStream, export_full, full_parity, trackers_of
+from memmlp.avatar.full import export_full, full_parity, trackers_of
 from memmlp.avatar.spaces import SPACES
 from memmlp.avatar.stream import Stream
 from memmlp.body import SPARSE_DIM
 from memmlp.errors import InputError
 from memmlp.export import TOLERANCE, export
 from memmlp.features import Heading, sparse_features
+from memmlp.session import OnnxStream
 from memmlp.streaming import streaming
 
 RUN = "0123456789abcdef"
@@ -48,7 +49,7 @@ def test_it_is_the_stream(name, network, folder: Path):
     assert full_parity(network, file, PERSON.frames, name) <= TOLERANCE
     positions, rotations = space.positions_out(PERSON.positions), space.rotations_out(PERSON.rotations)
     poses = live.play(Stream(folder, space=name), positions, rotations)
-    full = FullStream(file)
+    full = OnnxStream(file)
     for _ in range(2):
         for index, pose in enumerate(poses):
             given = [part[index : index + 1].astype(np.float32) for part in (positions, rotations)]

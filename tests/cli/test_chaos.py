@@ -7,7 +7,7 @@ from pathlib import Path
 
 from command_line import run
 
-from memmlp.cli.chaos import check, compare
+from memmlp.cli.bench.chaos import check, compare
 from memmlp.files import write_json
 from memmlp.runs import Run
 

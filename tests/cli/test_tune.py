@@ -12,7 +12,7 @@ from command_line import TINY as BASE
 from command_line import run as command
 from filelock import FileLock
 
-from memmlp.cli.chaos import examine
+from memmlp.cli.bench.chaos import examine
 from memmlp.cli.tune import prepared
 
 TINY = [*BASE, "optim.validate_every=3"]

@@ -1,20 +1,11 @@
-"""`memmlp bench`: claims about speed, measured on this machine."""
+"""`memmlp bench prepare` and `memmlp bench stream`: the speed of data and of evaluation."""
 
 from __future__ import annotations
 
 import click
 
-from memmlp.cli.bench_avatar import avatar, soak
-from memmlp.cli.bench_latency import latency
-from memmlp.cli.chaos import chaos, chaos_tune
 
-
-@click.group("bench")
-def bench() -> None:
-    """Measure speed on this machine, as rates and as ratios within one run."""
-
-
-@bench.command("prepare")
+@click.command("prepare")
 @click.option("--minutes", default=60.0, show_default=True, help="Length of the synthetic motion.")
 def prepare(minutes: float) -> None:
     """Prepare synthetic AMASS-format motion: seconds, frames a second, and peak memory."""
@@ -42,7 +33,7 @@ def prepare(minutes: float) -> None:
     )
 
 
-@bench.command("stream")
+@click.command("stream")
 @click.option("--clips", default=64, show_default=True, help="Clips side by side.")
 @click.option("--frames", default=60, show_default=True, help="Frames a clip.")
 @click.option("--rounds", default=3, show_default=True, help="Rounds, the two ways in turn.")
@@ -58,17 +49,11 @@ def stream(clips: int, frames: int, rounds: int, device: str, overrides: tuple[s
     import numpy as np
     import torch
 
-    from memmlp.body import FRAME_DIM, builtin_rest_joints
-    from memmlp.cli.build import build_architecture
-    from memmlp.cli.train import composed
+    from memmlp.body import FRAME_DIM
+    from memmlp.cli.build import untrained
     from memmlp.evaluation import stream as run
-    from memmlp.features import Frame
 
-    architecture = build_architecture(composed(["profile=paper", *overrides]))
-    torch.manual_seed(0)
-    codes = architecture.vqvae() if architecture.uses_codes else None
-    frame = Frame.raw(architecture.coordinates, torch.as_tensor(builtin_rest_joints()))
-    model = architecture.build(frame, codes).to(device).eval()
+    model = untrained(("profile=paper", *overrides)).to(device)
     motion = list(0.1 * torch.randn(clips, frames, FRAME_DIM, device=device))
 
     def milliseconds(parts: list[list[torch.Tensor]]) -> float:
@@ -87,10 +72,3 @@ def stream(clips: int, frames: int, rounds: int, device: str, overrides: tuple[s
     click.echo(
         f"ratio {np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f} over {rounds} rounds)"
     )
-
-
-bench.add_command(avatar)
-bench.add_command(soak)
-bench.add_command(latency)
-bench.add_command(chaos)
-bench.add_command(chaos_tune)

@@ -11,8 +11,6 @@ import click
 if TYPE_CHECKING:
     import numpy as np
 
-    from memmlp.model import WindowModel
-
 BASE = ("avatar_poser", "naive")
 """What the others are compared with: AvatarPoser as published."""
 
@@ -73,6 +71,7 @@ def exported(
     models: list[str], overrides: tuple[str, ...], folder: Path
 ) -> Iterator[tuple[tuple[str, str], Path]]:
     """The ONNX files of models in all variants, with a bar."""
+    from memmlp.cli.build import untrained
     from memmlp.export import export
     from memmlp.progress import track
     from memmlp.quantization import quantise
@@ -88,22 +87,6 @@ def exported(
         quantise(paths["streaming"], paths["int8"], stream.ends, clips)
         for variant, path in paths.items():
             yield (name, variant), path
-
-
-def untrained(overrides: tuple[str, ...]) -> WindowModel:
-    """The network of overrides with random weights."""
-    import torch
-
-    from memmlp.body import builtin_rest_joints
-    from memmlp.cli.build import build_architecture
-    from memmlp.cli.train import composed
-    from memmlp.features import Frame
-
-    architecture = build_architecture(composed(list(overrides)))
-    torch.manual_seed(0)
-    codes = architecture.vqvae() if architecture.uses_codes else None
-    frame = Frame.raw(architecture.coordinates, torch.as_tensor(builtin_rest_joints()))
-    return architecture.build(frame, codes).eval()
 
 
 def calibration() -> list[Any]:

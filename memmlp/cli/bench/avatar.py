@@ -73,7 +73,7 @@ def _alternate(stream: Stream, onnx: Path, frames: int) -> tuple[float, float]:
 
     from memmlp.avatar.rotations import quaternion_to_matrix
     from memmlp.body import SPARSE_DIM
-    from memmlp.export import OnnxStream
+    from memmlp.session import OnnxStream
 
     random = np.random.default_rng(0)
     alone, seconds = OnnxStream(onnx), np.zeros((frames, 2))
@@ -94,25 +94,11 @@ def _alternate(stream: Stream, onnx: Path, frames: int) -> tuple[float, float]:
 
 def _random(overrides: tuple[str, ...], path: Path) -> Path:
     """The ONNX file of a network with random weights."""
-    import torch
-
-    from memmlp.body import builtin_rest_joints
-    from memmlp.cli.build import build_architecture
-    from memmlp.cli.train import composed
-    from memmlp.errors import InputError
+    from memmlp.cli.build import untrained
+    from memmlp.deployment import GRAPHS
     from memmlp.export import export
-    from memmlp.features import Frame
-    from memmlp.streaming import streaming
 
-    architecture = build_architecture(composed(["profile=paper", *overrides]))
-    torch.manual_seed(0)
-    codes = architecture.vqvae() if architecture.uses_codes else None
-    frame = Frame.raw(architecture.coordinates, torch.as_tensor(builtin_rest_joints()))
-    model = architecture.build(frame, codes).eval()
-    try:
-        export(streaming(model), path, "random")
-    except InputError:  # no streaming graph of its own
-        export(model, path, "random")
+    export(GRAPHS["auto"](untrained(("profile=paper", *overrides))), path, "random")
     return path
 
 
