@@ -52,8 +52,8 @@ def live(
 ) -> None:
     """A finished run (id, its beginning, or folder) or an ONNX file, live, on a page of this machine.
 
-    It is fed a clip in real time, over and over, or tracker poses that arrive as packets (memmlp.player.packets
-    and the README tell their format). Ctrl-C ends it.
+    It is fed a clip in real time, over and over, or tracker poses that arrive as packets; the README has their
+    format. Ctrl-C ends it.
     """
     from memmlp.errors import InputError
     from memmlp.player.packets import needs_osc
@@ -157,7 +157,7 @@ def watched(network: str, source: Source, port: int, no_browser: bool, outputs: 
             file, name = Path(network), Path(network).name
         else:
             run = find_run(outputs, network)
-            file, name = run.onnx, f"run {run.id[:8]}"
+            file, name = run.deployed, f"run {run.id[:8]}"
         stream = Stream(file, space=source.space)
         hub = Hub(greeting(source, name))
         with Server(hub, port) as server:
