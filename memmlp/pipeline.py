@@ -26,7 +26,7 @@ from memmlp.losses import Loss
 from memmlp.memory import Memory
 from memmlp.model import MemMLP, WindowModel
 from memmlp.predictor import Predictor
-from memmlp.render import poses_png
+from memmlp.render.figure import poses_png
 from memmlp.rollout import PersistentStreams, Rollout
 from memmlp.runs import Run
 from memmlp.tracking import Tracker, project_safely

@@ -25,23 +25,13 @@ def evaluate(
     from rich.console import Console
 
     from memmlp import evaluation, pipeline
-    from memmlp.cli.build import build_experiment, config_of
-    from memmlp.cli.build import device as device_of
+    from memmlp.cli.opened import opened
     from memmlp.cli.report import metrics_table
-    from memmlp.data.dataset import Frames
-    from memmlp.errors import InputError
     from memmlp.files import write_json
-    from memmlp.runs import find_run
 
-    found = find_run(outputs, run)
-    experiment = replace(build_experiment(config_of(found)), device=device_of(device))
-    cache, manifest = experiment.data.prepare()
-    if manifest.digest != found.manifest["data"]:
-        raise InputError(
-            f"run {found.id}: its data has changed since (data.root={experiment.data.source.root})"
-        )
-    model = experiment.architecture.load(found).to(experiment.device)
-    frames = Frames.open(cache, "test").to(experiment.device)
+    _, experiment, cache, _ = found = opened(outputs, run, device)
+    model = experiment.architecture.load(found.run).to(experiment.device)
+    frames = found.test
     modes, batch = experiment.modes, experiment.evaluation_batch
     results = evaluation.evaluate(model, frames, modes, batch, experiment.ik)
     Console(highlight=False).print(metrics_table(results["mean"]))

@@ -36,6 +36,8 @@ COMMANDS = {
     "track": Command("track", "track", "Show run folders in MLflow."),
     "ui": Command("track", "ui", "MLflow's page on the tracked runs."),
     "eval": Command("evaluate", "evaluate", "Metrics and predictions of a finished run."),
+    "render": Command("render", "render", "Figures and films of runs beside the truth, coloured by error."),
+    "live": Command("live", "live", "A network live on a local page: a clip, or trackers by UDP or OSC."),
     "export": Command("export", "export", "ONNX file of a finished run."),
     "bench": Command("bench", "bench", "Measure this machine; sweeps and searches under kills."),
 }

@@ -1,0 +1,167 @@
+"""`memmlp live`: a network on a clip or on live trackers, watched on a local page."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from memmlp.cli.options import outputs_option
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from memmlp.player.sources import Clip, ClipSource, Source
+
+PORT = click.IntRange(1, 65535)
+
+
+@click.command("live")
+@click.argument("network", metavar="RUN|FILE.onnx")
+@click.option("--clip", help="A test clip's name, or an AMASS npz.  [default: the run's first test clip]")
+@click.option("--udp", type=PORT, metavar="PORT", help="Take JSON packets at this port of 127.0.0.1.")
+@click.option("--osc", type=PORT, metavar="PORT", help="Take OSC bundles at this port of 127.0.0.1.")
+@click.option(
+    "--space", default="amass", show_default=True, type=click.Choice(["amass", "openxr", "unity"]),
+    help="Frame of reference of the packets.",
+)  # fmt: skip
+@click.option(
+    "--hz",
+    default=60.0,
+    show_default=True,
+    type=click.FloatRange(10, 1000),
+    help="Samples a second of a clip.",
+)
+@click.option("--port", default=8765, show_default=True, type=click.IntRange(0, 65535), help="Of the page.")
+@click.option("--no-browser", is_flag=True, help="Only say where the page is.")
+@click.option("--send", is_flag=True, help="Send the clip once to the port of --udp or --osc instead.")
+@outputs_option
+def live(
+    network: str,
+    clip: str | None,
+    udp: int | None,
+    osc: int | None,
+    space: str,
+    hz: float,
+    port: int,
+    no_browser: bool,
+    send: bool,
+    outputs: Path,
+) -> None:
+    """A finished run (id, its beginning, or folder) or an ONNX file, live, on a page of this machine.
+
+    It is fed a clip in real time, over and over, or tracker poses that arrive as packets; the README has their
+    format. Ctrl-C ends it.
+    """
+    from memmlp.errors import InputError
+    from memmlp.player.packets import needs_osc
+
+    ports = [number for number in (udp, osc) if number is not None]
+    if len(ports) > 1 or (ports and clip is not None and not send):
+        raise InputError("--clip, --udp, --osc: more than one source; allowed is one of them")
+    if send and not ports:
+        raise InputError("--send: has no port; allowed is --udp PORT or --osc PORT")
+    if osc is not None:
+        needs_osc()
+    with contextlib.suppress(KeyboardInterrupt):
+        if send:
+            sent(clip_source(network, clip, hz, outputs, rounds=1), udp, osc)
+        else:
+            watched(
+                network, source_of(network, clip, udp, osc, space, hz, outputs), port, no_browser, outputs
+            )
+
+
+def source_of(
+    network: str, clip: str | None, udp: int | None, osc: int | None, space: str, hz: float, outputs: Path
+) -> Source:
+    """The source that the options name."""
+    from memmlp.player.packets import from_json, from_osc
+    from memmlp.player.sources import PacketSource
+
+    if udp is not None:
+        return PacketSource("UDP", udp, from_json, space)
+    if osc is not None:
+        return PacketSource("OSC", osc, from_osc, space)
+    return clip_source(network, clip, hz, outputs)
+
+
+def clip_source(
+    network: str, clip: str | None, hz: float, outputs: Path, rounds: float = float("inf")
+) -> ClipSource:
+    """A clip at a rate."""
+    from memmlp.player.sources import ClipSource
+
+    return ClipSource(clip_of(network, clip, outputs), hz, rounds)
+
+
+def clip_of(network: str, clip: str | None, outputs: Path) -> Clip:
+    """A test clip of a run, or an AMASS npz on the built-in body."""
+    from memmlp.errors import InputError
+    from memmlp.player.sources import Clip
+
+    if clip is not None and clip.endswith(".npz"):
+        return Clip(Path(clip).stem, npz_frames(Path(clip)))
+    if network.endswith(".onnx"):
+        raise InputError(
+            f"{network}: has no test clips; allowed with it are --clip FILE.npz, --udp and --osc"
+        )
+    from memmlp.cli.opened import clip_index, opened
+
+    test = opened(outputs, network).test
+    index = 0 if clip is None else clip_index(test, clip)
+    return Clip(test.names[index], test.clip(index).numpy())
+
+
+def npz_frames(path: Path) -> np.ndarray:
+    """Frames (N, 252) at 60 Hz of an AMASS npz on the built-in body."""
+    import torch
+
+    from memmlp.body import builtin_rest_joints
+    from memmlp.data.clip import read_clip, resample
+    from memmlp.errors import InputError
+    from memmlp.features import motion_frames
+
+    clip, _ = resample(read_clip(path, path.stem))
+    if len(clip) < 3:
+        raise InputError(f"{path}: {len(clip)} frames at 60 Hz; allowed are 3 or more")
+    tensors = (torch.tensor(part) for part in (clip.poses, clip.trans, builtin_rest_joints()))
+    return motion_frames(*tensors).numpy()
+
+
+def sent(source: ClipSource, udp: int | None, osc: int | None) -> None:
+    """Send a clip's packets."""
+    from memmlp.player.packets import to_json, to_osc
+    from memmlp.player.sources import send
+
+    port, pack = (udp, to_json) if udp is not None else (osc, to_osc)
+    assert port is not None
+    click.echo(f"sending {source.name} to port {port}")
+    click.echo(f"{send(source, port, pack)} packets sent")
+
+
+def watched(network: str, source: Source, port: int, no_browser: bool, outputs: Path) -> None:
+    """Play the source through the network, and serve the page, until Ctrl-C."""
+    import threading
+    import webbrowser
+
+    from memmlp.avatar.stream import Stream
+    from memmlp.player.play import greeting, play
+    from memmlp.player.server import Hub, Server
+    from memmlp.runs import find_run
+
+    with contextlib.closing(source):
+        if network.endswith(".onnx"):
+            file, name = Path(network), Path(network).name
+        else:
+            run = find_run(outputs, network)
+            file, name = run.deployed, f"run {run.id[:8]}"
+        stream = Stream(file, space=source.space)
+        hub = Hub(greeting(source, name))
+        with Server(hub, port) as server:
+            click.echo(f"{server.url}  {source.name}; Ctrl-C ends")
+            if not no_browser:
+                webbrowser.open(server.url)
+            play(stream, source, hub.publish, threading.Event())

@@ -1,0 +1,45 @@
+// The frames that came, the oldest forgotten; what is shown is the newest one, or the one that was chosen.
+
+const KEPT = 60 * 180; // frames: three minutes
+
+export class History {
+  frames = [];
+  chosen = null; // number of the frame that is shown while paused; null: the newest
+
+  add(frame) {
+    this.frames.push(measured(frame));
+    if (this.frames.length > KEPT) this.frames.shift();
+  }
+
+  get first() { return this.frames[0]?.number ?? 0; }
+  get last() { return this.frames.at(-1)?.number ?? 0; }
+  get paused() { return this.chosen !== null; }
+
+  get shown() {
+    if (!this.paused) return this.frames.at(-1);
+    return this.frames[Math.min(Math.max(this.chosen - this.first, 0), this.frames.length - 1)];
+  }
+
+  choose(number) { this.chosen = Math.min(Math.max(number, this.first), this.last); }
+  resume() { this.chosen = null; }
+
+  // Median and 95th percentile of the steps' milliseconds over the last frames.
+  timing(count = 300) {
+    const sorted = this.frames.slice(-count).map(frame => frame.ms).sort((a, b) => a - b);
+    const at = part => sorted[Math.min(Math.floor(part * sorted.length), sorted.length - 1)];
+    return sorted.length ? { median: at(0.5), p95: at(0.95) } : null;
+  }
+}
+
+// The frame in metres, with the joints' errors in cm where the truth is known.
+function measured(frame) {
+  const joints = Float32Array.from(frame.joints, mm => mm / 1000);
+  if (!frame.truth) return { ...frame, joints, errors: null, mean: null };
+  const truth = Float32Array.from(frame.truth, mm => mm / 1000);
+  const errors = new Float32Array(joints.length / 3);
+  for (let j = 0; j < errors.length; j++) {
+    const [x, y, z] = [0, 1, 2].map(i => joints[3 * j + i] - truth[3 * j + i]);
+    errors[j] = 100 * Math.hypot(x, y, z);
+  }
+  return { ...frame, joints, truth, errors, mean: errors.reduce((a, b) => a + b) / errors.length };
+}

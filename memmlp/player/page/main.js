@@ -1,0 +1,97 @@
+// Frames in, by server-sent events; the newest or the chosen one out, as a picture and in numbers.
+
+import { History } from './history.js';
+import { Stage } from './stage.js';
+
+const QUIET = 1000; // milliseconds without a frame after which the page says so
+const $ = id => document.getElementById(id);
+const history = new History();
+let stage = null;
+let greeting = null;
+let arrived = 0;
+
+const events = new EventSource('events');
+events.addEventListener('greeting', event => greet(JSON.parse(event.data)));
+events.addEventListener('frame', event => {
+  const frame = JSON.parse(event.data);
+  if (frame.number <= history.last && history.frames.length) begin(); // the command was started again
+  history.add(frame);
+  arrived = performance.now();
+});
+
+function greet(words) {
+  greeting = words;
+  $('about').textContent = `${words.network} · ${words.source}`;
+  $('ramp').style.background = `linear-gradient(to right, ${words.heat.join(', ')})`;
+  document.querySelector('.prediction').style.background = words.heat[1];
+  $('top').textContent = `${words.top}+`;
+  $('budget').textContent = `of ${(1000 / words.fps).toFixed(1)} ms at ${words.fps} Hz`;
+  try {
+    stage ??= new Stage(document.querySelector('canvas'), words);
+  } catch (error) {
+    $('trouble').textContent = `This browser draws no WebGL (${error.message}); the numbers go on.`;
+    $('trouble').hidden = false;
+  }
+}
+
+function begin() {
+  history.frames = [];
+  history.resume();
+}
+
+const pause = () => (history.paused ? history.resume() : history.choose(history.last));
+const step = by => history.choose((history.shown?.number ?? 0) + by);
+$('pause').addEventListener('click', pause);
+$('newest').addEventListener('click', () => history.resume());
+$('scrub').addEventListener('input', event => history.choose(event.target.valueAsNumber));
+addEventListener('keydown', event => {
+  const action = { ' ': pause, ArrowLeft: () => step(-1), ArrowRight: () => step(1), End: () => history.resume() }[event.key];
+  if (!action) return;
+  event.preventDefault();
+  action();
+});
+
+function status() {
+  if (events.readyState !== EventSource.OPEN) return ['gone', 'not connected'];
+  if (performance.now() - arrived > QUIET) return ['', 'waiting for trackers'];
+  return history.paused ? ['', 'paused'] : ['live', 'live'];
+}
+
+function tell(frame) {
+  const [kind, words] = status();
+  $('status').className = kind;
+  $('status').textContent = words;
+  $('pause').textContent = history.paused ? 'Play' : 'Pause';
+  $('pause').setAttribute('aria-pressed', history.paused);
+  $('newest').disabled = !history.paused;
+  if (!frame) return;
+  Object.assign($('scrub'), { min: history.first, max: history.last, value: frame.number });
+  $('time').textContent = `${frame.time.toFixed(2)} s`;
+  $('error').hidden = frame.mean === null;
+  if (frame.mean !== null) $('mean').textContent = frame.mean.toFixed(1);
+  for (const key of ['dropped', 'malformed']) $(key).textContent = frame[key];
+  $('frames').textContent = frame.number + 1;
+  for (const item of $('trackers').children) item.classList.toggle('held', frame.held.includes(item.dataset.name));
+  const { median, p95 } = history.timing();
+  $('median').textContent = median.toFixed(2);
+  $('p95').textContent = p95.toFixed(2);
+  const share = (p95 * greeting.fps) / 1000;
+  $('share').style.width = `${Math.min(100 * share, 100)}%`;
+  $('share').classList.toggle('over', share > 1);
+}
+
+let told = 0;
+function tick(now) {
+  const frame = history.shown;
+  if (stage && frame) {
+    stage.show(frame);
+    stage.draw();
+    document.documentElement.dataset.shown = frame.number;
+  }
+  if (now - told > 100) {
+    tell(frame);
+    told = now;
+  }
+  requestAnimationFrame(tick);
+}
+requestAnimationFrame(tick);

@@ -1,0 +1,185 @@
+// The scene: a floor, the truth in grey, the prediction coloured by error, a camera that goes along.
+
+import * as THREE from 'three';
+import { OrbitControls } from './three/OrbitControls.js';
+
+const ROUND = 20; // sides of a limb
+const RINGS = 6; // along a limb, so that its colour follows the scale
+const UP = new THREE.Vector3(0, 1, 0);
+const SUN = new THREE.Vector3(1.4, 4, 1.8); // from there too
+const START = new THREE.Vector3(1.1, 0.5, 3.2); // of the camera, from the person's middle
+
+export class Stage {
+  constructor(canvas, greeting) {
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
+    this.renderer.shadowMap.enabled = true;
+    this.scene = new THREE.Scene();
+    this.camera = new THREE.PerspectiveCamera(35, 1, 0.1, 60);
+    this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.maxPolarAngle = 0.53 * Math.PI;
+    this.controls.minDistance = 0.8;
+    this.controls.maxDistance = 12;
+    this.heat = heatmap(greeting.heat, greeting.top);
+    this.prediction = new Body(greeting.limbs, 1, 1);
+    this.truth = new Body(greeting.limbs, 0.55, 0.8);
+    this.scene.add(this.prediction.group, this.truth.group);
+    this.light();
+    this.themed();
+    matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => this.themed());
+  }
+
+  light() {
+    this.scene.add(new THREE.HemisphereLight(0xffffff, 0x8a94a0, 1.9));
+    this.sun = new THREE.DirectionalLight(0xffffff, 2.2);
+    this.sun.castShadow = true;
+    this.sun.shadow.mapSize.set(1024, 1024);
+    this.sun.shadow.radius = 6;
+    Object.assign(this.sun.shadow.camera, { left: -2, right: 2, top: 2, bottom: -2, near: 0.5, far: 9 });
+    this.floor = new THREE.Mesh(new THREE.CircleGeometry(14, 64), new THREE.ShadowMaterial({ opacity: 0.22 }));
+    this.floor.rotation.x = -Math.PI / 2;
+    this.floor.receiveShadow = true;
+    this.scene.add(this.sun, this.sun.target, this.floor);
+  }
+
+  // The page's colours, light or dark.
+  themed() {
+    const style = getComputedStyle(document.documentElement);
+    const colour = name => new THREE.Color(style.getPropertyValue(name).trim());
+    this.scene.background = colour('--stage');
+    this.scene.fog = new THREE.Fog(this.scene.background, 4, 8);
+    this.scene.remove(this.grid);
+    this.grid = new THREE.GridHelper(6, 12, colour('--grid'), colour('--grid'));
+    this.scene.add(this.grid);
+    this.grey = colour('--truth');
+  }
+
+  show(frame) {
+    const { joints, truth, errors } = frame;
+    const known = errors !== null;
+    this.prediction.pose(joints, known ? this.heat.bind(null, errors) : () => this.grey);
+    this.truth.group.visible = known;
+    if (known) this.truth.pose(truth, () => this.grey);
+    this.follow(truth ?? joints, frame.restarted);
+  }
+
+  // Camera and light stay where they are from the person's middle; a jump is not followed slowly.
+  follow(joints, jump) {
+    const lowest = Math.min(...joints.filter((_, i) => i % 3 === 1));
+    this.ground = Math.min(lowest, this.ground ?? lowest);
+    const target = this.controls.target;
+    const moved = new THREE.Vector3(joints[0], this.ground + 0.88, joints[2]).sub(target);
+    const now = performance.now();
+    if (this.met && !jump) moved.multiplyScalar(1 - Math.exp(-(now - this.met) / 250));
+    target.add(moved);
+    this.camera.position.add(this.met ? moved : target.clone().add(this.front(joints)));
+    this.met = now;
+    this.sun.target.position.copy(target);
+    this.sun.position.copy(target).add(SUN);
+    this.floor.position.set(target.x, this.ground - 0.03, target.z);
+    this.grid.position.set(Math.round(2 * target.x) / 2, this.ground - 0.03, Math.round(2 * target.z) / 2);
+  }
+
+  // The camera's place from the person's middle, so that she is seen from the front, a little from the side.
+  front(joints) {
+    const left = new THREE.Vector3(joints[3] - joints[6], 0, joints[5] - joints[8]); // from right to left hip
+    return START.clone().applyAxisAngle(UP, Math.atan2(-left.z, left.x));
+  }
+
+  draw() {
+    const { clientWidth: width, clientHeight: height } = this.renderer.domElement.parentElement;
+    const ratio = Math.min(devicePixelRatio, 2);
+    if (this.width !== width || this.height !== height || this.ratio !== ratio) {
+      Object.assign(this, { width, height, ratio });
+      this.renderer.setPixelRatio(ratio);
+      this.renderer.setSize(width, height, false);
+      this.camera.aspect = width / Math.max(height, 1);
+      this.camera.updateProjectionMatrix();
+    }
+    this.controls.update();
+    this.renderer.render(this.scene, this.camera);
+  }
+}
+
+// A person of round limbs; a slim one is inside of another at the same place.
+class Body {
+  constructor(limbs, opacity, slim) {
+    const material = new THREE.MeshStandardMaterial({
+      vertexColors: true, roughness: 0.75, transparent: opacity < 1, opacity, depthWrite: opacity === 1,
+    });
+    this.limbs = limbs.map(limb => new Limb(limb, material, slim));
+    this.group = new THREE.Group().add(...this.limbs.map(limb => limb.mesh));
+  }
+
+  // Joints: 66 metres; paint: (joint, other joint, part of the way) -> a colour.
+  pose(joints, paint) {
+    for (const limb of this.limbs) limb.pose(joints, paint);
+  }
+}
+
+// A round limb: one surface, turned from a half circle at each end and the line between.
+class Limb {
+  constructor({ start, end, radii, tip }, material, slim) {
+    Object.assign(this, { start, end, tip });
+    this.profile = outline(...radii.map(radius => slim * radius));
+    this.geometry = new THREE.LatheGeometry(this.profile.map(p => new THREE.Vector2(p.x, p.y + p.part)), ROUND);
+    const count = this.geometry.attributes.position.count;
+    this.geometry.setAttribute('color', new THREE.BufferAttribute(new Float32Array(3 * count), 3));
+    this.mesh = new THREE.Mesh(this.geometry, material);
+    this.mesh.castShadow = slim === 1;
+    this.mesh.frustumCulled = false;
+    this.length = 1;
+  }
+
+  pose(joints, paint) {
+    const at = joint => new THREE.Vector3().fromArray(joints, 3 * joint);
+    let [from, to] = [at(this.start), at(this.end)];
+    const along = to.clone().sub(from).normalize();
+    if (this.tip) [from, to] = [to, to.clone().addScaledVector(along, this.tip)];
+    this.mesh.position.copy(from);
+    this.mesh.quaternion.setFromUnitVectors(UP, along);
+    this.stretch(from.distanceTo(to));
+    this.colour(paint);
+  }
+
+  // The line between the ends is as long as the limb; the ends keep their form.
+  stretch(length) {
+    if (Math.abs(length - this.length) < 1e-4) return;
+    this.length = length;
+    this.each((vertex, { y, part }) => this.geometry.attributes.position.setY(vertex, y + part * length));
+    this.geometry.attributes.position.needsUpdate = true;
+  }
+
+  colour(paint) {
+    const colours = this.geometry.attributes.color;
+    const first = this.tip ? this.end : this.start;
+    const row = this.profile.map(({ part }) => paint(first, this.end, part));
+    this.each((vertex, _, i) => colours.setXYZ(vertex, row[i].r, row[i].g, row[i].b));
+    colours.needsUpdate = true;
+  }
+
+  each(action) {
+    const points = this.profile.length;
+    for (let v = 0; v < (ROUND + 1) * points; v++) action(v, this.profile[v % points], v % points);
+  }
+}
+
+// From end to end: radius x, height y above the point that is `part` of the way along.
+function outline(start, end) {
+  const quarter = Array.from({ length: 7 }, (_, i) => (Math.PI / 12) * i);
+  const cap = (radius, side, part) =>
+    quarter.map(angle => ({ x: radius * Math.sin(angle), y: side * radius * Math.cos(angle), part }));
+  const rings = Array.from({ length: RINGS - 1 }, (_, i) => (i + 1) / RINGS);
+  const between = rings.map(part => ({ x: start + part * (end - start), y: 0, part }));
+  return [...cap(start, -1, 0), ...between, ...cap(end, 1, 1).reverse()];
+}
+
+// (errors, joint, other joint, part of the way) -> the colour of the error there.
+function heatmap(colours, top) {
+  const anchors = colours.map(colour => new THREE.Color(colour));
+  return (errors, a, b, part) => {
+    const error = errors[a] + part * (errors[b] - errors[a]);
+    const place = Math.min(Math.max(error / top, 0), 1) * (anchors.length - 1);
+    const below = Math.min(Math.floor(place), anchors.length - 2);
+    return anchors[below].clone().lerp(anchors[below + 1], place - below);
+  };
+}

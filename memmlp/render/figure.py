@@ -1,0 +1,55 @@
+"""Heat-map figures, as the paper's Figs. 6 and 9 to 13: rows of truth and predictions, columns of poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from memmlp.files import atomic_write
+from memmlp.progress import track
+from memmlp.render.raster import draw
+from memmlp.render.sheet import FAINT, Sheet, png
+from memmlp.render.take import Take
+
+POSES = 6
+WIDTH, HEIGHT = 230, 330  # of a panel, pixels
+TOP, LEFT, RIGHT, CAPTION = 84, 40, 110, 26
+
+
+def heatmap_png(path: Path, take: Take, poses: int = POSES) -> None:
+    """Write a PNG: the truth's poses in a row, below it each prediction's, coloured by error.
+
+    Each pose is seen from the person's front and all rows from one camera; under a prediction stands the
+    mean error of its 22 joints.
+    """
+    rows = 1 + len(take.predictions)
+    step = HEIGHT + CAPTION
+    sheet = Sheet(LEFT + poses * WIDTH + RIGHT, TOP + rows * step + 8)
+    sheet.text(LEFT, 28, take.title, 22, ha="left", weight="bold")
+    for row, label in enumerate(["truth", *take.predictions]):
+        sheet.text(20, TOP + row * step + HEIGHT / 2, label, 17, rotation=90, weight="bold")
+    frames = np.linspace(0, len(take.truth) - 1, poses + 2).round().astype(int)[1:-1]
+    for column, frame in enumerate(track(frames.tolist(), "poses")):
+        x = LEFT + column * WIDTH
+        sheet.text(x + WIDTH / 2, TOP - 16, f"{take.seconds(frame):.2f} s", 17)
+        for row, picture in enumerate(views(take, frame)):
+            sheet.panel(x, TOP + row * step, WIDTH, HEIGHT).set_data(picture)
+        for row, errors in enumerate(take.errors.values(), 2):
+            mean = f"{errors[frame].mean():.1f} cm"
+            sheet.text(x + WIDTH / 2, TOP + row * step - CAPTION + 10, mean, 16, color=FAINT)
+    tall = min(360, rows * step - 40)
+    sheet.colour_bar(LEFT + poses * WIDTH + 18, TOP + (rows * step - tall) // 2, 16, tall, take.top)
+    atomic_write(path, png(sheet.pixels()))
+
+
+def views(take: Take, frame: int) -> list[np.ndarray]:
+    """The rows of one column."""
+    centre = take.truth[frame, 0, :2]
+    camera = take.camera(take.azimuth(frame), centre, WIDTH, HEIGHT)
+    return [draw(camera, joints, errors, take.floor) for joints, errors in take.rows(frame)]
+
+
+def poses_png(path: Path, truth: np.ndarray, predicted: np.ndarray, title: str) -> None:
+    """Write a PNG of truth and prediction, joint positions (N, 22, 3), metres, world (Z up)."""
+    heatmap_png(path, Take(title, truth, {"prediction": predicted}))

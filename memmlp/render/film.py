@@ -1,0 +1,96 @@
+"""Films of truth and predictions side by side, coloured by error, as MP4 or GIF."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from io import BytesIO
+from itertools import chain, cycle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from memmlp.body import FPS
+from memmlp.errors import InputError
+from memmlp.files import atomic_write
+from memmlp.progress import track
+from memmlp.render.raster import draw
+from memmlp.render.sheet import FAINT, Sheet, indexed
+from memmlp.render.take import Take
+
+RATE = 30  # pictures a second
+EVERY = FPS // RATE
+WIDTH, HEIGHT = 340, 480  # of a panel, pixels
+TOP, RIGHT, BOTTOM = 88, 112, 44
+TICKS = (30, 30, 40)  # milliseconds of a GIF's pictures, which count in hundredths: 30 a second on average
+
+
+def film(path: Path, take: Take) -> None:
+    """Write a film at 30 pictures a second, whole or not at all: MP4 or GIF, by the path's suffix.
+
+    Raises InputError where MP4 is asked for and PyAV is not installed.
+    """
+    encode = {".mp4": mp4, ".gif": gif}[path.suffix]
+    if path.suffix == ".mp4":
+        pyav()
+    atomic_write(path, encode(pictures(take)))
+
+
+def pictures(take: Take) -> Iterator[np.ndarray]:
+    """The film's pictures (H, W, 3), uint8, with a progress bar."""
+    labels = ["truth", *take.predictions]
+    width = len(labels) * WIDTH + RIGHT
+    sheet = Sheet(width + width % 2, TOP + HEIGHT + BOTTOM)
+    sheet.text(20, 26, take.title, 22, ha="left", weight="bold")
+    time = sheet.text(width - 20, 26, "", 20, ha="right")
+    middles = [(column + 0.5) * WIDTH for column in range(len(labels))]
+    for x, label in zip(middles, labels, strict=True):
+        sheet.text(x, 64, label, 19, weight="bold")
+    panels = [sheet.panel(column * WIDTH, TOP, WIDTH, HEIGHT) for column in range(len(labels))]
+    means = {
+        k: sheet.text(x, TOP + HEIGHT + 18, "", 18, color=FAINT)
+        for x, k in zip(middles[1:], labels[1:], strict=True)
+    }
+    sheet.colour_bar(len(labels) * WIDTH + 16, TOP + 60, 16, HEIGHT - 120, take.top)
+    path, azimuth = take.path(), take.azimuth(len(take.truth) // 2)
+    for frame in track(range(0, len(take.truth), EVERY), "pictures"):
+        camera = take.camera(azimuth, path[frame], WIDTH, HEIGHT)
+        for panel, (joints, errors) in zip(panels, take.rows(frame), strict=True):
+            panel.set_data(draw(camera, joints, errors, take.floor))
+        for label, text in means.items():
+            text.set_text(f"{take.errors[label][frame].mean():.1f} cm")
+        time.set_text(f"{take.seconds(frame):.2f} s")
+        yield sheet.pixels()
+
+
+def gif(pictures: Iterable[np.ndarray]) -> bytes:
+    """Pictures as an endless GIF."""
+    first, *rest = (indexed(picture) for picture in pictures)
+    buffer, ticks = BytesIO(), cycle(TICKS)
+    durations = [next(ticks) for _ in range(1 + len(rest))]
+    first.save(buffer, "GIF", save_all=True, append_images=rest, duration=durations, loop=0)
+    return buffer.getvalue()
+
+
+def mp4(pictures: Iterable[np.ndarray]) -> bytes:
+    """Pictures of even sides as H.264 in MP4."""
+    av, buffer = pyav(), BytesIO()
+    frames = (av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), "rgb24") for picture in pictures)
+    with av.open(buffer, "w", format="mp4") as container:
+        first = next(frames)
+        stream = container.add_stream("libx264", rate=RATE, options={"crf": "20"})
+        stream.width, stream.height, stream.pix_fmt = first.width, first.height, "yuv420p"
+        for frame in chain([first], frames, [None]):  # None: what the encoder still holds
+            container.mux(stream.encode(frame))
+    return buffer.getvalue()
+
+
+def pyav() -> Any:
+    """The module `av`. Raises InputError where it is not installed."""
+    try:
+        import av
+    except ImportError:
+        raise InputError(
+            "--out: MP4 needs PyAV, pip install 'memmlp[video]'; allowed without it: .gif, .png"
+        ) from None
+    return av

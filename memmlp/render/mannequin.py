@@ -1,0 +1,71 @@
+"""How a skeleton is drawn, in pictures and on the live page: its limbs, and the colours of errors."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from memmlp.body import HEAD, JOINTS, LEFT_WRIST, PARENTS, RIGHT_WRIST
+
+_RADII = {
+    "pelvis": 0.100, "hip": 0.082, "knee": 0.054, "ankle": 0.038, "foot": 0.030, "spine1": 0.100,
+    "spine2": 0.106, "spine3": 0.108, "neck": 0.050, "collar": 0.062, "head": 0.052, "shoulder": 0.054,
+    "elbow": 0.041, "wrist": 0.031,
+}  # fmt: skip
+RADII = tuple(_RADII[name.split("_")[-1]] for name in JOINTS)
+"""Radius of the body at each joint, metres."""
+
+
+class Limb(NamedTuple):
+    """A round limb from a joint to another, or to a tip that no joint marks.
+
+    Attributes:
+        start, end: the joints whose errors colour its ends.
+        radii: at its ends, metres.
+        tip: metres beyond `end`, in the direction from `start`, where it goes on from `end`; 0 without.
+    """
+
+    start: int
+    end: int
+    radii: tuple[float, float]
+    tip: float = 0.0
+
+    @property
+    def first(self) -> int:
+        """The joint where it begins."""
+        return self.end if self.tip else self.start
+
+
+LIMBS = (
+    *(Limb(p, j, (RADII[p], RADII[j])) for j, p in enumerate(PARENTS) if p >= 0),
+    Limb(PARENTS[HEAD], HEAD, (0.085, 0.095), 0.085),
+    *(Limb(PARENTS[hand], hand, (0.031, 0.038), 0.085) for hand in (LEFT_WRIST, RIGHT_WRIST)),
+)
+NEUTRAL = (0.66, 0.70, 0.74)  # of what has no error: the truth
+HEAT = ("#2b5fd9", "#27a9e1", "#3fc380", "#f2d43d", "#f28c28", "#c4161c")
+"""Colours from no error to the top of the scale, evenly spaced."""
+
+SCALES = (10, 15, 20, 30, 40, 50, 75, 100)  # cm at the top of a scale
+
+
+def ends(limb: Limb, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where a limb of joints (22, 3) begins and ends, each (3,), metres."""
+    start, end = joints[limb.start], joints[limb.end]
+    if not limb.tip:
+        return start, end
+    along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-6)
+    return end, end + limb.tip * along
+
+
+def heat(parts: np.ndarray) -> np.ndarray:
+    """Colours (..., 3), 0 to 1, of errors (...) as parts of the scale; above 1 they are as at 1."""
+    anchors = np.array([[int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)] for colour in HEAT])
+    place = np.clip(parts, 0, 1) * (len(anchors) - 1)
+    return np.stack([np.interp(place, range(len(anchors)), channel) for channel in anchors.T], -1)
+
+
+def scale(errors: np.ndarray) -> float:
+    """The top of a scale for errors in cm: a round number that all but the largest 2 % stay below."""
+    high = float(np.percentile(errors, 98))
+    return float(next((top for top in SCALES if high <= top), SCALES[-1]))

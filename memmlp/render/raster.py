@@ -1,0 +1,156 @@
+"""Skeletons as shaded bodies on a floor, in NumPy: rows of spheres, a depth buffer, parallel projection."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from memmlp.render.mannequin import LIMBS, NEUTRAL, Limb, ends, heat
+
+SAMPLES = 2  # a pixel's side, for smooth edges
+SPHERES = 18  # of a limb
+LIGHT = np.array([-0.45, 0.65, 0.62]) / np.linalg.norm([-0.45, 0.65, 0.62])  # in the camera's axes
+AMBIENT = 0.46
+GRID = 0.5  # metres between the floor's lines
+FLOOR = 0.56  # of a picture's width around its centre in which the floor is seen; it fades out
+SHADOW = 0.13  # metres of a shadow's blur
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A parallel projection of the world (Z up).
+
+    Attributes:
+        centre: the point (3,) in the middle of the picture, metres.
+        azimuth: radians about the vertical; at 0 the camera looks along +Y.
+        elevation: radians by which it looks down.
+        width, height: pixels. scale: pixels a metre.
+    """
+
+    centre: np.ndarray
+    azimuth: float
+    width: int
+    height: int
+    scale: float
+    elevation: float = np.deg2rad(12)
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Unit vectors (3, 3), rows: to the right, up, and towards the viewer."""
+        (c, s), (ce, se) = ((np.cos(angle), np.sin(angle)) for angle in (self.azimuth, self.elevation))
+        return np.array([[c, s, 0], [-s * se, c * se, ce], [s * ce, -c * ce, se]])
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """World points (..., 3) -> to the right, up and towards the viewer of the centre (..., 3), metres."""
+        return (points - self.centre) @ self.axes.T
+
+    def grid(self) -> tuple[np.ndarray, np.ndarray]:
+        """Metres to the right (1, W) and up (H, 1) of the samples, `SAMPLES` a pixel's side."""
+        width, height, scale = SAMPLES * self.width, SAMPLES * self.height, SAMPLES * self.scale
+        right = (np.arange(width, dtype=np.float32) + 0.5 - width / 2) / scale
+        up = (height / 2 - np.arange(height, dtype=np.float32) - 0.5) / scale
+        return right[None], up[:, None]
+
+
+def draw(camera: Camera, joints: np.ndarray, errors: np.ndarray | None, floor: float) -> np.ndarray:
+    """A picture (height, width, 3), uint8, of one skeleton on white.
+
+    Args:
+        joints: positions (22, 3), metres, world.
+        errors: of the joints (22,), as parts of the colour scale; None for the truth.
+        floor: its height, metres.
+    """
+    right, up = camera.grid()
+    picture = ground(camera, joints, floor)
+    depth = np.full(picture.shape[:2], -np.inf, np.float32)
+    for limb in LIMBS:
+        shade(limb, camera, joints, errors, right, up, picture, depth)
+    height, width = camera.height, camera.width
+    smooth = picture.reshape(height, SAMPLES, width, SAMPLES, 3).mean((1, 3))
+    return (smooth * 255 + 0.5).astype(np.uint8)
+
+
+def ground(camera: Camera, joints: np.ndarray, floor: float) -> np.ndarray:
+    """White with the floor's grid and the skeleton's shadow, (height, width, 3) in samples."""
+    x, y = on_floor(camera, floor)
+    far = np.hypot(x - camera.centre[0], y - camera.centre[1]) / (FLOOR * camera.width / camera.scale)
+    fade = np.clip(1.8 * (1 - far), 0, 1)
+    lines = np.maximum(*(grid_lines(v, camera) for v in (x, y)))
+    shadow = np.zeros_like(fade)
+    for point in np.concatenate([np.linspace(*ends(limb, joints), 2) for limb in LIMBS]):
+        spread = SHADOW + 0.25 * max(float(point[2]) - floor, 0.0)  # higher up, wider and fainter
+        near = ((x - point[0]) ** 2 + (y - point[1]) ** 2) / spread**2
+        shadow = np.maximum(shadow, SHADOW / spread / (1 + near) ** 2)
+    dark = fade * (0.05 + 0.13 * lines + 0.25 * shadow)
+    return np.kron((1 - dark)[..., None], np.ones((SAMPLES, SAMPLES, 3), np.float32))
+
+
+def on_floor(camera: Camera, floor: float) -> tuple[np.ndarray, np.ndarray]:
+    """World X and Y (height, width), metres, of the floor behind each pixel."""
+    right, up = camera.grid()
+    right, up = right[:, ::SAMPLES], up[::SAMPLES]
+    axes = camera.axes.astype(np.float32)
+    away = (floor - camera.centre[2] - right * axes[0, 2] - up * axes[1, 2]) / axes[2, 2]
+    x, y = (camera.centre[i] + right * axes[0, i] + up * axes[1, i] + away * axes[2, i] for i in (0, 1))
+    return x.astype(np.float32), y.astype(np.float32)
+
+
+def grid_lines(along: np.ndarray, camera: Camera) -> np.ndarray:
+    """How much (height, width), 0 to 1, of each pixel lies on the grid's lines of a coordinate."""
+    off = np.abs((along / GRID + 0.5) % 1 - 0.5) * GRID
+    pixel = np.hypot(*np.gradient(along))  # metres of the floor that a pixel covers
+    return np.clip(1.2 - off / np.maximum(pixel, 1e-6), 0, 1)
+
+
+def shade(
+    limb: Limb,
+    camera: Camera,
+    joints: np.ndarray,
+    errors: np.ndarray | None,
+    right: np.ndarray,
+    up: np.ndarray,
+    picture: np.ndarray,
+    depth: np.ndarray,
+) -> None:
+    """Draw a limb into a picture (H, W, 3) where it is nearer than the depth (H, W) so far."""
+    a, b = (camera.project(point) for point in ends(limb, joints))
+    part = np.linspace(0, 1, SPHERES, dtype=np.float32)[:, None, None]
+    centre = [a[i] + part * (b[i] - a[i]) for i in range(3)]
+    radius = limb.radii[0] + part * (limb.radii[1] - limb.radii[0])
+    rows, columns = box(centre, radius, right, up)
+    x, y = right[:, columns] - centre[0], up[rows] - centre[1]
+    inside = radius**2 - x**2 - y**2
+    surface = np.where(inside > 0, centre[2] + np.sqrt(np.maximum(inside, 0)), -np.inf)
+    best = surface.argmax(0)[None]
+    near = np.take_along_axis(surface, best, 0)[0]
+    seen = near > depth[rows, columns]
+    t = part[best[0], 0, 0]
+    normal = np.stack(
+        [np.take_along_axis(v, best, 0)[0] / radius[best[0], 0, 0] for v in np.broadcast_arrays(x, y)], -1
+    )
+    normal = np.concatenate([normal, np.sqrt(np.clip(1 - (normal**2).sum(-1, keepdims=True), 0, 1))], -1)
+    normal = along_tube(normal, b - a, (t > 0) & (t < 1))
+    light = AMBIENT + (1 - AMBIENT) * np.clip(normal @ LIGHT, 0, 1) + 0.12 * normal[..., 2] - 0.06
+    colour = (
+        np.array(NEUTRAL) if errors is None else heat(np.interp(t, (0, 1), errors[[limb.first, limb.end]]))
+    )
+    picture[rows, columns][seen] = np.clip(colour * light[..., None], 0, 1)[seen]
+    depth[rows, columns][seen] = near[seen]
+
+
+def box(
+    centre: list[np.ndarray], radius: np.ndarray, right: np.ndarray, up: np.ndarray
+) -> tuple[slice, slice]:
+    """Rows and columns of the samples that spheres can cover."""
+    columns = np.searchsorted(right[0], [(centre[0] - radius).min(), (centre[0] + radius).max()])
+    rows = np.searchsorted(-up[:, 0], [(-centre[1] - radius).min(), (-centre[1] + radius).max()])
+    return slice(*rows), slice(*columns)
+
+
+def along_tube(normal: np.ndarray, axis: np.ndarray, side: np.ndarray) -> np.ndarray:
+    """Normals (H, W, 3) of a row of spheres as a tube along the axis (3,) has them on its side (H, W)."""
+    axis = axis / max(float(np.linalg.norm(axis)), 1e-6)
+    flat = normal - (normal @ axis)[..., None] * axis
+    flat /= np.maximum(np.linalg.norm(flat, axis=-1, keepdims=True), 1e-6)
+    return np.where(side[..., None], flat, normal)

@@ -1,0 +1,180 @@
+"""`memmlp render` and `memmlp live` as a person types them, on a tiny run."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from command_line import MAIN, TINY, run
+from conftest import Memmlp, one_line
+from PIL import Image
+
+from memmlp.player.packets import Packet
+from memmlp.player.sources import PacketSource
+from memmlp.runs import Run, list_runs
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a finished run."""
+    folder = tmp_path_factory.mktemp("look")
+    run(folder, "train", *TINY)
+    return folder
+
+
+@pytest.fixture
+def finished(home: Path, memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """That run, in the folder of which the commands run."""
+    monkeypatch.chdir(home)
+    return next(found for found in list_runs("outputs") if found.manifest["kind"] == "memmlp")
+
+
+@pytest.fixture
+def clips(finished: Run) -> list[str]:
+    return [row["name"] for row in json.loads(finished.clips.read_text())]
+
+
+def test_a_figure(memmlp: Memmlp, finished: Run, clips: list[str], tmp_path: Path):
+    out = tmp_path / "heat.png"
+    ran = memmlp("render", finished.id, "--out", str(out), "--frames", "2", "--label", "ours")
+    error = json.loads(finished.clips.read_text())[0]["stream"]["rotation"]["MPJPE"]
+    assert (ran.code, ran.out) == (0, f"{out}: {clips[0]}, ours {error:.1f} cm\n")
+    with Image.open(out) as image:
+        assert image.size[0] < 700
+
+
+def test_a_films_branch_mode_and_times(memmlp: Memmlp, finished: Run, clips: list[str], tmp_path: Path):
+    out = tmp_path / "film.gif"
+    times = ["--from", "0.5", "--to", "0.7"]
+    ran = memmlp("render", finished.id, "--out", str(out), "--branch", "position", "--mode", "window", *times)
+    assert ran.code == 0, ran.err
+    with Image.open(out) as image:
+        assert image.n_frames == 6
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--clip", "nobody", "--out", "a.png"], ("--clip nobody", "no such test clip; allowed are ")),
+        (["--out", "a.avi"], ("--out a.avi", ".png, .gif, .mp4")),
+        (["--out", "no/a.png"], ("no folder no",)),
+        (["--from", "900", "--out", "a.png"], ("--from 900", "nothing between")),
+        (["--from", "1", "--to", "1", "--out", "a.png"], ("--from 1 --to 1",)),
+        (["--label", "a", "--label", "b", "--out", "a.png"], ("2 for 1 runs",)),
+    ],
+)
+def test_bad_input_to_render_is_one_line(memmlp: Memmlp, finished: Run, arguments, words):
+    assert one_line(memmlp("render", finished.id, *arguments), *words)
+    assert not Path("a.png").exists()
+
+
+def test_an_unknown_clip_lists_the_test_clips(memmlp: Memmlp, finished: Run, clips: list[str]):
+    ran = memmlp("render", finished.id, "--clip", "nobody", "--out", "a.png")
+    assert all(name in ran.err for name in clips)
+
+
+def test_without_pyav_nothing_is_computed(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert one_line(memmlp("render", "no-such-run", "--out", "a.mp4"), "memmlp[video]")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--clip", "nobody"], ("--clip nobody", "no such test clip")),
+        (["--clip", "no.npz"], ("no.npz",)),
+        (["--udp", "9000", "--osc", "9001"], ("more than one source",)),
+        (["--udp", "9000", "--clip", "a"], ("more than one source",)),
+        (["--send"], ("--send", "--udp PORT or --osc PORT")),
+    ],
+)
+def test_bad_input_to_live_is_one_line(memmlp: Memmlp, finished: Run, arguments, words):
+    assert one_line(memmlp("live", finished.id, "--no-browser", *arguments), *words)
+
+
+def test_a_file_has_no_test_clips(memmlp: Memmlp, finished: Run):
+    assert one_line(
+        memmlp("live", str(finished.onnx), "--no-browser"), "has no test clips", "--clip FILE.npz"
+    )
+
+
+@pytest.mark.parametrize("option", ["--port", "--udp"])
+def test_a_taken_port_is_one_line(memmlp: Memmlp, finished: Run, option: str):
+    kind = socket.SOCK_DGRAM if option == "--udp" else socket.SOCK_STREAM
+    with socket.socket(socket.AF_INET, kind) as taken:
+        taken.bind(("127.0.0.1", 0))
+        if option == "--port":
+            taken.listen()
+        port = str(taken.getsockname()[1])
+        assert one_line(memmlp("live", finished.id, "--no-browser", option, port), f"port {port}: taken")
+
+
+class Watched:
+    """`memmlp live` in a process of its own."""
+
+    def __init__(self, folder: Path, *arguments: str):
+        line = [*MAIN, "live", "--no-browser", "--port", "0", *arguments]
+        self.process = subprocess.Popen(
+            line, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        assert self.process.stdout is not None
+        self.greeting = self.process.stdout.readline()
+        self.port = int(re.findall(r"http://127.0.0.1:(\d+)/", self.greeting)[0])
+
+    def frames(self) -> Iterator[dict]:
+        """The frames that it sends."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        connection.request("GET", "/events")
+        for line in connection.getresponse():
+            if line.startswith(b'data: {"number"'):
+                yield json.loads(line[6:])
+
+    def interrupt(self) -> tuple[int, str, str]:
+        """What Ctrl-C makes of it: exit code, and the rest of what it wrote."""
+        self.process.send_signal(signal.SIGINT)
+        out, err = self.process.communicate(timeout=60)
+        return self.process.returncode, out, err
+
+
+@pytest.mark.parametrize("source", ["clip", "udp"])
+def test_ctrl_c_ends_it_and_leaves_nothing(home: Path, finished: Run, source: str):
+    arguments = ["--hz", "72"]
+    if source == "udp":
+        free = PacketSource("UDP", 0, lambda data: Packet((None, None, None)), "amass")
+        free.close()
+        arguments = ["--udp", str(free.port), "--space", "unity"]
+    watched = Watched(home, finished.id, *arguments)
+    if source == "clip":
+        frames = watched.frames()
+        assert {"joints", "truth", "held", "ms"} <= set(next(frames))
+    assert watched.interrupt() == (0, "", "")
+    with pytest.raises(ProcessLookupError):
+        os.kill(watched.process.pid, 0)
+    with socket.create_server(("127.0.0.1", watched.port)):
+        pass
+
+
+@pytest.mark.parametrize("kind", ["--udp", "--osc"])
+def test_a_clip_that_is_sent_is_predicted(home: Path, finished: Run, kind: str):
+    free = PacketSource("any", 0, lambda data: Packet((None, None, None)), "amass")
+    free.close()
+    watched = Watched(home, finished.id, kind, str(free.port))
+    sender = subprocess.Popen(
+        [*MAIN, "live", finished.id, "--send", kind, str(free.port)], cwd=home, stdout=subprocess.DEVNULL
+    )
+    frames = watched.frames()
+    seen = [next(frames) for _ in range(30)]
+    sender.kill()
+    sender.wait()
+    assert [f["number"] for f in seen] == list(range(seen[0]["number"], seen[0]["number"] + 30))
+    assert all(f["truth"] is None and f["held"] == [] and f["malformed"] == 0 for f in seen)
+    assert watched.interrupt()[0] == 0
