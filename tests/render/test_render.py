@@ -50,11 +50,16 @@ def test_one_joints_error_colours_its_limbs_alone(camera: Camera):
     errors = np.zeros(22)
     plain = draw(camera, TRUTH[0], errors, 0.0)
     errors[7] = 1.0  # the left ankle
-    changed = (draw(camera, TRUTH[0], errors, 0.0) != plain).any(-1)
+    picture = draw(camera, TRUTH[0], errors, 0.0)
+    changed = (picture != plain).any(-1)
     rows, columns = np.nonzero(changed)
     ankle = camera.project(TRUTH[0, 7]) * camera.scale
     assert 20 < changed.sum() < 0.1 * changed.size
     assert np.hypot(columns - 60 - ankle[0], 90 - rows - ankle[1]).max() < 0.55 * camera.scale
+    x, y, _ = (camera.project(TRUTH[0, [7, 4]]) * camera.scale).T
+    at_ankle, at_knee = picture[np.round(90 - y).astype(int), np.round(60 + x).astype(int)]
+    assert at_ankle.argmax() == 0
+    assert at_knee.argmax() == 2
 
 
 def test_the_truth_has_no_colour(camera: Camera):
