@@ -52,8 +52,8 @@ def live(
 ) -> None:
     """A finished run (id, its beginning, or folder) or an ONNX file, live, on a page of this machine.
 
-    It is fed a clip in real time, over and over, or tracker poses that arrive as packets; the README has
-    their format. Ctrl-C ends it.
+    It is fed a clip in real time, over and over, or tracker poses that arrive as packets.
+    The README has their format. Ctrl-C ends it.
     """
     from memmlp.errors import InputError
     from memmlp.player.packets import needs_osc
