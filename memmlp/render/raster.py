@@ -78,9 +78,9 @@ def ground(camera: Camera, joints: np.ndarray, floor: float) -> np.ndarray:
     fade = np.clip(1.8 * (1 - far), 0, 1)
     lines = np.maximum(*(grid_lines(v, camera) for v in (x, y)))
     shadow = np.zeros_like(fade)
-    for point in np.concatenate([np.linspace(*ends(limb, joints), 2) for limb in LIMBS]):
-        spread = SHADOW + 0.25 * max(float(point[2]) - floor, 0.0)  # higher up, wider and fainter
-        near = ((x - point[0]) ** 2 + (y - point[1]) ** 2) / spread**2
+    for px, py, pz in np.concatenate([ends(limb, joints) for limb in LIMBS]).tolist():
+        spread = SHADOW + 0.25 * max(pz - floor, 0.0)  # higher up, wider and fainter
+        near = ((x - px) ** 2 + (y - py) ** 2) / spread**2
         shadow = np.maximum(shadow, SHADOW / spread / (1 + near) ** 2)
     dark = fade * (0.05 + 0.13 * lines + 0.25 * shadow)
     return np.kron((1 - dark)[..., None], np.ones((SAMPLES, SAMPLES, 3), np.float32))
@@ -114,7 +114,7 @@ def shade(
     depth: np.ndarray,
 ) -> None:
     """Draw a limb into a picture (H, W, 3) where it is nearer than the depth (H, W) so far."""
-    a, b = (camera.project(point) for point in ends(limb, joints))
+    a, b = (camera.project(point).astype(np.float32) for point in ends(limb, joints))
     part = np.linspace(0, 1, SPHERES, dtype=np.float32)[:, None, None]
     centre = [a[i] + part * (b[i] - a[i]) for i in range(3)]
     radius = limb.radii[0] + part * (limb.radii[1] - limb.radii[0])
