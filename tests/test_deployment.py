@@ -11,15 +11,18 @@ import onnx
 import pytest
 import tiny
 from command_line import TINY, run
+from conftest import one_line
 
-import memmlp
-from memmlp.deployment import GRAPHS
+import memmlp as package
+from memmlp.cli.build import build_experiment
+from memmlp.cli.train import composed
+from memmlp.deployment import GRAPHS, Deployment
 from memmlp.export import export
 from memmlp.features import Heading
 from memmlp.memory import CodeMemory
 from memmlp.model import WindowModel
 from memmlp.quantization import accuracy, compared, quantise, streamed
-from memmlp.runs import list_runs
+from memmlp.runs import Run, list_runs
 from memmlp.session import OnnxStream
 from memmlp.streaming import Stream, streaming
 
@@ -108,7 +111,7 @@ def test_accuracy_is_that_of_the_evaluation(tmp_path):
         assert value == pytest.approx(np.mean([row[name] for row in rows]), rel=1e-3), name
 
 
-def test_a_run_in_int8_records_what_it_costs(tmp_path):
+def test_a_run_in_int8_records_what_it_costs(tmp_path, memmlp):
     run(tmp_path, "train", *TINY, "export.precision=int8")
     (made,) = (found for found in list_runs(tmp_path / "outputs") if found.manifest["kind"] == "memmlp")
     written = made.latency.read_text()
@@ -125,29 +128,30 @@ def test_a_run_in_int8_records_what_it_costs(tmp_path):
         cost["default"] = default
         made.latency.write_text(json.dumps(record))
         assert made.deployed == used
-        assert memmlp.Stream(made).network.path == used
-        assert memmlp.Stream(str(made.folder)).network.path == used
+        assert package.Stream(made).network.path == used
+        assert package.Stream(str(made.folder)).network.path == used
     made.latency.write_text(written)
     assert made.verify() == []
     made.int8.write_bytes(b"")
     assert made.verify() == ["step.int8.onnx"]
 
-    out = tmp_path / "int8.onnx"
-    said = run(tmp_path, "export", made.id, "--out", str(out), "--precision", "int8", "--max-growth", "50")
-    assert "MPJPE" in said
-    out.unlink()
-    said = run(
-        tmp_path, "export", made.id, "--out", str(out), "--precision", "int8", "--max-growth", "-100", code=1
-    )
-    assert "not written" in said
+    line = ["export", made.id, "--out", "int8.onnx", "--precision", "int8"]
+    assert "MPJPE" in memmlp(*line, "--max-growth", "50").out
+    Path("int8.onnx").unlink()
+    refused = memmlp(*line, "--max-growth", "-100")
+    assert refused.code == 1
+    assert "not written" in refused.err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["outputs"]
-    line = ["export", made.id, "--out", str(out), "--precision", "int8"]
-    assert "allowed" in run(tmp_path, *line, "--graph", "naive", code=2)
+    assert one_line(memmlp(*line, "--graph", "naive"), "allowed")
 
 
 def test_the_naive_graph_by_switch(tmp_path):
-    run(tmp_path, "train", *TINY, "export.graph=naive")
-    (made,) = (found for found in list_runs(tmp_path / "outputs") if found.manifest["kind"] == "memmlp")
-    record = json.loads(made.latency.read_text())
-    assert record["graph"] == "naive"
-    assert record["step_macs"] == record["macs"]
+    """No run: what a config's deployment writes."""
+    shipped = {}
+    for graph in ("naive", "auto"):
+        made = Run(tmp_path / graph)
+        made.begin("memmlp", {}, data="d", upstream=None)
+        shipped[graph] = Deployment(1, graph).ship(tiny.model(), made, CLIPS, CLIPS)
+    assert [record["graph"] for record in shipped.values()] == ["naive", "streaming"]
+    assert shipped["naive"]["step_macs"] == shipped["naive"]["macs"] == shipped["auto"]["macs"]
+    assert build_experiment(composed(["export.graph=naive"])).deployment.graph == "naive"

@@ -14,6 +14,7 @@ import onnx
 import pytest
 import torch
 import yaml
+from conftest import one_line
 from PIL import Image
 
 from memmlp import pipeline
@@ -101,27 +102,28 @@ def test_eval_repeats_the_runs_numbers_and_saves_predictions(home):
     assert run.done
 
 
-def test_the_live_stream_of_a_run(home):
+def test_the_live_stream_of_a_run(home, memmlp, monkeypatch):
+    monkeypatch.chdir(home)
     run = motion_run(home)
-    out = command(home, "bench", "soak", run.id, "--hours", "0.001")
+    out = memmlp("bench", "soak", run.id, "--hours", "0.001").out
     assert "all finite: yes" in out
     first, last = re.search(r"MPJPE (\S+) cm in the first tenth, (\S+) cm in the last", out).groups()
     assert float(last) == pytest.approx(float(first), rel=0.05)
-    assert "ratio" in command(home, "bench", "avatar", "--run", run.id, "--frames", "5", "--rounds", "1")
-    assert "neither RUN nor --onnx" in command(home, "bench", "soak", code=2)
+    assert "ratio" in memmlp("bench", "avatar", "--run", run.id, "--frames", "5", "--rounds", "1").out
+    assert one_line(memmlp("bench", "soak"), "neither RUN nor --onnx")
 
 
-def test_export_again_and_bad_names(home):
+def test_export_again_and_bad_names(home, memmlp, monkeypatch):
+    monkeypatch.chdir(home)
     run = motion_run(home)
-    assert "differs from torch" in command(home, "export", run.id, "--out", "again.onnx")
+    assert "differs from torch" in memmlp("export", run.id, "--out", "again.onnx").out
     onnx.checker.check_model(onnx.load(home / "again.onnx"))
     full = ["export", run.id, "--out", "full.onnx", "--space", "unity"]
-    assert "differs from torch" in command(home, *full, "--scope", "full")
-    assert "allowed with --scope full" in command(home, *full, code=2)
-    assert "run 'zzz'" in command(home, "eval", "zzz", code=2)
-    assert "--out" in command(home, "export", run.id, "--out", "no/where.onnx", code=2)
-    vqvae = run.manifest["upstream"]
-    assert "not a finished Mem-MLP run" in command(home, "eval", vqvae, code=2)
+    assert "differs from torch" in memmlp(*full, "--scope", "full").out
+    assert one_line(memmlp(*full), "allowed with --scope full")
+    assert one_line(memmlp("eval", "zzz"), "run 'zzz'")
+    assert one_line(memmlp("export", run.id, "--out", "no/where.onnx"), "--out")
+    assert one_line(memmlp("eval", run.manifest["upstream"]), "not a finished Mem-MLP run")
 
 
 def test_foreign_targets_in_a_runs_config_are_refused(home, tmp_path):

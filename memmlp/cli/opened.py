@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+from torch import Tensor
+
 from memmlp import pipeline
 from memmlp.cli.build import build_experiment, config_of, device
 from memmlp.data.dataset import Frames
@@ -40,6 +42,11 @@ def opened(outputs: Path, name: str, device_name: str = "cpu") -> Opened:
         root = experiment.data.source.root
         raise InputError(f"run {run.id}: its data has changed since (data.root={root})")
     return Opened(run, experiment, cache, manifest)
+
+
+def clip_of(test: Frames, name: str) -> Tensor:
+    """All frames (N, 252) of a test clip. Raises InputError where there is none of that name."""
+    return test.clip(clip_index(test, name))
 
 
 def clip_index(test: Frames, name: str) -> int:

@@ -66,8 +66,7 @@ def render(
     check(out, runs, labels)
     if out.suffix == ".mp4":
         pyav()
-    take = taken([opened(outputs, run) for run in runs], labels, clip, branch, mode)
-    take = cut(take, begin, end)
+    take = taken([opened(outputs, run) for run in runs], labels, clip, (begin, end), branch, mode)
     if out.suffix == ".png":
         heatmap_png(out, take, frames)
     else:
@@ -90,34 +89,47 @@ def check(out: Path, runs: tuple[str, ...], labels: tuple[str, ...]) -> None:
         raise InputError(f"{'--label' if labels else 'RUNS'}: one is there twice; allowed are different ones")
 
 
-def taken(runs: list[Opened], labels: tuple[str, ...], clip: str | None, branch: str, mode: str) -> Take:
-    """The whole clip as these runs predict it."""
+def taken(
+    runs: list[Opened],
+    labels: tuple[str, ...],
+    clip: str | None,
+    times: tuple[float, float | None],
+    branch: str,
+    mode: str,
+) -> Take:
+    """The piece of a clip between two times, seconds, as these runs predict it."""
     import numpy as np
 
+    from memmlp.cli.opened import clip_of
     from memmlp.errors import InputError
     from memmlp.render.take import Take
 
     title = clip or runs[0].test.names[0]
+    first, last = span(len(clip_of(runs[0].test, title)), title, *times)
     truths, predictions = [], {}
     for label, run in zip(labels or [run.run.id[:8] for run in runs], runs, strict=True):
-        truth, predictions[label] = predicted(run, title, branch, mode)
-        truths.append(truth)
-        if truth.shape != truths[0].shape or not np.array_equal(truth, truths[0]):
+        truth, motion = predicted(run, title, last, branch, mode)
+        truths.append(truth[first:])
+        predictions[label] = motion[first:]
+        if not np.array_equal(truths[-1], truths[0]):
             raise InputError(
                 f"run {run.run.id}: {title} is another motion or body there than in the first run"
             )
-    return Take(title, truths[0], predictions)
+    return Take(title, truths[0], predictions, start=first)
 
 
-def predicted(run: Opened, clip: str, branch: str, mode: str) -> tuple[np.ndarray, np.ndarray]:
-    """Truth and prediction (N, 22, 3) of a test clip, metres, world."""
+def predicted(run: Opened, clip: str, last: int, branch: str, mode: str) -> tuple[np.ndarray, np.ndarray]:
+    """Truth and prediction (last, 22, 3) of a test clip's frames up to `last`, metres, world."""
     from memmlp import evaluation
     from memmlp.body import SPARSE_DIM
-    from memmlp.cli.opened import clip_index
+    from memmlp.cli.opened import clip_of
 
     model = run.experiment.architecture.load(run.run)
-    frames = run.test.clip(clip_index(run.test, clip))
-    motion = evaluation.MODES[mode](model, [frames])[0]
+    frames = clip_of(run.test, clip)
+    if mode == "stream":  # what comes later can't matter, as it does to the windows of the other
+        frames = frames[:last]
+    motion = evaluation.MODES[mode](model, [frames])[0][:last]
+    frames = frames[:last]
     positions = {
         "rotation": lambda: model.frame.pose(motion, frames[:, :SPARSE_DIM]),
         "position": lambda: evaluation.joint_positions(motion),
@@ -125,17 +137,13 @@ def predicted(run: Opened, clip: str, branch: str, mode: str) -> tuple[np.ndarra
     return evaluation.joint_positions(frames[:, SPARSE_DIM:]).numpy(), positions.numpy()
 
 
-def cut(take: Take, begin: float, end: float | None) -> Take:
-    """The piece of a clip between two times, seconds."""
-    from dataclasses import replace
-
+def span(length: int, title: str, begin: float, end: float | None) -> tuple[int, int]:
+    """The first frame of a clip's piece between two times, seconds, and the one after its last."""
     from memmlp.body import FPS
     from memmlp.errors import InputError
 
-    length = len(take.truth)
     first, last = round(begin * FPS), length if end is None else min(round(end * FPS), length)
     if first >= last:
         given = f"--from {begin:g}" + ("" if end is None else f" --to {end:g}")
-        raise InputError(f"{given}: nothing between; {take.title} has {length / FPS:.1f} s")
-    pieces = {label: motion[first:last] for label, motion in take.predictions.items()}
-    return replace(take, truth=take.truth[first:last], predictions=pieces, start=first)
+        raise InputError(f"{given}: nothing between; {title} has {length / FPS:.1f} s")
+    return first, last

@@ -96,7 +96,7 @@ def test_it_is_evaluations_stream(name, tmp_path):
 def test_on_a_dancer_at_60_and_at_120_hz(network, file):
     bvh = read_bvh(CMU / "salsa" / "10.bvh")
     clip = retarget(bvh, find_skeleton(bvh), tiny.REST.numpy())
-    poses, trans = torch.tensor(clip.poses), torch.tensor(clip.trans)
+    poses, trans = torch.tensor(clip.poses[:1200]), torch.tensor(clip.trans[:1200])
     every, second = live.of_poses(poses, trans), live.of_poses(poses[::2], trans[::2])
     assert largest_difference(network, file, second) < 1e-4
     times = np.arange(len(poses)) / 120
