@@ -18,7 +18,7 @@ demo: $(STAMP)
 	$(BIN)/memmlp demo
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: $(STAMP)
 	$(BIN)/ruff check .

@@ -24,7 +24,7 @@ from memmlp.data.dataset import Frames
 from memmlp.pipeline import MOTION_ARTIFACTS
 from memmlp.runs import Run, list_runs
 
-TINY = ["profile=tiny", "data.synth.minutes=0.8", "tracker=none", "threads=1"]
+TINY = ["profile=tiny", "data.synth.minutes=0.6", "tracker=none", "threads=1"]
 
 
 @pytest.fixture(scope="module")
@@ -139,9 +139,9 @@ def test_foreign_targets_in_a_runs_config_are_refused(home, tmp_path):
 
 
 def test_kill_9_in_the_pipeline_then_again_gives_the_same_model(home, tmp_path):
-    """The whole command killed at four unrelated moments, from data to export, and then let finish."""
+    """The whole command killed at three unrelated moments, from data to export, and then let finish."""
     line = [sys.executable, "-c", "from memmlp.cli.main import main; main()", "train", *TINY]
-    for seconds in (3.0, 5.0, 6.5, 8.0):
+    for seconds in (3.0, 5.0, 7.5):
         process = subprocess.Popen(line, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         time.sleep(seconds)
         os.kill(process.pid, signal.SIGKILL)

@@ -87,8 +87,10 @@ class Sweep:
     def with_overrides(self, overrides: Sequence[str]) -> Sweep:
         """The same sweep, further overrides standing after its base and before its arms' differences.
 
-        `seed=0,1` or `seed=0` sets the seeds.
+        `seed=0,1` or `seed=0` sets the seeds. Raises InputError for the outputs folder, no arm's matter.
         """
+        if any(word.partition("=")[0].lstrip("+") == "paths.outputs" for word in overrides):
+            raise InputError("paths.outputs: allowed here is --outputs FOLDER, or MEMMLP_OUTPUTS")
         seeds = [word.partition("=")[2] for word in overrides if word.startswith("seed=")]
         others = tuple(word for word in overrides if not word.startswith("seed="))
         chosen = _seeds(seeds[-1].split(","), "seed") if seeds else self.seeds

@@ -37,6 +37,12 @@ def test_seeds_of_the_command_line_replace_the_files():
     assert sweep.extra == ("profile=tiny",)
 
 
+def test_the_outputs_folder_is_an_option_and_no_override():
+    sweep = parse_sweep("s", {"seeds": [0], "arms": ARMS})
+    with pytest.raises(InputError, match=r"paths\.outputs: allowed here is --outputs"):
+        sweep.with_overrides(["profile=tiny", "paths.outputs=elsewhere"])
+
+
 def test_axes_are_a_grid_over_every_arm():
     axes = {"model.frames": [11, 21], "memory.layers": [[2], [2, 4]], "seed": [3, 4]}
     sweep = parse_sweep("s", {"arms": {"a": ["loss=manual"]}, "axes": axes})
