@@ -10,8 +10,9 @@ from typing import Any
 from torch import Tensor
 
 from memmlp import latency
-from memmlp.export import TOLERANCE, export, parity
+from memmlp.export import export
 from memmlp.model import WindowModel
+from memmlp.parity import TOLERANCE, parity
 from memmlp.quantization import compared, quantise
 from memmlp.runs import Run
 from memmlp.streaming import Stream, has_stream, streaming

@@ -1,4 +1,4 @@
-"""ONNX of one streaming step with its state explicit, and the proof that it computes the same.
+"""ONNX of one streaming step with its state explicit.
 
 Inputs: `sparse` (1, 54), the world features of the newest frame (order: memmlp.body), and `state.*`, all
 zeros for a fresh start. Outputs: `rotation6d` (1, 22, 6) local rotations, `position` (1, 22, 3) metres in
@@ -10,24 +10,19 @@ from __future__ import annotations
 import json
 import logging
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
 import onnx
 import torch
 from torch import Tensor, nn
 
 from memmlp import __version__
 from memmlp.body import FEATURES, FPS, JOINTS, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
-from memmlp.memory import Blend
 from memmlp.model import WindowModel
-from memmlp.session import OnnxStream
+from memmlp.parity import deterministic
 from memmlp.streaming import Stream
 
 OPSET = 18
-TOLERANCE = 1e-4
 
 
 class StreamStep(nn.Module):
@@ -45,20 +40,6 @@ class StreamStep(nn.Module):
         rotation = last[:, ROTATION].unflatten(-1, (N_JOINTS, 6))
         position = last[:, POSITION].unflatten(-1, (N_JOINTS, 3))
         return rotation, position, *(new[name] for name in self.names)
-
-
-@contextmanager
-def deterministic(model: nn.Module) -> Iterator[None]:
-    """No draws, which torch and ONNX Runtime could not share: a sampled m (reading 7) is its mean."""
-    sampled = [module for module in model.modules() if isinstance(module, Blend) and module.sampled]
-    values = [blend.value for blend in sampled]
-    try:
-        for blend in sampled:
-            blend.value = Blend.MEAN
-        yield
-    finally:
-        for blend, value in zip(sampled, values, strict=True):
-            blend.value = value
 
 
 def export(model: WindowModel | Stream, path: Path, run_id: str) -> None:
@@ -122,17 +103,3 @@ def metadata(model: WindowModel | Stream, run_id: str) -> dict[str, str]:
         "memmlp_version": __version__,
         "run_id": run_id,
     }
-
-
-@torch.no_grad()
-def parity(model: WindowModel, path: Path, clip: Tensor) -> float:
-    """Largest difference between torch and ONNX Runtime, each with its own history, over a clip (N, 252)."""
-    model = model.cpu().eval()
-    onnx_stream, state, worst = OnnxStream(path), model.initial_state(1), 0.0
-    with deterministic(model):
-        for sparse in clip[:, None, None, :SPARSE_DIM].cpu():
-            motion, state = model.advance(sparse, state)
-            rotation, position = onnx_stream.step(sparse[:, 0].numpy())
-            ours = np.concatenate([rotation.reshape(-1), position.reshape(-1)])
-            worst = max(worst, float(np.abs(ours - motion[0, -1].numpy()).max()))
-    return worst

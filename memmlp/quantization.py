@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 import onnx
-import torch
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 from torch import Tensor
 
 from memmlp.body import SPARSE_DIM
 from memmlp.evaluation import rotations_report
 from memmlp.features import Frame
+from memmlp.parity import streamed
 from memmlp.session import OnnxStream
 
 MAX_GROWTH = 0.01
@@ -108,13 +108,6 @@ def accuracy(path: Path, frame: Frame, clips: Sequence[Tensor]) -> dict[str, flo
         truth = clip[: max(int(share * len(clip)), 2)]
         rows.append(rotations_report(frame, streamed(stream, truth), truth))
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-
-
-def streamed(stream: OnnxStream, clip: Tensor) -> Tensor:
-    """Motion (N, 198) in the world that a fresh stream makes of a clip's inputs (N, 252)."""
-    stream.reset()
-    outputs = [stream.step(sparse) for sparse in clip[:, None, :SPARSE_DIM].numpy()]
-    return torch.tensor(np.stack([np.concatenate([r.ravel(), p.ravel()]) for r, p in outputs]))
 
 
 def compared(exact: Path, quantised: Path, frame: Frame, clips: Sequence[Tensor]) -> dict[str, Any]:

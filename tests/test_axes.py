@@ -15,9 +15,10 @@ from memmlp.cli.build import build_experiment
 from memmlp.cli.train import composed
 from memmlp.data.dataset import Frames
 from memmlp.errors import InputError
-from memmlp.export import TOLERANCE, export, parity
+from memmlp.export import export
 from memmlp.features import Frame
 from memmlp.model import MemMLP
+from memmlp.parity import TOLERANCE, parity
 from memmlp.runs import Run
 
 TINY = [

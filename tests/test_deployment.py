@@ -21,7 +21,8 @@ from memmlp.export import export
 from memmlp.features import Heading
 from memmlp.memory import CodeMemory
 from memmlp.model import WindowModel
-from memmlp.quantization import accuracy, compared, quantise, streamed
+from memmlp.parity import streamed
+from memmlp.quantization import accuracy, compared, quantise
 from memmlp.runs import Run, list_runs
 from memmlp.session import OnnxStream
 from memmlp.streaming import Stream, streaming

@@ -9,10 +9,11 @@ import tiny
 import torch
 
 from memmlp import latency
-from memmlp.body import JOINTS, SPARSE_DIM
-from memmlp.export import TOLERANCE, export, parity
+from memmlp.body import JOINTS, ROTATION, SPARSE_DIM
+from memmlp.export import export
 from memmlp.features import Heading
 from memmlp.memory import NoMemory
+from memmlp.parity import TOLERANCE, in_torch, parity, streamed
 from memmlp.predictor import RotationOnly
 from memmlp.session import OnnxStream
 
@@ -44,6 +45,20 @@ def test_parity_sees_a_difference(exported):
     assert parity(model, path, CLIP) > TOLERANCE
     with torch.no_grad():
         model.stem.bias -= 0.1
+
+
+def test_almost_parallel_columns_are_no_failure(tmp_path):
+    """As an untrained network makes them: the joints of rotations that agree may be far apart."""
+    model, path = tiny.reference("agrol_mlp"), tmp_path / "step.onnx"
+    mean, std = (t[SPARSE_DIM:][ROTATION].view(22, 6) for t in (model.frame.mean, model.frame.std))
+    mean[9, 3:], std[9] = mean[9, :3], 4e-3
+    export(model, path, "0123456789abcdef")
+    with torch.no_grad():
+        model.head.bias.view(22, 6)[9, 3] += 1e-3  # 4e-6 of the rotation, the rounding of a large network
+    assert parity(model, path, CLIP) <= TOLERANCE
+    assert float((in_torch(model, CLIP) - streamed(OnnxStream(path), CLIP)).abs().max()) > TOLERANCE
+    model.frame.rest[15] += 0.01  # of the joints alone
+    assert parity(model, path, CLIP) > TOLERANCE
 
 
 def test_interface_and_metadata(exported):

@@ -12,10 +12,11 @@ from memmlp.body import MOTION_DIM, ROTATION, SPARSE_DIM
 from memmlp.cli.build import build_experiment, config_of
 from memmlp.cli.train import composed
 from memmlp.errors import InputError
-from memmlp.export import TOLERANCE, export, parity
+from memmlp.export import export
 from memmlp.features import Frame, Heading, World
 from memmlp.losses import AGRoLLoss, AvatarPoserLoss
 from memmlp.model import WindowModel
+from memmlp.parity import TOLERANCE, parity
 from memmlp.reference.agrol import TimeEmbedding
 from memmlp.reference.avatar_poser import Attention, EncoderLayer
 from memmlp.reference.diffusion import Diffusion, cosine_schedule

@@ -12,9 +12,10 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from memmlp.body import SPARSE_DIM
 from memmlp.errors import InputError
-from memmlp.export import export, parity
+from memmlp.export import export
 from memmlp.features import Heading, HeadRelative, World
 from memmlp.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory
+from memmlp.parity import parity
 from memmlp.predictor import RotationOnly, TwoBranch, TwoBranchMemory
 from memmlp.session import OnnxStream
 from memmlp.streaming import Stream, streaming

@@ -30,10 +30,11 @@ from memmlp.body import (
     SPARSE_ROTATION,
     SPARSE_VELOCITY,
 )
-from memmlp.export import deterministic, metadata, save
+from memmlp.export import metadata, save
 from memmlp.features import Frame, sparse_features
 from memmlp.geometry import sixd_to_matrix
 from memmlp.model import WindowModel
+from memmlp.parity import in_torch
 from memmlp.session import OnnxStream
 from memmlp.streaming import Stream
 
@@ -137,29 +138,23 @@ def trackers_of(frames: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat([positions[:1] - velocity, positions]), torch.cat([before, rotations])
 
 
-@torch.no_grad()
 def full_parity(model: WindowModel, path: Path, clip: Tensor, space: str = "amass") -> float:
     """Largest difference between torch and the file, each with its own history, over a clip (N, 252).
 
     Torch goes the way of evaluation: the features of the same trackers, the network, `Frame.pose`.
     """
-    model, there = model.cpu().eval(), space_of(space)
+    model, there, stream = model.cpu().eval(), space_of(space), OnnxStream(path)
     positions, rotations = trackers_of(clip[:, :SPARSE_DIM].cpu())
     given = [there.positions_out(positions.numpy()), there.rotations_out(rotations.numpy())]
-    stream, state, worst = OnnxStream(path), model.initial_state(1), 0.0
-    stream.step(*(part[:1] for part in given))
-    with deterministic(model):
-        for index, sparse in enumerate(sparse_features(rotations, positions), start=1):
-            motion, state = model.advance(sparse[None, None], state)
-            expected = _expected(model.frame, motion[0, -1:], sparse[None], there)
-            found = stream.step(*(part[index : index + 1] for part in given))
-            pairs = zip(expected, found, strict=True)
-            worst = max(worst, *(float(np.abs(a - b).max()) for a, b in pairs))
-    return worst
+    sparse = sparse_features(rotations, positions)
+    made = [stream.step(*(part[index : index + 1] for part in given)) for index in range(len(positions))]
+    found = [np.concatenate(parts) for parts in zip(*made[1:], strict=True)]
+    expected = _expected(model.frame, in_torch(model, sparse), sparse, there)
+    return max(float(np.abs(a - b).max()) for a, b in zip(expected, found, strict=True))
 
 
 def _expected(frame: Frame, motion: Tensor, sparse: Tensor, space: Space) -> list[np.ndarray]:
-    """Rotations, positions and joints in a space, of world motion (1, 198) at inputs (1, 54)."""
+    """Rotations, positions and joints in a space, of world motion (N, 198) at inputs (N, 54)."""
     local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6))).numpy()
     positions = [frame.pose(motion, sparse), motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))]
     return [space.pose_out(local), *(space.positions_out(part.numpy()) for part in positions)]

@@ -73,8 +73,8 @@ def export(
     from memmlp.data.dataset import Frames
     from memmlp.deployment import GRAPHS
     from memmlp.errors import InputError
-    from memmlp.export import TOLERANCE, parity
     from memmlp.export import export as export_network
+    from memmlp.parity import TOLERANCE, parity
     from memmlp.runs import find_run
     from memmlp.streaming import Stream
 

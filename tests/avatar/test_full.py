@@ -17,8 +17,9 @@ from memmlp.avatar.spaces import SPACES
 from memmlp.avatar.stream import Stream
 from memmlp.body import SPARSE_DIM
 from memmlp.errors import InputError
-from memmlp.export import TOLERANCE, export
+from memmlp.export import export
 from memmlp.features import Heading, sparse_features
+from memmlp.parity import TOLERANCE
 from memmlp.session import OnnxStream
 from memmlp.streaming import streaming
 
