@@ -9,7 +9,7 @@ from pathlib import Path
 MAIN = [sys.executable, "-c", "from memmlp.cli.main import main; main()"]
 TINY = [
     "profile=tiny",
-    "data.synth.minutes=0.6",
+    "data.synth.minutes=0.2",
     "tracker=none",
     "threads=1",
     "optim.steps=6",

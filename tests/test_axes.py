@@ -22,7 +22,7 @@ from memmlp.parity import TOLERANCE, parity
 from memmlp.runs import Run
 
 TINY = [
-    "profile=tiny", "data.synth.minutes=0.6", "tracker=none", "threads=1", "optim.steps=2", "vqvae.steps=2",
+    "profile=tiny", "data.synth.minutes=0.2", "tracker=none", "threads=1", "optim.steps=2", "vqvae.steps=2",
     "optim.batch=4", "model.width=8", "memory.width=4", "vqvae.width=8", "evaluation.ik_iterations=2",
 ]  # fmt: skip
 SMALL = [

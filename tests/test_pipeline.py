@@ -24,7 +24,7 @@ from memmlp.data.dataset import Frames
 from memmlp.pipeline import MOTION_ARTIFACTS
 from memmlp.runs import Run, list_runs
 
-TINY = ["profile=tiny", "data.synth.minutes=0.6", "tracker=none", "threads=1"]
+TINY = ["profile=tiny", "data.synth.minutes=0.2", "tracker=none", "threads=1"]
 
 
 @pytest.fixture(scope="module")

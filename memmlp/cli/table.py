@@ -16,6 +16,7 @@ from memmlp.errors import InputError
 
 if TYPE_CHECKING:
     from memmlp.runs import Run
+    from memmlp.sweep.plan import Plan
     from memmlp.sweep.spec import Arm, Sweep
     from memmlp.tables.collect import Find, Table
     from memmlp.tables.measured import Measured
@@ -50,7 +51,7 @@ def table(
         found = gathered([name], overrides, outputs, MODES[mode], functools.cache(load))
     tables = [one.table for one in found]
     if form is None and out is None:
-        _print(tables)
+        on_screen(tables)
         return
     text = _formatted(tables, form or _form_of(out), alone=name != "all")
     if out is None:
@@ -118,7 +119,11 @@ def finder(sweep: Sweep, outputs: Path) -> Find:
     """What finds the sweep's runs. Raises InputError where its config is wrong."""
     from memmlp.cli.plan import planned
 
-    plan = planned(sweep, outputs.absolute())
+    return finder_in(planned(sweep, outputs.absolute()))
+
+
+def finder_in(plan: Plan) -> Find:
+    """What finds the runs of a planned sweep."""
     runs = {(entry.label, entry.seed): plan.run_of(entry) for entry in plan.entries}
 
     def find(arm: Arm, seed: int) -> Run | None:
@@ -127,7 +132,8 @@ def finder(sweep: Sweep, outputs: Path) -> Find:
     return find
 
 
-def _print(tables: Sequence[Table]) -> None:
+def on_screen(tables: Sequence[Table]) -> None:
+    """Show tables as wide as the screen."""
     from rich.console import Console
 
     from memmlp.tables.render import show

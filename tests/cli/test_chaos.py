@@ -13,7 +13,7 @@ from memmlp.runs import Run
 
 
 def test_a_sweep_under_kills_ends_as_an_undisturbed_one(tmp_path: Path):
-    words = ["--runs", "2", "--kills", "3", "--controllers", "2", "data.synth.minutes=0.6"]
+    words = ["--runs", "2", "--kills", "3", "--controllers", "2", "data.synth.minutes=0.2"]
     said = run(tmp_path, "bench", "chaos", *words)
     assert "with 3 kills" in said
     assert "as undisturbed: 0 differences" in said

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 import signal
 import subprocess
 import time
@@ -49,6 +50,8 @@ def test_what_can_be_done_is_done_once(home: Path):
     said = (home / "first.txt").read_text()
     assert "3 of 4 runs done" in said
     assert "wild seed 0: failed, loss is nan" in said
+    assert "MPJPE" in said
+    assert [re.search(rf"^{arm} +(./1)", said, re.M)[1] for arm in ARMS] == ["1/1", "1/1", "0/1"]
     runs = list_runs(home / "outputs")
     assert sorted(run.manifest["kind"] for run in runs if run.done) == ["memmlp", "memmlp", "vqvae"]
     before = stamps(home)

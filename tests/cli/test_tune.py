@@ -122,7 +122,7 @@ def test_a_folder_of_ones_own_searches(tmp_path: Path):
 
 
 def test_a_search_under_kills_has_every_trial_once(tmp_path: Path):
-    said = command(tmp_path, "bench", "chaos-tune", "--trials", "3", "--kills", "5", "data.synth.minutes=0.6")
+    said = command(tmp_path, "bench", "chaos-tune", "--trials", "3", "--kills", "5", "data.synth.minutes=0.2")
     assert "3 trials with 5 kills" in said
     assert "all trials as they should be: 0 differences" in said
 

@@ -91,9 +91,12 @@ def test_files_are_in_amass_layout_and_last_as_long_as_asked(tmp_path):
 
 
 @pytest.mark.parametrize("seconds", [0.01, 1.0])
-def test_a_little_is_one_short_clip(tmp_path, seconds):
-    (path,) = synthesize(tmp_path, minutes=seconds / 60, fps=60.0)
-    assert len(read_clip(path, path.stem)) == max(2, seconds * 60)
+def test_a_little_is_three_short_clips(tmp_path, seconds):
+    """One for each side of a split."""
+    lengths = [len(read_clip(path, path.stem)) for path in synthesize(tmp_path, minutes=seconds / 60)]
+    assert len(lengths) == 3
+    assert sum(lengths) == max(6, seconds * 60)
+    assert min(lengths) >= max(2, 0.6 / 1.4 * sum(lengths) / 5)
 
 
 @pytest.mark.parametrize(

@@ -28,12 +28,14 @@ ACTIVITIES: dict[str, Activity] = {
     "idling": actions.idling,
 }
 CLIP_SECONDS = 14.0  # on average
+MIN_CLIPS = 3  # train, validation and test
 MARGIN = 4.0  # seconds; a clip is a random excerpt of a performance that is longer by this
 
 
 def synthesize(out: Path, *, minutes: float = 10.0, seed: int = 0, fps: float = 60.0) -> list[Path]:
     """Write `out`/<activity>/<activity>_<nnn>.npz, clips of 8 to 20 s, `minutes` in all; the same for a seed.
 
+    Where that were fewer than three clips, three shorter ones.
     Raises InputError for bad arguments.
     """
     _check(minutes, seed, fps)
@@ -65,7 +67,7 @@ def synthesize_clip(activity: str, seed: int, *, seconds: float = 14.0, fps: flo
 
 def _lengths(rng: np.random.Generator, seconds: float, fps: float) -> list[int]:
     """Lengths of the clips in frames, at least 2 each."""
-    share = rng.uniform(0.6, 1.4, max(1, round(seconds / CLIP_SECONDS)))
+    share = rng.uniform(0.6, 1.4, max(MIN_CLIPS, round(seconds / CLIP_SECONDS)))
     ends = np.round(np.cumsum(share) / share.sum() * seconds * fps).astype(int)
     return [max(2, int(n)) for n in np.diff(ends, prepend=0)]
 
