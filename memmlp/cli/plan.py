@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from memmlp.pipeline import Experiment
 
 
-CODE = ("build", "motion", "plan", "schema")  # what turns a config into an experiment
+CODE = ("build.py", "motion.py", "plan.py", "schema/*.py")  # what turns a config into an experiment
 
 
 def find_sweep(name: str) -> Sweep:
@@ -153,7 +153,7 @@ def _fresh(data: dict[str, Any]) -> bool:
 def _stamp(sweep: Sweep, outputs: Path) -> str:
     """Digest of all that a plan follows from but the data: sweep, outputs, configs, what reads them."""
     here = Path(__file__).parent
-    files = [*shipped("conf").rglob("*.yaml"), *(here / f"{name}.py" for name in CODE)]
+    files = [*shipped("conf").rglob("*.yaml"), *(file for name in CODE for file in here.glob(name))]
     texts = [(file.name, file.read_text(encoding="utf-8")) for file in sorted(files)]
     return digest([RECIPE, asdict(sweep), str(outputs), texts])
 

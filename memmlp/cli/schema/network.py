@@ -1,0 +1,150 @@
+"""The schemas of what makes a network: conf/frame, model, predictor, memory and vqvae."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Union
+
+from omegaconf import MISSING
+
+from memmlp.cli.schema.rules import EachOf, Within, at_least, fraction, key, one_of, positive, target
+
+# OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
+# The fields' helpers make dataclass fields, not shared defaults.
+# ruff: noqa: UP007, RUF009
+
+
+@dataclass
+class Frame:
+    coordinates: str = one_of("heading", "head_relative", "world")
+    normalize: bool = key()
+
+
+@dataclass
+class Model:
+    frames: int = at_least(2)
+    width: int = at_least(1)
+    depth: int = at_least(1)
+
+
+@dataclass
+class Reference(Model):
+    """A network without slots: it leaves memory, predictor and hand empty."""
+
+    _target_: str = MISSING
+    _partial_: bool = True
+
+
+@dataclass
+class AGRoLMLP(Reference):
+    _target_: str = target("memmlp.reference.agrol.AGRoLMLP")
+
+
+@dataclass
+class AGRoLDiffusion(Reference):
+    _target_: str = target("memmlp.reference.agrol.AGRoLDiffusion")
+    width: int = at_least(2)
+    diffusion_steps: int = at_least(1)
+    sampling_steps: int = at_least(1)
+    noise_seed: int = at_least(0)
+
+
+@dataclass
+class AvatarPoser(Reference):
+    _target_: str = target("memmlp.reference.avatar_poser.AvatarPoser")
+    heads: int = at_least(1)
+    feedforward: int = at_least(1)
+    dropout: float = fraction()
+
+
+@dataclass
+class Predictor:
+    _target_: str = MISSING
+    _partial_: bool = True
+    depth: int = at_least(0)
+
+
+@dataclass
+class TwoBranch(Predictor):
+    _target_: str = target("memmlp.predictor.TwoBranch")
+
+
+@dataclass
+class RotationOnly(Predictor):
+    _target_: str = target("memmlp.predictor.RotationOnly")
+
+
+@dataclass
+class TwoBranchMemory(Predictor):
+    _target_: str = target("memmlp.predictor.TwoBranchMemory")
+    depth: int = at_least(1)
+
+
+@dataclass
+class RotationOnlyMemory(Predictor):
+    _target_: str = target("memmlp.predictor.RotationOnlyMemory")
+    depth: int = at_least(1)
+
+
+@dataclass
+class Memory:
+    _target_: str = MISSING
+    _partial_: bool = True
+
+
+@dataclass
+class NoMemory(Memory):
+    _target_: str = target("memmlp.memory.NoMemory")
+
+
+@dataclass
+class NoCodesMemory(Memory):
+    _target_: str = target("memmlp.memory.NoCodesMemory")
+    layers: list[int] = key(EachOf(Within(1)))
+    width: int = at_least(1)
+    shift: str = one_of("frame", "window")
+    history: str = one_of("first", "latest")
+    fusion: str = one_of("residual", "plain")
+    blend: Union[int, float, str] = key(Within(0, 1, words=("sampled",)))
+
+
+@dataclass
+class CodeMemory(NoCodesMemory):
+    _target_: str = target("memmlp.memory.CodeMemory")
+
+
+@dataclass
+class JointCodeMemory(NoCodesMemory):
+    _target_: str = target("memmlp.memory.JointCodeMemory")
+
+
+@dataclass
+class RecurrentMemory(Memory):
+    layers: list[int] = key(EachOf(Within(1)))
+    width: int = at_least(1)
+    fusion: str = one_of("residual", "plain")
+
+
+@dataclass
+class LSTMMemory(RecurrentMemory):
+    _target_: str = target("memmlp.memory.LSTMMemory")
+
+
+@dataclass
+class GRUMemory(RecurrentMemory):
+    _target_: str = target("memmlp.memory.GRUMemory")
+
+
+@dataclass
+class VQVAE:
+    codes: int = at_least(1)
+    width: int = at_least(1)
+    encoder_depth: int = at_least(0)
+    decoder_depth: int = at_least(0)
+    commitment: float = at_least(0)
+    decay: float = key(Within(0, 1, strict=True))
+    codebook: str = one_of("ema", "gradient")
+    steps: int = at_least(1)
+    batch: int = at_least(1)
+    lr: float = positive()
+    weight_decay: float = at_least(0)

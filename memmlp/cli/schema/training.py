@@ -1,0 +1,110 @@
+"""The schemas of how it is trained: conf/rollout, loss, hand and optim."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from omegaconf import MISSING
+
+from memmlp.cli.schema.rules import Within, at_least, key, one_of, positive, target
+
+# OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
+# The fields' helpers make dataclass fields, not shared defaults.
+
+
+@dataclass
+class Rollout:
+    _target_: str = MISSING
+
+
+@dataclass
+class TeacherForcing(Rollout):
+    _target_: str = target("memmlp.rollout.TeacherForcing")
+
+
+@dataclass
+class OwnPredictions(Rollout):
+    _target_: str = target("memmlp.rollout.OwnPredictions")
+    max_passes: int = at_least(1)
+
+
+@dataclass
+class Streams(Rollout):
+    _target_: str = target("memmlp.rollout.PersistentStreams")
+    streams: int = at_least(1)
+
+
+@dataclass
+class Loss:
+    _target_: str = MISSING
+
+
+@dataclass
+class Uncertainty(Loss):
+    _target_: str = target("memmlp.losses.Uncertainty")
+    lr: float = positive()
+
+
+@dataclass
+class Manual(Loss):
+    _target_: str = target("memmlp.losses.Manual")
+    rotation: float = at_least(0)
+    rotation_velocity: float = at_least(0)
+    position: float = at_least(0)
+    velocity: float = at_least(0)
+    hand: float = at_least(0)
+
+
+@dataclass
+class ReferenceLoss(Loss):
+    """A whole loss, where the others are weights of Mem-MLP's terms."""
+
+
+@dataclass
+class AGRoLLoss(ReferenceLoss):
+    _target_: str = target("memmlp.losses.AGRoLLoss")
+
+
+@dataclass
+class AvatarPoserLoss(ReferenceLoss):
+    _target_: str = target("memmlp.losses.AvatarPoserLoss")
+    orientation: float = at_least(0)
+    rotation: float = at_least(0)
+    position: float = at_least(0)
+
+
+@dataclass
+class Hand:
+    _target_: str = MISSING
+
+
+@dataclass
+class HandPosition(Hand):
+    _target_: str = target("memmlp.losses.HandPosition")
+
+
+@dataclass
+class HandFK(Hand):
+    _target_: str = target("memmlp.losses.HandFK")
+
+
+@dataclass
+class NoHand(Hand):
+    _target_: str = target("memmlp.losses.NoHand")
+
+
+@dataclass
+class Optim:
+    steps: int = at_least(1)
+    batch: int = at_least(1)
+    lr: float = positive()
+    final_lr: float = at_least(0)
+    schedule: str = one_of("step", "cosine")
+    drop_at: float = key(Within(0, 1, strict=True))
+    weight_decay: float = at_least(0)
+    clip_norm: float = at_least(0)
+    precision: str = one_of("fp32", "bf16")
+    compile: bool = key()
+    checkpoint_every: int = at_least(1)
+    validate_every: int = at_least(1)
+    log_every: int = at_least(1)
