@@ -331,7 +331,8 @@ def find_run(outputs: Path | str, name: str) -> Run:
     where = Path(outputs) / "runs"
     if not matches:
         raise InputError(f"run '{name}': no such folder, and no id in {where} ({len(known)}) begins so")
-    raise InputError(f"run '{name}': {len(matches)} ids begin so: {_enumerate(run.id for run in matches)}")
+    ids = _enumerate(sorted(run.id for run in matches))
+    raise InputError(f"run '{name}': {len(matches)} ids begin so: {ids}")
 
 
 def _enumerate(names: Iterable[str], most: int = 8) -> str:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import command_line
 import pytest
+from filelock import FileLock
 
 from memmlp.cli.main import main
 
@@ -20,11 +24,14 @@ class Ran(NamedTuple):
     err: str
 
 
+# Networks are tiny and test processes many: more threads only wait for each other.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+INT8 = "export.precision=int8"
 Memmlp = Callable[..., Ran]
 
 
-@pytest.fixture(autouse=True)
-def _own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def clean(monkeypatch: pytest.MonkeyPatch) -> None:
     """No test depends on the caller's settings, or writes to its outputs."""
     for name in (
         "MEMMLP_OUTPUTS",
@@ -35,6 +42,34 @@ def _own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("COLUMNS", "80")
+
+
+@pytest.fixture(autouse=True)
+def _own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    clean(monkeypatch)
+
+
+@pytest.fixture(scope="session")
+def tiny_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one finished run, int8 included, and what it printed; made once for all processes.
+
+    It is only read: what writes takes a copy (`home`).
+    """
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "tiny"
+    folder.mkdir(exist_ok=True)
+    said = folder / "out.txt"
+    with FileLock(f"{folder}.lock"), pytest.MonkeyPatch.context() as monkeypatch:
+        clean(monkeypatch)
+        if not said.exists():
+            said.write_text(command_line.run(folder, "train", *command_line.TINY, INT8))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def home(tiny_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the folder with one finished run."""
+    return Path(shutil.copytree(tiny_home, tmp_path_factory.mktemp("home") / "home"))
 
 
 @pytest.fixture

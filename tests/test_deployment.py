@@ -10,7 +10,6 @@ import numpy as np
 import onnx
 import pytest
 import tiny
-from command_line import TINY, run
 from conftest import one_line
 
 import memmlp as package
@@ -112,9 +111,9 @@ def test_accuracy_is_that_of_the_evaluation(tmp_path):
         assert value == pytest.approx(np.mean([row[name] for row in rows]), rel=1e-3), name
 
 
-def test_a_run_in_int8_records_what_it_costs(tmp_path, memmlp):
-    run(tmp_path, "train", *TINY, "export.precision=int8")
-    (made,) = (found for found in list_runs(tmp_path / "outputs") if found.manifest["kind"] == "memmlp")
+def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
+    monkeypatch.chdir(home)
+    (made,) = (found for found in list_runs(home / "outputs") if found.manifest["kind"] == "memmlp")
     written = made.latency.read_text()
     record = json.loads(written)
     assert record["graph"] == "streaming"
@@ -142,7 +141,7 @@ def test_a_run_in_int8_records_what_it_costs(tmp_path, memmlp):
     refused = memmlp(*line, "--max-growth", "-100")
     assert refused.code == 1
     assert "not written" in refused.err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["outputs"]
+    assert sorted(path.name for path in home.iterdir()) == ["out.txt", "outputs"]
     assert one_line(memmlp(*line, "--graph", "naive"), "allowed")
 
 

@@ -5,7 +5,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -14,32 +13,18 @@ import onnx
 import pytest
 import torch
 import yaml
-from conftest import one_line
+from command_line import MAIN, TINY
+from command_line import run as command
+from conftest import INT8, one_line
 from PIL import Image
 
 from memmlp import pipeline
 from memmlp.cli.build import build_experiment
+from memmlp.cli.shipped import shipped
 from memmlp.cli.train import composed
 from memmlp.data.dataset import Frames
 from memmlp.pipeline import MOTION_ARTIFACTS
 from memmlp.runs import Run, list_runs
-
-TINY = ["profile=tiny", "data.synth.minutes=0.2", "tracker=none", "threads=1"]
-
-
-@pytest.fixture(scope="module")
-def home(tmp_path_factory) -> Path:
-    """A folder with one finished run and what it printed."""
-    folder = tmp_path_factory.mktemp("home")
-    (folder / "out.txt").write_text(command(folder, "train", *TINY))
-    return folder
-
-
-def command(folder: Path, *arguments: str, code: int = 0) -> str:
-    line = [sys.executable, "-c", "from memmlp.cli.main import main; main()", *arguments]
-    ran = subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False)
-    assert ran.returncode == code, ran.stdout + ran.stderr
-    return ran.stdout + ran.stderr
 
 
 def motion_run(folder: Path) -> Run:
@@ -77,7 +62,7 @@ def test_a_run_leaves_everything(home):
 
 def test_the_same_command_finds_the_run_and_others_share_the_vqvae(home):
     before = {run.id: run.marker.stat().st_mtime_ns for run in list_runs(home / "outputs")}
-    assert "finished already" in command(home, "train", *TINY)
+    assert "finished already" in command(home, "train", *TINY, INT8)
     assert {run.id: run.marker.stat().st_mtime_ns for run in list_runs(home / "outputs")} == before
     command(home, "train", *TINY, "seed=1", "evaluation.modes=[stream]")
     kinds = [run.manifest["kind"] for run in list_runs(home / "outputs")]
@@ -140,7 +125,7 @@ def test_foreign_targets_in_a_runs_config_are_refused(home, tmp_path):
 
 def test_kill_9_in_the_pipeline_then_again_gives_the_same_model(home, tmp_path):
     """The whole command killed at three unrelated moments, from data to export, and then let finish."""
-    line = [sys.executable, "-c", "from memmlp.cli.main import main; main()", "train", *TINY]
+    line = [*MAIN, "train", *TINY]
     for seconds in (3.0, 5.0, 7.5):
         process = subprocess.Popen(line, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         time.sleep(seconds)
@@ -155,38 +140,17 @@ def test_kill_9_in_the_pipeline_then_again_gives_the_same_model(home, tmp_path):
     assert rotation == pytest.approx(whole.results["stream"]["rotation"], rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        [],
-        ["memory=none"],
-        ["memory=no_codes"],
-        ["memory=vq_joint"],
-        ["memory=lstm"],
-        ["memory=gru", "rollout=streams"],
-        ["predictor=two_branch_memory"],
-        ["predictor=rotation_only", "hand=fk"],
-        ["rollout=own_predictions"],
-        ["rollout=streams"],
-        ["loss=manual"],
-        ["hand=off"],
-        ["frame.coordinates=world", "frame.normalize=false"],
-        ["vqvae.codebook=gradient"],
-        ["memory.shift=frame", "memory.history=latest", "memory.fusion=plain"],
-        ["experiment=paper", "profile=tiny"],
-    ],
-    ids=" ".join,
-)
-def test_every_option_trains_and_streams(home, overrides):
+@pytest.mark.parametrize("name", sorted(path.stem for path in shipped("conf/experiment").glob("*.yaml")))
+def test_every_experiment_trains_and_streams(home, name):
     """Two steps and one validation of each, on the prepared data, without export."""
     os.chdir(home)
-    cfg = composed([*TINY, "optim.steps=2", "vqvae.steps=2", *overrides])
+    cfg = composed([f"experiment={name}", *TINY, "optim.steps=2"])
     experiment = build_experiment(cfg)
     cache, manifest = experiment.data.prepare()
     upstream = None
     if experiment.architecture.uses_codes:
         upstream = pipeline.vqvae_run(experiment, cache, manifest)
-    run = Run(home / "variants" / "-".join(overrides).replace("/", "_"))
+    run = Run(home / "variants" / name)
     run.folder.mkdir(parents=True, exist_ok=True)
     model = pipeline.trained(experiment, run, cache, manifest, upstream)
     values = run.metrics()[-1].values

@@ -14,21 +14,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from command_line import MAIN, TINY, run
+from command_line import MAIN
 from conftest import Memmlp, one_line
 from PIL import Image
 
 from memmlp.player.packets import Packet
 from memmlp.player.sources import PacketSource
 from memmlp.runs import Run, list_runs
-
-
-@pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a finished run."""
-    folder = tmp_path_factory.mktemp("look")
-    run(folder, "train", *TINY)
-    return folder
 
 
 @pytest.fixture
