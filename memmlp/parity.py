@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from memmlp.body import ROTATION, SPARSE_DIM
 from memmlp.memory import Blend
 from memmlp.model import WindowModel
+from memmlp.progress import track
 from memmlp.session import OnnxStream
 
 TOLERANCE = 1e-4
@@ -55,7 +56,7 @@ def in_torch(model: WindowModel, clip: Tensor) -> Tensor:
     """Motion (N, 198) in the world that the network streams of a clip's inputs (N, 252 or 54)."""
     state, made = model.initial_state(1), []
     with deterministic(model):
-        for sparse in clip[:, None, None, :SPARSE_DIM]:
+        for sparse in track(clip[:, None, None, :SPARSE_DIM], "check"):
             motion, state = model.advance(sparse, state)
             made.append(motion[0, -1])
     return torch.stack(made)

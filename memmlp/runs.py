@@ -329,6 +329,8 @@ def find_run(outputs: Path | str, name: str) -> Run:
     if len(matches) == 1:
         return matches[0]
     where = Path(outputs) / "runs"
+    if not matches and name and (Path(name) / "manifest.json").is_file():
+        return Run(Path(name).resolve())
     if not matches:
         raise InputError(f"run '{name}': no such folder, and no id in {where} ({len(known)}) begins so")
     ids = _enumerate(sorted(run.id for run in matches))

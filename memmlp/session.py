@@ -27,12 +27,13 @@ class OnnxStream:
             overwritten by the next.
 
     Raises:
-        InputError: for a file that is missing or does not run.
+        InputError: for a file that is missing, does not run, or has not the form of such a step.
     """
 
     def __init__(self, path: Path, profile: Path | None = None):
         self.path = path
         self.session = open_session(path, profile)
+        self._check()
         given = {i.name: np.zeros(i.shape, np.float32) for i in self.session.get_inputs()}
         self.inputs = {name: array for name, array in given.items() if not name.startswith(STATE)}
         self._state = {name: array for name, array in given.items() if name.startswith(STATE)}
@@ -41,6 +42,16 @@ class OnnxStream:
         self.outputs = {name: np.zeros(shape, np.float32) for name, shape in made.items()}
         self._binding = self._bound(self._state, self._other)
         self._other_binding = self._bound(self._other, self._state)
+
+    def _check(self) -> None:
+        """Refuse a file of other inputs and outputs."""
+        inputs = {i.name: i.shape for i in self.session.get_inputs()}
+        outputs = {o.name: o.shape for o in self.session.get_outputs()}
+        ends = [*self.session.get_inputs(), *self.session.get_outputs()]
+        arrays = all(e.type == "tensor(float)" and all(isinstance(n, int) for n in e.shape) for e in ends)
+        states = {f"{name}{NEXT}": shape for name, shape in inputs.items() if name.startswith(STATE)}
+        if not arrays or any(outputs.get(name) != shape for name, shape in states.items()):
+            raise InputError(f"{self.path}: no network of memmlp's; allowed is what memmlp export writes")
 
     @property
     def state(self) -> Arrays:

@@ -281,6 +281,13 @@ def test_no_such_run_is_one_line(tmp_path: Path, name: str):
         find_run(tmp_path, name)
 
 
+def test_a_run_by_the_bare_name_of_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made = Run.of(tmp_path, "ab" + "0" * 14)
+    made.begin("memmlp", {}, data="d", upstream=None)
+    monkeypatch.chdir(made.folder.parent)
+    assert find_run("outputs", made.id).folder == made.folder.resolve()
+
+
 def test_an_ambiguous_beginning_lists_the_runs(tmp_path: Path):
     for name in ("ab" + "0" * 14, "ab" + "1" * 14):
         Run.of(tmp_path, name).begin("memmlp", {}, data="d", upstream=None)

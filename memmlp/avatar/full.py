@@ -5,6 +5,7 @@ and right wrist, one frame at 60 Hz; and `state.*`, all zeros for a fresh start.
 (1, 22, 3, 3), local matrices, the root's global; `positions` (1, 22, 3), metres, by forward kinematics, the
 head on its tracker; `joints` (1, 22, 3), metres, the network's own positions; and the new `state.*` under the
 same names with the suffix `.next`. All in the frame of reference that was chosen (memmlp.avatar.spaces).
+Trackers that are lost, other rates and gaps (memmlp.avatar.trackers) are the caller's: NaN in is NaN out.
 """
 
 from __future__ import annotations

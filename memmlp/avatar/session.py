@@ -42,7 +42,12 @@ class Network(OnnxStream):
             raise InputError(f"{self.path}: an older file, without {', '.join(missing)} in it; {AGAIN}")
         if meta["features"] != FEATURES:
             raise InputError(f"{self.path}: its inputs are not those of this version of memmlp; {AGAIN}")
-        rest = np.array(json.loads(meta["rest"]))
-        self.skeleton = Skeleton(json.loads(meta["joints"]), json.loads(meta["parents"]), rest)
-        self.fps, self.frames = float(meta["fps"]), int(meta["T"])
-        self.branches = frozenset(json.loads(meta["branches"]))
+        try:
+            rest = np.array(json.loads(meta["rest"]), np.float64)
+            self.skeleton = Skeleton(json.loads(meta["joints"]), json.loads(meta["parents"]), rest)
+            self.fps, self.frames = float(meta["fps"]), int(meta["T"])
+            self.branches = frozenset(json.loads(meta["branches"]))
+        except (ValueError, TypeError, LookupError):
+            raise InputError(f"{self.path}: its metadata are damaged; {AGAIN}") from None
+        if not 1 <= self.fps <= 1000:
+            raise InputError(f"{self.path}: fps={self.fps:g} in its metadata, which are damaged; {AGAIN}")

@@ -78,6 +78,6 @@ SPACES = {
 
 def space_of(name: str) -> Space:
     """The space of a name. Raises InputError for an unknown one."""
-    if name not in SPACES:
+    if not isinstance(name, str) or name not in SPACES:
         raise InputError(f"space={name}: no such frame of reference; allowed: {', '.join(SPACES)}")
     return SPACES[name]

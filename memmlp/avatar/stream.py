@@ -25,6 +25,8 @@ TRACKERS = ("head", "left", "right")
 IDENTITY = np.eye(3)
 NOTHING = np.full((3, 12), np.nan)
 NEUTRAL = np.concatenate([np.zeros(3), IDENTITY.reshape(9)])
+FARTHEST = 1e6  # metres
+LATEST = 1e10  # seconds; at much more frames of 1/60 s can't be told apart
 UNIT = 1e-2  # by how much a quaternion's norm, or a matrix' columns, may be off
 
 Tracker = tuple[ArrayLike, ArrayLike] | None
@@ -122,17 +124,16 @@ class Stream:
 
         Args:
             head, left, right: (position (3,) in metres, rotation (4,) xyzw or (3, 3)), or None for a lost
-                tracker; so is one with NaN in it or with a quaternion of zeros.
+                tracker; so is one with NaN in it, with a quaternion of zeros, or more than 1,000 km away.
             time: of the sample, seconds of any clock; None for exactly one frame after the last.
 
         Returns:
             The newest frame's pose.
 
         Raises:
-            InputError: for other shapes, what is no rotation, a time that is not finite.
+            InputError: for other shapes, what is no rotation, a time that is no number of seconds.
         """
-        if time is not None and not math.isfinite(time):
-            raise InputError(f"time={time}: allowed is a finite number of seconds, or None for one frame")
+        _check_time(time)
         positions, rotations, lost = read_trackers((head, left, right))
         if self.offsets is not None:
             positions = positions + (rotations @ self.offsets.positions[:, :, None])[..., 0]
@@ -236,7 +237,7 @@ def read_trackers(trackers: Sequence[Tracker]) -> tuple[np.ndarray, np.ndarray, 
                 read[index, 3:] = rotation.reshape(9)
     if quaternions:
         read[list(quaternions), 3:] = _matrices(quaternions).reshape(-1, 9)
-    lost = tuple((~np.isfinite(read).all(1)).tolist())
+    lost = tuple((~(np.abs(read) <= FARTHEST).all(1)).tolist())
     if any(lost):
         read[list(lost)] = NEUTRAL
     positions, rotations = read[:, :3], read[:, 3:].reshape(3, 3, 3)
@@ -280,12 +281,29 @@ def _check_rotations(names: Sequence[str], rotations: np.ndarray) -> None:
             raise InputError(f"{name}: the matrix is a mirror image; allowed is a rotation (3, 3)")
 
 
+def _check_time(time: float | None) -> None:
+    """Refuse what is no time."""
+    if time is None:
+        return
+    if not isinstance(time, (int, float, np.integer, np.floating)) or not abs(time) <= LATEST:
+        raise InputError(
+            f"time={time}: allowed is a number of seconds, at most {LATEST:g}, or None for one frame"
+        )
+
+
 def checked_offsets(offsets: Offsets) -> Offsets:
     """Offsets as float64 arrays. Raises InputError where they are none."""
-    positions, rotations = (np.asarray(part, np.float64) for part in offsets)
+    try:
+        positions, rotations = (np.asarray(part, np.float64) for part in offsets)
+    except (TypeError, ValueError):
+        raise InputError(
+            "offsets: allowed are memmlp.avatar.Offsets, positions (3, 3) and rotations (3, 3, 3)"
+        ) from None
     if positions.shape != (3, 3) or rotations.shape != (3, 3, 3):
         shapes = f"{positions.shape} and {rotations.shape}"
         raise InputError(f"offsets: shapes {shapes}; allowed are positions (3, 3) and rotations (3, 3, 3)")
+    if not (np.isfinite(positions).all() and np.isfinite(rotations).all()):
+        raise InputError("offsets: NaN or infinity; allowed are numbers")
     _check_rotations([f"offsets of {name}" for name in TRACKERS], rotations)
     return Offsets(positions, rotations)
 
@@ -297,5 +315,7 @@ def _names(lost: Lost) -> tuple[str, ...]:
 
 def _file(source: str | PathLike[str] | Run) -> Path:
     """The ONNX file of a run, of its folder, or itself."""
+    if not isinstance(source, Run | str | PathLike) or not str(source):
+        raise InputError(f"source={source!r}: allowed are a run, its folder, or an ONNX file")
     run = source if isinstance(source, Run) else Run(Path(source))
     return run.deployed if run.folder.is_dir() else run.folder

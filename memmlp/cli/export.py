@@ -66,6 +66,7 @@ def export(
     outputs: Path,
 ) -> None:
     """Export a finished run (id, its beginning, or folder) as ONNX and check it on whole test clips."""
+    import tempfile
     from functools import partial
 
     from memmlp.avatar.full import export_full, full_parity
@@ -102,13 +103,16 @@ def export(
             raise InputError("--precision int8: allowed with --scope network and a streaming graph")
         write_int8(network, out, found.id, Frames.open(cache, "train").clips(), test, max_growth / 100)
         return
-    write(network, out, found.id)
     checked = test[: clips or None]
-    worst = max(check(model, out, clip) for clip in checked)
-    size = f"{out}: {out.stat().st_size / 1e6:.1f} MB"
-    click.echo(f"{size}, differs from torch by {worst:.1e} at most on {len(checked)} test clips")
-    if not worst <= TOLERANCE:
-        raise click.ClickException(f"more than {TOLERANCE:.0e}")
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
+        path = Path(folder) / "step.onnx"
+        write(network, path, found.id)
+        worst = max(check(model, path, clip) for clip in checked)
+        said = f"differs from torch by {worst:.1e} at most on {len(checked)} test clips"
+        if not worst <= TOLERANCE:
+            raise click.ClickException(f"{said}, more than {TOLERANCE:.0e}: not written")
+        path.replace(out)
+    click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {said}")
 
 
 def write_int8(

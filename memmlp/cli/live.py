@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import outputs_option
+from memmlp.cli.options import Finite, outputs_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,13 +25,13 @@ PORT = click.IntRange(1, 65535)
 @click.option("--osc", type=PORT, metavar="PORT", help="Take OSC bundles at this port of 127.0.0.1.")
 @click.option(
     "--space", default="amass", show_default=True, type=click.Choice(["amass", "openxr", "unity"]),
-    help="Frame of reference of the packets.",
+    help="Frame of reference of the packets, also of those of --send.",
 )  # fmt: skip
 @click.option(
     "--hz",
     default=60.0,
     show_default=True,
-    type=click.FloatRange(10, 1000),
+    type=Finite(10, 1000),
     help="Samples a second of a clip.",
 )
 @click.option("--port", default=8765, show_default=True, type=click.IntRange(0, 65535), help="Of the page.")
@@ -67,7 +67,7 @@ def live(
         needs_osc()
     with contextlib.suppress(KeyboardInterrupt):
         if send:
-            sent(clip_source(network, clip, hz, outputs, rounds=1), udp, osc)
+            sent(clip_source(network, clip, hz, outputs, rounds=1), udp, osc, space)
         else:
             watched(
                 network, source_of(network, clip, udp, osc, space, hz, outputs), port, no_browser, outputs
@@ -131,15 +131,16 @@ def npz_frames(path: Path) -> np.ndarray:
     return motion_frames(*tensors).numpy()
 
 
-def sent(source: ClipSource, udp: int | None, osc: int | None) -> None:
-    """Send a clip's packets."""
+def sent(source: ClipSource, udp: int | None, osc: int | None, space: str) -> None:
+    """Send a clip's packets, in a space."""
+    from memmlp.avatar.spaces import space_of
     from memmlp.player.packets import to_json, to_osc
     from memmlp.player.sources import send
 
     port, pack = (udp, to_json) if udp is not None else (osc, to_osc)
     assert port is not None
     click.echo(f"sending {source.name} to port {port}")
-    click.echo(f"{send(source, port, pack)} packets sent")
+    click.echo(f"{send(source, port, pack, space_of(space))} packets sent")
 
 
 def watched(network: str, source: Source, port: int, no_browser: bool, outputs: Path) -> None:

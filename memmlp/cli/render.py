@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import outputs_option
+from memmlp.cli.options import Finite, outputs_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,10 +30,8 @@ SUFFIXES = (".png", ".gif", ".mp4")
     help="Forward kinematics of the rotations with the head on its tracker, or the positions as they are.",
 )  # fmt: skip
 @click.option("--mode", default="stream", show_default=True, type=click.Choice(["stream", "window"]))
-@click.option(
-    "--from", "begin", default=0.0, show_default=True, type=click.FloatRange(min=0), help="Seconds."
-)
-@click.option("--to", "end", type=click.FloatRange(min=0, min_open=True), help="Seconds.  [default: the end]")
+@click.option("--from", "begin", default=0.0, show_default=True, type=Finite(min=0), help="Seconds.")
+@click.option("--to", "end", type=Finite(min=0, min_open=True), help="Seconds.  [default: the end]")
 @click.option(
     "--frames",
     default=6,
@@ -60,17 +58,22 @@ def render(
     pictures a second. One colour scale holds for all.
     """
     from memmlp.cli.opened import opened
+    from memmlp.errors import InputError
     from memmlp.render.figure import heatmap_png
     from memmlp.render.film import film, pyav
 
     check(out, runs, labels)
-    if out.suffix == ".mp4":
+    kind = out.suffix.lower()
+    if kind == ".mp4":
         pyav()
     take = taken([opened(outputs, run) for run in runs], labels, clip, (begin, end), branch, mode)
-    if out.suffix == ".png":
-        heatmap_png(out, take, frames)
-    else:
-        film(out, take)
+    try:
+        if kind == ".png":
+            heatmap_png(out, take, frames)
+        else:
+            film(out, take)
+    except OSError as error:
+        raise InputError(f"--out {out}: {error.strerror or error}") from None
     errors = ", ".join(f"{label} {error.mean():.1f} cm" for label, error in take.errors.items())
     click.echo(f"{out}: {take.title}, {errors}")
 
@@ -79,14 +82,12 @@ def check(out: Path, runs: tuple[str, ...], labels: tuple[str, ...]) -> None:
     """Raise InputError for what is wrong before any run is read."""
     from memmlp.errors import InputError
 
-    if out.suffix not in SUFFIXES:
+    if out.suffix.lower() not in SUFFIXES:
         raise InputError(f"--out {out}: no such kind of picture; allowed are {', '.join(SUFFIXES)}")
     if not out.parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}")
     if labels and len(labels) != len(runs):
         raise InputError(f"--label: {len(labels)} for {len(runs)} runs; allowed is one for each, or none")
-    if len(set(labels or runs)) < len(runs):
-        raise InputError(f"{'--label' if labels else 'RUNS'}: one is there twice; allowed are different ones")
 
 
 def taken(
@@ -104,10 +105,13 @@ def taken(
     from memmlp.errors import InputError
     from memmlp.render.take import Take
 
+    names = labels or tuple(run.run.id[:8] for run in runs)
+    if len(set(names)) < len(names):
+        raise InputError(f"{'--label' if labels else 'RUNS'}: one is there twice; allowed are different ones")
     title = clip or runs[0].test.names[0]
     first, last = span(len(clip_of(runs[0].test, title)), title, *times)
     truths, predictions = [], {}
-    for label, run in zip(labels or [run.run.id[:8] for run in runs], runs, strict=True):
+    for label, run in zip(names, runs, strict=True):
         truth, motion = predicted(run, title, last, branch, mode)
         truths.append(truth[first:])
         predictions[label] = motion[first:]

@@ -12,6 +12,7 @@ without a time the time of arrival counts; seq, the number of the sample, only s
 from __future__ import annotations
 
 import json
+import logging
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -67,11 +68,14 @@ def from_osc(datagram: bytes) -> Packet:
     from pythonosc.osc_bundle import OscBundle
     from pythonosc.osc_message import OscMessage
 
+    logging.disable(logging.WARNING)  # the library warns of each datagram that it can't read
     try:
         parts = [part for part in OscBundle(datagram) if isinstance(part, OscMessage)]
         arguments = {part.address.removeprefix(PREFIX): list(part.params) for part in parts}
     except Exception as error:  # the library raises many kinds over bytes that are no OSC
         raise ValueError(f"no OSC bundle ({error})") from None
+    finally:
+        logging.disable(logging.NOTSET)
     numbers = {key: arguments[key][0] for key in ("time", "seq") if arguments.get(key)}
     return packet(arguments | numbers)
 

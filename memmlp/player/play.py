@@ -34,10 +34,15 @@ def play(stream: Stream, source: Source, publish: Publish, stopped: threading.Ev
 
     A message has the frame's number and time (s), the step's time (ms), what was dropped and malformed so
     far, the trackers that are held, and joints (66 whole millimetres, axes of openxr) predicted and true.
+    Malformed packets are told of at once, by a message of the counts alone.
     """
     space, number, dropped, refused = SPACES[source.space], 0, 0, 0
+    counts = {"dropped": 0, "malformed": 0}
     while not stopped.is_set():
         sample = source.read()
+        if source.malformed + refused != counts["malformed"]:
+            counts = {"dropped": dropped, "malformed": source.malformed + refused}
+            publish(counts)
         if sample is None:
             continue
         dropped += sample.dropped

@@ -96,6 +96,9 @@ class Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """A file of the page, or the events."""
         name = self.path.partition("?")[0].lstrip("/")
+        if self.headers.get("Host", "").partition(":")[0] not in (HOST, "localhost"):  # another site's page
+            self.send_error(403)
+            return
         with contextlib.suppress(ConnectionError):  # the page was closed
             if name == "events":
                 self._events()

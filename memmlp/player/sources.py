@@ -11,7 +11,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from memmlp.avatar.rotations import matrix_to_quaternion, sixd_to_matrix
+from memmlp.avatar.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
+from memmlp.avatar.spaces import Space
 from memmlp.avatar.trackers import Tracked, between
 from memmlp.body import FPS, MOTION_DIM, N_JOINTS, POSITION, SPARSE_DIM, SPARSE_POSITION, SPARSE_ROTATION
 from memmlp.errors import InputError
@@ -21,6 +22,7 @@ HOST = "127.0.0.1"
 WAIT = 0.25  # seconds that `read` waits at most
 PAUSE = 1.0  # seconds without a sample between two rounds of a clip: the stream begins anew
 LARGEST = 65_536  # bytes of a datagram
+FORGOTTEN = 10_000  # numbers left out that are no lost packets but another sender
 
 
 class Sample(NamedTuple):
@@ -85,6 +87,14 @@ class Clip:
         """The frame before a time, and how far on to the next one it is."""
         first = min(max(int(time * FPS), 0), len(self.joints) - 2)
         return first, time * FPS - first
+
+
+def in_space(trackers: Trackers, space: Space) -> Trackers:
+    """Trackers of AMASS' world, positions and quaternions xyzw, in a space."""
+    positions, rotations = (np.stack(part) for part in zip(*filter(None, trackers), strict=True))
+    matrices = space.rotations_out(quaternion_to_matrix(rotations))
+    head, left, right = zip(space.positions_out(positions), matrix_to_quaternion(matrices), strict=True)
+    return head, left, right
 
 
 class ClipSource:
@@ -182,7 +192,8 @@ class PacketSource:
         last, self.last = self.last, packet.seq
         if last is None or packet.seq is None:
             return 0
-        return max(packet.seq - last - 1, 0)
+        missing = packet.seq - last - 1
+        return missing if 0 < missing < FORGOTTEN else 0
 
     def truth(self, time: float) -> None:
         """Nobody knows."""
@@ -205,11 +216,15 @@ def bound(listener: socket.socket, port: int) -> None:
         ) from None
 
 
-def send(source: ClipSource, port: int, pack: Callable[[Packet], bytes]) -> int:
-    """Send a clip's samples to a UDP port of this machine until its rounds are over; how many were sent."""
+def send(source: ClipSource, port: int, pack: Callable[[Packet], bytes], space: Space) -> int:
+    """Send a clip's samples, in a space, to a UDP port of this machine until its rounds are over.
+
+    Returns how many were sent.
+    """
     sent = 0
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         while not source.over and (sample := source.read()) is not None:
-            sender.sendto(pack(Packet(sample.trackers, sample.time, source.next - 1)), (HOST, port))
+            trackers = in_space(sample.trackers, space)
+            sender.sendto(pack(Packet(trackers, sample.time, source.next - 1)), (HOST, port))
             sent += 1
     return sent

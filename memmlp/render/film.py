@@ -30,8 +30,8 @@ def film(path: Path, take: Take) -> None:
 
     Raises InputError where MP4 is asked for and PyAV is not installed.
     """
-    encode = {".mp4": mp4, ".gif": gif}[path.suffix]
-    if path.suffix == ".mp4":
+    encode = {".mp4": mp4, ".gif": gif}[path.suffix.lower()]
+    if path.suffix.lower() == ".mp4":
         pyav()
     atomic_write(path, encode(pictures(take)))
 

@@ -6,6 +6,7 @@ treatment.
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 import tracemalloc
@@ -256,6 +257,7 @@ def test_lost_trackers_are_held_and_come_back(trackers, during, speed, file, und
         ([0, 0, 0], [np.nan, 0, 0, 1]),
         ([0, 0, 0], [0, 0, 0, 0]),
         ([np.inf, 0, 0], np.eye(3)),
+        ([0, 0, -1e38], np.eye(3)),
     ],
 )
 def test_what_counts_as_lost(gone, file):
@@ -375,14 +377,22 @@ def test_bad_trackers_are_refused(tracker, words, file):
 
 
 def test_bad_times_spaces_and_outputs_are_refused(file):
-    with pytest.raises(InputError, match="time=nan"):
-        Stream(file).step(ONE, ONE, ONE, float("nan"))
-    with pytest.raises(InputError, match="space=up"):
-        Stream(file, space="up")
+    for time in (float("nan"), 1e20, -math.inf, "1.0", [1]):
+        with pytest.raises(InputError, match=r"time=.*allowed is a number of seconds"):
+            Stream(file).step(ONE, ONE, ONE, time)
+    for space in ("up", ["amass"]):
+        with pytest.raises(InputError, match=r"space=.*up|space=.*amass"):
+            Stream(file, space=space)
+    for source in (None, 5, ""):
+        with pytest.raises(InputError, match="source="):
+            Stream(source)
     with pytest.raises(InputError, match=r"rotations=euler.*matrix, quaternion"):
         Stream(file, rotations="euler")
     with pytest.raises(InputError, match="offsets: shapes"):
         Stream(file, offsets=Offsets(np.zeros(3), np.eye(3)))
+    for offsets in (5, (1, 2, 3), Offsets(np.full((3, 3), np.nan), np.stack([np.eye(3)] * 3))):
+        with pytest.raises(InputError, match="offsets: "):
+            Stream(file, offsets=offsets)
     with pytest.raises(InputError, match="calibrate: the hands are not apart"):
         Stream(file).calibrate(ONE, ONE, ONE)
     with pytest.raises(InputError, match="calibrate: no pose of left"):
@@ -404,6 +414,36 @@ def test_bad_files_are_refused(file, tmp_path):
         Stream(tmp_path / "old.onnx")
     del graph.metadata_props[:]
     onnx.save(graph, tmp_path / "foreign.onnx")
+    with pytest.raises(InputError, match="no network of memmlp"):
+        Stream(tmp_path / "foreign.onnx")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("rest", "[1]"), ("rest", "{"), ("joints", "3"), ("fps", "0"), ("fps", "x"), ("T", "1.5")],
+)
+def test_damaged_metadata_are_refused(key, value, file, tmp_path):
+    graph = onnx.load(file)
+    onnx.helper.set_model_props(graph, {p.key: p.value for p in graph.metadata_props} | {key: value})
+    onnx.save(graph, tmp_path / "damaged.onnx")
+    with pytest.raises(InputError, match="damaged"):
+        Stream(tmp_path / "damaged.onnx")
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "shape"),
+    [
+        ("x", onnx.TensorProto.FLOAT, ["batch", 3]),
+        ("x", onnx.TensorProto.STRING, [3]),
+        ("state.x", onnx.TensorProto.FLOAT, [3]),
+    ],
+)
+def test_networks_of_other_programs_are_refused(name, kind, shape, tmp_path):
+    ends = [onnx.helper.make_tensor_value_info(end, kind, shape) for end in (name, "y")]
+    node = onnx.helper.make_node("Identity", [name], ["y"])
+    graph = onnx.helper.make_graph([node], "foreign", ends[:1], ends[1:])
+    model = onnx.helper.make_model(graph, ir_version=9, opset_imports=[onnx.helper.make_opsetid("", 18)])
+    onnx.save(model, tmp_path / "foreign.onnx")
     with pytest.raises(InputError, match="no network of memmlp"):
         Stream(tmp_path / "foreign.onnx")
 

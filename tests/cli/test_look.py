@@ -61,12 +61,21 @@ def test_a_films_branch_mode_and_times(memmlp: Memmlp, finished: Run, clips: lis
         (["--out", "no/a.png"], ("no folder no",)),
         (["--from", "900", "--out", "a.png"], ("--from 900", "nothing between")),
         (["--from", "1", "--to", "1", "--out", "a.png"], ("--from 1 --to 1",)),
+        (["--from", "nan", "--out", "a.png"], ("--from", "no finite number")),
+        (["--to", "inf", "--out", "a.png"], ("--to", "no finite number")),
         (["--label", "a", "--label", "b", "--out", "a.png"], ("2 for 1 runs",)),
     ],
 )
 def test_bad_input_to_render_is_one_line(memmlp: Memmlp, finished: Run, arguments, words):
     assert one_line(memmlp("render", finished.id, *arguments), *words)
     assert not Path("a.png").exists()
+
+
+def test_a_run_is_there_once_unless_labelled(memmlp: Memmlp, finished: Run, tmp_path: Path):
+    same = [finished.id, str(finished.folder)]
+    assert one_line(memmlp("render", *same, "--out", "a.png"), "RUNS: one is there twice")
+    labels = ["--label", "a", "--label", "b", "--frames", "1", "--to", "0.1"]
+    assert memmlp("render", *same, "--out", str(tmp_path / "a.PNG"), *labels).code == 0
 
 
 def test_an_unknown_clip_lists_the_test_clips(memmlp: Memmlp, finished: Run, clips: list[str]):
@@ -87,6 +96,7 @@ def test_without_pyav_nothing_is_computed(memmlp: Memmlp, monkeypatch: pytest.Mo
         (["--udp", "9000", "--osc", "9001"], ("more than one source",)),
         (["--udp", "9000", "--clip", "a"], ("more than one source",)),
         (["--send"], ("--send", "--udp PORT or --osc PORT")),
+        (["--hz", "nan"], ("--hz", "no finite number")),
     ],
 )
 def test_bad_input_to_live_is_one_line(memmlp: Memmlp, finished: Run, arguments, words):
@@ -157,11 +167,13 @@ def test_ctrl_c_ends_it_and_leaves_nothing(home: Path, finished: Run, source: st
 
 @pytest.mark.parametrize("kind", ["--udp", "--osc"])
 def test_a_clip_that_is_sent_is_predicted(home: Path, finished: Run, kind: str):
+    """In a space that both name: the body stands upright on the floor."""
     free = PacketSource("any", 0, lambda data: Packet((None, None, None)), "amass")
     free.close()
-    watched = Watched(home, finished.id, kind, str(free.port))
+    at = [kind, str(free.port), "--space", "unity"]
+    watched = Watched(home, finished.id, *at)
     sender = subprocess.Popen(
-        [*MAIN, "live", finished.id, "--send", kind, str(free.port)], cwd=home, stdout=subprocess.DEVNULL
+        [*MAIN, "live", finished.id, "--send", *at], cwd=home, stdout=subprocess.DEVNULL
     )
     frames = watched.frames()
     seen = [next(frames) for _ in range(30)]
@@ -169,4 +181,6 @@ def test_a_clip_that_is_sent_is_predicted(home: Path, finished: Run, kind: str):
     sender.wait()
     assert [f["number"] for f in seen] == list(range(seen[0]["number"], seen[0]["number"] + 30))
     assert all(f["truth"] is None and f["held"] == [] and f["malformed"] == 0 for f in seen)
+    head = [f["joints"][3 * 15 + 1] for f in seen]
+    assert all(1000 < height < 2200 for height in head), head  # millimetres
     assert watched.interrupt()[0] == 0

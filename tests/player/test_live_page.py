@@ -74,10 +74,12 @@ def test_it_plays_pauses_and_goes_back(browser: Browser, url: str):
     assert browser.errors == []
 
 
-def test_it_says_when_the_command_has_ended(browser: Browser, clip: Clip):
+def test_it_says_what_it_waits_for_and_when_the_command_has_ended(browser: Browser, clip: Clip):
     with Server(Hub(greeting(ClipSource(clip, 60), "tiny")), 0) as server:
         browser.open(server.url)
         browser.wait("document.querySelector('#status').textContent == 'waiting for trackers'")
+        server.hub.publish({"dropped": 0, "malformed": 3})
+        browser.wait("document.querySelector('#status').textContent.endsWith('3 packets malformed')")
     browser.wait("document.querySelector('#status').textContent == 'not connected'")
 
 

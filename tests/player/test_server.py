@@ -77,7 +77,9 @@ def test_truth_and_prediction_in_the_pages_axes(network: Path, clip: Clip):
 
 
 def test_held_trackers_and_refused_samples_are_told(network: Path, clip: Clip):
-    messages = played(network, clip, 60, Losing)
+    told = played(network, clip, 60, Losing)
+    messages = [message for message in told if "joints" in message]
+    assert [message for message in told if "joints" not in message] == [{"dropped": 0, "malformed": 1}]
     held = [m["number"] for m in messages if m["held"]]
     assert held == list(range(39, 49))
     assert messages[45]["held"] == ("left",)
@@ -159,6 +161,13 @@ def test_nothing_else_is_served(server: Server, path: str):
 
 def test_only_this_machine_is_served(server: Server):
     assert server.socket.getsockname()[0] == "127.0.0.1"
+
+
+def test_a_page_of_another_site_gets_nothing(server: Server):
+    """Whose name was made to mean this machine."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+    connection.request("GET", "/events", headers={"Host": f"elsewhere.example:{server.server_port}"})
+    assert connection.getresponse().status == 403
 
 
 def test_a_taken_port_is_one_line(server: Server):

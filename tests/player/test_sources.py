@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from memmlp.avatar.rotations import quaternion_to_matrix
+from memmlp.avatar.spaces import SPACES
 from memmlp.errors import InputError
 from memmlp.player.packets import from_json, from_osc, to_json, to_osc
 from memmlp.player.sources import HOST, PAUSE, Clip, ClipSource, PacketSource, send
@@ -84,20 +85,23 @@ def test_a_round_follows_after_a_pause(clip: Clip):
     assert np.array_equal(played.truth(samples[120].time), played.truth(0.0))
 
 
-@pytest.mark.parametrize("kind", PACKETS)
-def test_a_clip_arrives_as_packets(clip: Clip, kind: str):
+@pytest.mark.parametrize(("kind", "space"), [("udp", "amass"), ("osc", "unity")])
+def test_a_clip_arrives_as_packets(clip: Clip, kind: str, space: str):
     pack, parse = PACKETS[kind]
-    arrives = PacketSource(kind, 0, parse, "amass")
-    clock = Clock()
+    arrives = PacketSource(kind, 0, parse, space)
+    there, clock = SPACES[space], Clock()
     played = source(clip, 60, clock)
-    sender = threading.Thread(target=send, args=(played, arrives.port, pack))
+    sender = threading.Thread(target=send, args=(played, arrives.port, pack, there))
     sender.start()
     samples = [arrives.read() for _ in range(120)]
     sender.join()
     arrives.close()
     assert [sample.time for sample in samples] == pytest.approx([i / 60 for i in range(120)])
     assert all(sample.dropped == 0 for sample in samples)
-    assert samples[50].trackers[2][0] == pytest.approx(clip.positions[50, 2], abs=1e-6)
+    position, quaternion = samples[50].trackers[2]
+    assert there.positions_in(position) == pytest.approx(clip.positions[50, 2], abs=1e-6)
+    turned = there.rotations_in(quaternion_to_matrix(quaternion[None]))
+    assert turned[0] == pytest.approx(clip.rotations[50, 2], abs=1e-6)
     assert arrives.malformed == 0
     assert arrives.truth(0.5) is None
 
@@ -112,10 +116,11 @@ def test_malformed_and_missing_packets_are_counted():
             "",
             f'{{{head}, "seq": 8}}',
             f'{{{head}, "seq": 2}}',
+            f'{{{head}, "seq": {10**300}}}',
         ):
             sender.sendto(text.encode(), (HOST, arrives.port))
-        samples = [arrives.read() for _ in range(5)]
-    assert [s and s.dropped for s in samples] == [0, None, None, 3, 0]
+        samples = [arrives.read() for _ in range(6)]
+    assert [s and s.dropped for s in samples] == [0, None, None, 3, 0, 0]
     assert arrives.malformed == 2
     assert arrives.read() is None
     arrives.close()

@@ -9,11 +9,14 @@ const history = new History();
 let stage = null;
 let greeting = null;
 let arrived = 0;
+let malformed = 0;
 
 const events = new EventSource('events');
 events.addEventListener('greeting', event => greet(JSON.parse(event.data)));
 events.addEventListener('frame', event => {
   const frame = JSON.parse(event.data);
+  ({ malformed } = frame);
+  if (!frame.joints) return; // the counts alone
   if (frame.number <= history.last && history.frames.length) begin(); // the command was started again
   history.add(frame);
   arrived = performance.now();
@@ -53,7 +56,9 @@ addEventListener('keydown', event => {
 
 function status() {
   if (events.readyState !== EventSource.OPEN) return ['gone', 'not connected'];
-  if (performance.now() - arrived > QUIET) return ['', 'waiting for trackers'];
+  if (performance.now() - arrived > QUIET) {
+    return ['', malformed ? `waiting for trackers, ${malformed} packets malformed` : 'waiting for trackers'];
+  }
   return history.paused ? ['', 'paused'] : ['live', 'live'];
 }
 
