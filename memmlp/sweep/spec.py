@@ -30,8 +30,8 @@ from memmlp.units import UNITS
 BRANCHES = ("rotation", "position", "combined")
 KEYS = ("title", "table", "notes", "base", "seeds", "reference", "metrics", "arms", "axes")
 ARM_KEYS = ("overrides", "branch", "paper", "note")
-COSTS = ("FLOPs", "MACs", "parameters", "size", "ms", "FPS")
-"""Columns of the paper's tables that are no errors: GFLOP, GMAC, millions, MB, ms, frames a second."""
+COSTS = ("FLOPs", "MACs", "parameters", "size", "ms", "ratio", "FPS")
+"""Columns that are no errors: GFLOP, GMAC, millions, MB, ms, these over the reference network's, and 1 / s."""
 
 
 @dataclass(frozen=True)

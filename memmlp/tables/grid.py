@@ -10,7 +10,7 @@ from memmlp.sweep.spec import COSTS
 from memmlp.tables.collect import Cell, Row, Table
 from memmlp.units import UNITS
 
-COST_UNITS = {"FLOPs": "G", "MACs": "G", "parameters": "M", "size": "MB", "ms": "", "FPS": ""}
+COST_UNITS = {"FLOPs": "G", "MACs": "G", "parameters": "M", "size": "MB", "ms": "", "ratio": "", "FPS": ""}
 MISSING = "-"
 MINUS = "\N{MINUS SIGN}"
 

@@ -38,7 +38,8 @@ class Measured:
     Attributes:
         run: where they lie.
         means: the metrics' means over the test clips. clips: those of each clip by its name.
-        costs: GFLOP, GMAC and ms of a streaming step, millions of parameters, MB of ONNX, frames a second.
+        costs: GFLOP, GMAC and ms of a streaming step, its time over the reference network's in the same
+            minute, millions of parameters, MB of ONNX, frames a second.
         origin: what the run was made from.
     """
 
@@ -97,6 +98,7 @@ def _costs(latency: Mapping[str, float]) -> dict[str, float]:
         "parameters": of("parameters") / 1e6,
         "size": of("onnx_bytes") / 1e6,
         "ms": of("median_ms"),
+        "ratio": of("ratio_to_reference"),
         "FPS": 1000 / of("median_ms"),
     }
     return {name: float(cost) for name, cost in costs.items() if not np.isnan(cost)}
