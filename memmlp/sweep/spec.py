@@ -31,7 +31,7 @@ BRANCHES = ("rotation", "position", "combined")
 KEYS = ("title", "table", "notes", "base", "seeds", "reference", "metrics", "arms", "axes")
 ARM_KEYS = ("overrides", "branch", "paper", "note")
 COSTS = ("FLOPs", "MACs", "parameters", "size", "ms", "ratio", "FPS")
-"""Columns that are no errors: GFLOP, GMAC, millions, MB, ms, these over the reference network's, and 1 / s."""
+"""Columns that are no errors: GFLOP, GMAC, millions, MB, ms, those over the reference network's, 1 / s."""
 
 
 @dataclass(frozen=True)
