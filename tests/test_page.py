@@ -14,6 +14,7 @@ from conftest import Memmlp, one_line
 from fake_runs import fake_sweep
 
 from memmlp.errors import InputError
+from memmlp.report import figures
 from memmlp.report.page import Chapter, page, published
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.spec import Sweep, load_sweep
@@ -63,6 +64,15 @@ def test_page_needs_nothing_else(text: str):
     assert not re.search(r"<script|<link(?! rel=\"icon\" href=\"data:)|@import|url\((?!#)|src=|<img", text)
     addresses = set(re.findall(r"https?://[^\"'\s<)]+", text))
     assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
+
+
+@pytest.mark.parametrize("count", [2, 12, 13])
+def test_points_of_ours_are_named_where_they_are_few(count: int):
+    """One that two tables share once."""
+    points = [figures.Point(f"arm {number};", 100.0 + number, 4.0) for number in range(count)]
+    svg = figures.accuracy({"one": points, "other": points[:1]}, [figures.Point("theirs", 72, 3)], "MPJRE")
+    assert svg.count("theirs") == 1
+    assert [svg.count(point.label) for point in points] == [int(count <= 12)] * count
 
 
 def test_page_has_every_table_and_figure(chapters: list[Chapter], text: str):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import matplotlib as mpl
@@ -32,6 +32,7 @@ STYLE: Any = {
 WIDTH = 10.5  # inches
 LABEL = 34  # characters of an arm's label in a figure
 PANELS = 4  # side by side
+NAMED = 12  # points of ours whose names have room in one figure
 
 
 class Point(NamedTuple):
@@ -82,28 +83,36 @@ def forest(table: Table) -> str | None:
 
 @mpl.rc_context(STYLE)
 def accuracy(ours: Mapping[str, Sequence[Point]], paper: Sequence[Point], error: str) -> str:
-    """Error against frames a second (Fig. 1): ours by table, the paper's systems named."""
+    """Error against frames a second (Fig. 1): ours by table, named if few, and the paper's systems."""
     figure = Figure(figsize=(WIDTH, 5))
     axis = figure.add_subplot()
     axis.plot(
         [point.fps for point in paper], [point.error for point in paper],
         linestyle="", marker="D", color=INK, markerfacecolor="none", label="paper, Meta Quest 3",
     )  # fmt: skip
-    for number, point in enumerate(sorted(paper, key=lambda point: (point.fps, point.error))):
-        place = (6, -11 if number % 2 else 5)  # neighbours' names below and above
-        axis.annotate(point.label, (point.fps, point.error), place, textcoords="offset points", fontsize=8)
+    _names(axis, paper)
     for number, (name, points) in enumerate(ours.items()):
         axis.plot(
             [point.fps for point in points], [point.error for point in points],
             linestyle="", marker=MARKERS[number // len(SERIES) % len(MARKERS)], markersize=5, alpha=0.8,
             color=SERIES[number % len(SERIES)], label=name,
         )  # fmt: skip
+    measured = {(point.fps, point.error): point for points in ours.values() for point in points}
+    if len(measured) <= NAMED:
+        _names(axis, measured.values())
     axis.set(xscale="log", xlabel="frames a second, CPU", ylabel=heading(error))
     axis.xaxis.set_major_formatter(ScalarFormatter())
     axis.xaxis.set_minor_formatter(NullFormatter())
     axis.grid(alpha=0.6)
     axis.legend(loc="upper left", bbox_to_anchor=(1, 1), fontsize=8)
     return _svg(figure, "accuracy", f"{error} against frames a second")
+
+
+def _names(axis: Axes, points: Iterable[Point]) -> None:
+    """The points' names, neighbours' below and above."""
+    for number, point in enumerate(sorted(points, key=lambda point: (point.fps, point.error))):
+        place = (6, -11 if number % 2 else 5)
+        axis.annotate(point.label, (point.fps, point.error), place, textcoords="offset points", fontsize=8)
 
 
 @mpl.rc_context(STYLE)
