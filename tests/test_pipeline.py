@@ -111,6 +111,18 @@ def test_export_again_and_bad_names(home, memmlp, monkeypatch):
     assert one_line(memmlp("eval", run.manifest["upstream"]), "not a finished Mem-MLP run")
 
 
+def test_a_nan_on_a_later_clip_is_not_exported(home, memmlp, monkeypatch):
+    """Which Python's max would pass over."""
+    monkeypatch.chdir(home)
+    found = iter([1e-6, float("nan")])
+    monkeypatch.setattr("memmlp.parity.parity", lambda *_: next(found))
+    monkeypatch.setattr("memmlp.export.export", lambda model, path, run: path.write_bytes(b""))
+    monkeypatch.setattr(Frames, "clips", lambda self: [None, None])
+    ran = memmlp("export", motion_run(home).id, "--out", "never.onnx", "--clips", "0")
+    assert (ran.code, "not written" in ran.err) == (1, True)
+    assert not list(home.glob("*never*")) + list(home.glob(".export-*"))
+
+
 def test_foreign_targets_in_a_runs_config_are_refused(home, tmp_path):
     run = motion_run(home)
     copy = tmp_path / run.id

@@ -151,7 +151,7 @@ def full_parity(model: WindowModel, path: Path, clip: Tensor, space: str = "amas
     made = [stream.step(*(part[index : index + 1] for part in given)) for index in range(len(positions))]
     found = [np.concatenate(parts) for parts in zip(*made[1:], strict=True)]
     expected = _expected(model.frame, in_torch(model, sparse), sparse, there)
-    return max(float(np.abs(a - b).max()) for a, b in zip(expected, found, strict=True))
+    return float(np.max([np.abs(a - b).max() for a, b in zip(expected, found, strict=True)]))
 
 
 def _expected(frame: Frame, motion: Tensor, sparse: Tensor, space: Space) -> list[np.ndarray]:

@@ -69,6 +69,8 @@ def export(
     import tempfile
     from functools import partial
 
+    import numpy as np
+
     from memmlp.avatar.full import export_full, full_parity
     from memmlp.cli.build import build_experiment, config_of
     from memmlp.data.dataset import Frames
@@ -107,7 +109,7 @@ def export(
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         path = Path(folder) / "step.onnx"
         write(network, path, found.id)
-        worst = max(check(model, path, clip) for clip in checked)
+        worst = float(np.max([check(model, path, clip) for clip in checked]))  # NaN, if one is
         said = f"differs from torch by {worst:.1e} at most on {len(checked)} test clips"
         if not worst <= TOLERANCE:
             raise click.ClickException(f"{said}, more than {TOLERANCE:.0e}: not written")
