@@ -26,7 +26,6 @@ from memmlp.losses import Loss
 from memmlp.memory import Memory
 from memmlp.model import MemMLP, WindowModel
 from memmlp.predictor import Predictor
-from memmlp.render.figure import poses_png
 from memmlp.rollout import PersistentStreams, Rollout
 from memmlp.runs import Run
 from memmlp.tracking import Tracker, project_safely
@@ -283,6 +282,8 @@ def trained(
 
 def picture(model: WindowModel, test: Frames, run: Run) -> None:
     """Draw the start of the first test clip, streamed."""
+    from memmlp.render.figure import poses_png  # with matplotlib: half a second that planning needs not
+
     device = model.frame.rest.device
     clip = test.clip(0)[:PICTURE_FRAMES].to(device)
     motion = evaluation.stream(model, [clip])[0]

@@ -37,6 +37,12 @@ def files(folder: Path, model: WindowModel) -> tuple[Path, Path]:
     return exact, quantised
 
 
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory) -> tuple[Path, Path]:
+    """The two files of the first tiny network."""
+    return files(tmp_path_factory.mktemp("pair"), tiny.model())
+
+
 def test_auto_is_the_stream_where_there_is_one():
     assert isinstance(GRAPHS["auto"](tiny.model()), Stream)
     revised = tiny.model(CodeMemory, history="latest")
@@ -59,9 +65,8 @@ def weights(graph: onnx.ModelProto) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("network", ["mem_mlp", *tiny.REFERENCES])
-def test_inner_layers_are_int8_and_the_ends_are_not(tmp_path, network):
-    model = tiny.model() if network == "mem_mlp" else tiny.reference(network)
-    _, quantised = files(tmp_path, model)
+def test_inner_layers_are_int8_and_the_ends_are_not(pair, tmp_path, network):
+    _, quantised = pair if network == "mem_mlp" else files(tmp_path, tiny.reference(network))
     kinds = weights(onnx.load(quantised))
     inner = [kind for name, kind in kinds.items() if ".blocks." in name or ".layers." in name]
     assert inner
@@ -82,9 +87,9 @@ def test_int8_is_near_and_keeps_the_metadata(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fp32.onnx", "int8.onnx"]
 
 
-def test_int8_may_stand_for_float32_only_if_it_is_as_good(tmp_path):
+def test_int8_may_stand_for_float32_only_if_it_is_as_good(pair, tmp_path):
     model = tiny.model()
-    exact, quantised = files(tmp_path, model)
+    exact, quantised = pair
     cost = compared(exact, quantised, model.frame, CLIPS)
     assert cost["growth"] == pytest.approx(cost["int8"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
     assert cost["default"] == (cost["growth"] <= 0.01)
@@ -96,11 +101,11 @@ def test_int8_may_stand_for_float32_only_if_it_is_as_good(tmp_path):
     assert compared(exact, exact, model.frame, CLIPS)["default"]
 
 
-def test_accuracy_is_that_of_the_evaluation(tmp_path):
+def test_accuracy_is_that_of_the_evaluation(pair):
     from memmlp import evaluation
 
     model = tiny.model()
-    exact, _ = files(tmp_path, model)
+    exact, _ = pair
     found = accuracy(exact, model.frame, CLIPS)
     motions = evaluation.stream(model, CLIPS)
     rows = [

@@ -3,9 +3,6 @@
 import json
 import os
 import re
-import signal
-import subprocess
-import time
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +10,7 @@ import onnx
 import pytest
 import torch
 import yaml
-from command_line import MAIN, TINY
+from command_line import TINY
 from command_line import run as command
 from conftest import INT8, one_line
 from PIL import Image
@@ -133,23 +130,6 @@ def test_foreign_targets_in_a_runs_config_are_refused(home, tmp_path):
     config["memory"]["_target_"] = "os.system"
     (copy / "config.yaml").write_text(yaml.safe_dump(config))
     assert "os.system" in command(home, "eval", str(copy), code=2)
-
-
-def test_kill_9_in_the_pipeline_then_again_gives_the_same_model(home, tmp_path):
-    """The whole command killed at three unrelated moments, from data to export, and then let finish."""
-    line = [*MAIN, "train", *TINY]
-    for seconds in (3.0, 5.0, 7.5):
-        process = subprocess.Popen(line, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        time.sleep(seconds)
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
-    command(tmp_path, "train", *TINY)
-    whole = next(run for run in list_runs(home / "outputs") if "window" in run.results)
-    killed = Run.of(tmp_path / "outputs", whole.id)
-    assert killed.done
-    assert killed.model.read_bytes() == whole.model.read_bytes()
-    rotation = killed.results["stream"]["rotation"]
-    assert rotation == pytest.approx(whole.results["stream"]["rotation"], rel=1e-6)
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in shipped("conf/experiment").glob("*.yaml")))

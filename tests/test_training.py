@@ -1,11 +1,5 @@
 """The training loop: learning, resuming bit for bit after a kill, stopping at NaN; checkpoints."""
 
-import os
-import signal
-import subprocess
-import sys
-import textwrap
-import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -101,43 +95,6 @@ def test_another_seed_is_another_run(tmp_path):
         train(motion_task(seed=0), OPTIM, run, seed, "seed")
     a, b = map(weights, runs)
     assert not torch.equal(a["module.model.stem.weight"], b["module.model.stem.weight"])
-
-
-CHILD = """
-    import sys; sys.path[:0] = [{here!r}]
-    import test_training as t
-    from dataclasses import replace
-    from pathlib import Path
-    from memmlp.runs import Run
-    run = Run(Path({folder!r})); run.folder.mkdir(exist_ok=True)
-    optim = replace(t.OPTIM, steps=400, checkpoint_every=7)
-    t.torch.set_num_threads(1)
-    t.train(t.motion_task("own", optim), optim, run, 0, "child")
-"""
-
-
-def child(folder: Path) -> subprocess.Popen:
-    code = textwrap.dedent(CHILD).format(here=str(Path(__file__).parent), folder=str(folder))
-    return subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-
-
-def test_kill_9_at_any_moment_then_again_ends_in_the_same_weights(tmp_path):
-    """Real processes, killed at three unrelated moments (a write in progress among them by chance)."""
-    assert child(tmp_path / "whole").wait() == 0
-    broken = Run(tmp_path / "broken")
-    for after in (7, 70, 140):  # kill as soon as the checkpoint has passed that step
-        process = child(broken.folder)
-        while process.poll() is None:
-            if broken.checkpoint.exists() and checkpoint.read(broken.checkpoint)[1]["step"] >= after:
-                os.kill(process.pid, signal.SIGKILL)
-                break
-            time.sleep(0.003)
-        assert process.wait() == -signal.SIGKILL
-    assert child(broken.folder).wait() == 0
-    expected, got = weights(Run(tmp_path / "whole")), weights(broken)
-    assert all(torch.equal(expected[name], got[name]) for name in expected)
 
 
 @pytest.mark.parametrize("make", [vqvae_task, motion_task, *(TASKS[name] for name in tiny.REFERENCES)])

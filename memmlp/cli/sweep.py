@@ -61,7 +61,7 @@ def sweep(
         if dry_run:
             forecast(plan, count)
             if engine == "slurm":
-                click.echo(sbatch(sweep_folder(chosen, outputs) / "workers" / "%j", slurm_options(options)))
+                click.echo(sbatch(sweep_folder(chosen, outputs) / "workers" / "%j", options))
         return
     if retry:
         for task in plan.tasks:
@@ -72,8 +72,8 @@ def sweep(
     report(chosen, plan, [name, *rest])
 
 
-def split_executor(words: tuple[str, ...]) -> tuple[str, dict[str, str], tuple[str, ...]]:
-    """The executor, its options, and the words that are Hydra's overrides."""
+def split_executor(words: tuple[str, ...]) -> tuple[str, dict[str, object], tuple[str, ...]]:
+    """The executor, submitit's parameters for its jobs, and the words that are Hydra's overrides."""
     engine, options, rest = "local", {}, []
     for word in words:
         key, _, value = word.partition("=")
@@ -90,16 +90,16 @@ def split_executor(words: tuple[str, ...]) -> tuple[str, dict[str, str], tuple[s
             raise InputError(f"slurm.{key}: no such key; allowed here: {', '.join(OPTIONS)}")
     if options and engine != "slurm":
         raise InputError(f"slurm.{next(iter(options))}: goes with executor=slurm")
-    return engine, options, tuple(rest)
+    return engine, slurm_options(options), tuple(rest)
 
 
-def executor(engine: str, options: dict[str, str], folder: Path) -> Executor:
+def executor(engine: str, options: dict[str, object], folder: Path) -> Executor:
     """The executor of that name, its workers' logs below the sweep's folder."""
     from memmlp.sweep.executors import Ray, Submitit
 
     if engine == "ray":
         return Ray()
-    return Submitit(engine, folder / "workers" / "%j", slurm_options(options) if engine == "slurm" else None)
+    return Submitit(engine, folder / "workers" / "%j", options)
 
 
 def slurm_options(options: dict[str, str]) -> dict[str, object]:
@@ -119,7 +119,7 @@ def slurm_options(options: dict[str, str]) -> dict[str, object]:
     return found
 
 
-def bring_to_end(chosen: Sweep, plan: Plan, engine: str, options: dict[str, str], workers: int) -> None:
+def bring_to_end(chosen: Sweep, plan: Plan, engine: str, options: dict[str, object], workers: int) -> None:
     """Start workers and wait for them."""
     from memmlp.cli.plan import sweep_folder
     from memmlp.sweep.board import Board
@@ -129,7 +129,9 @@ def bring_to_end(chosen: Sweep, plan: Plan, engine: str, options: dict[str, str]
     oversee(plan, fleet, Board())
 
 
-def hire(folder: Path, plan: Plan, engine: str, options: dict[str, str], workers: int) -> tuple[Path, Fleet]:
+def hire(
+    folder: Path, plan: Plan, engine: str, options: dict[str, object], workers: int
+) -> tuple[Path, Fleet]:
     """The file of this process' plan, whatever others plan meanwhile, and workers for it, none started yet.
 
     folder: of the sweep or search; the workers' logs lie there too.

@@ -140,7 +140,7 @@ def show(setup: Setup) -> None:
     Console(highlight=False).print(render(study, setup.outputs) if study else "not begun")
 
 
-def search(setup: Setup, study: Study, engine: str, options: dict[str, str], workers: int) -> None:
+def search(setup: Setup, study: Study, engine: str, options: dict[str, object], workers: int) -> None:
     """Bring the study to as many trials as are wanted."""
     from memmlp.cli.sweep import hire
     from memmlp.search.board import SearchBoard

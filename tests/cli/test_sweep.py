@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from command_line import MAIN, TINY, run
+from command_line import MAIN, TINY, run, run_apart
 
 from memmlp.cli.plan import find_sweep, orphans, planned
 from memmlp.cli.sweep import split_executor
@@ -30,7 +30,7 @@ def home(tmp_path_factory) -> Path:
     """A folder where a sweep of three arms, one of which diverges, was run."""
     folder = tmp_path_factory.mktemp("sweep")
     write(folder, ARMS)
-    (folder / "first.txt").write_text(command(folder, code=1))
+    (folder / "first.txt").write_text(run_apart(folder, "sweep", "trial.yaml", *TINY, code=1))
     return folder
 
 
@@ -89,7 +89,7 @@ def test_an_edited_file_adds_arms_and_lists_orphans(home: Path):
 def test_retry_takes_failed_runs_up_again(home: Path):
     failed = next(run for run in list_runs(home / "outputs") if run.failure)
     attempts = len(failed.manifest["attempts"])
-    assert "3 of 4 runs done" in command(home, "--retry", code=1)
+    assert "3 of 4 runs done" in run_apart(home, "sweep", "trial.yaml", *TINY, "--retry", code=1)
     assert len(Run(failed.folder).manifest["attempts"]) == attempts + 1
     assert failed.failure is not None
 
@@ -152,22 +152,21 @@ def wait_for(condition, seconds: float = 90) -> None:
 )
 def test_bad_input_is_one_line(tmp_path: Path, words: list[str], line: str):
     write(tmp_path, ARMS)
-    ran = subprocess.run([*MAIN, "sweep", *words], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert ran.returncode == 2, ran.stdout + ran.stderr
-    assert line in ran.stderr
-    assert len(ran.stderr.strip().splitlines()) == 1
+    said = run(tmp_path, "sweep", *words, code=2)
+    assert line in said
+    assert said.count("\n") == 1
 
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (memmlp[ray])")
 def test_a_sweep_on_a_local_ray(tmp_path: Path):
     write(tmp_path, {"none": ["memory=none"]})
-    assert "1 of 1 runs done" in command(tmp_path, "executor=ray")
+    assert "1 of 1 runs done" in run_apart(tmp_path, "sweep", "trial.yaml", *TINY, "executor=ray")
 
 
 def test_executor_words_are_no_overrides_of_the_runs():
     assert split_executor(("executor=slurm", "slurm.time=5", "model.depth=8")) == (
         "slurm",
-        {"time": "5"},
+        {"timeout_min": 5},
         ("model.depth=8",),
     )
     with pytest.raises(InputError, match="executor"):

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from command_line import TINY as BASE
 from command_line import run as command
+from command_line import run_apart
 from filelock import FileLock
 
 from memmlp.cli.bench.chaos import examine
@@ -22,7 +23,7 @@ TINY = [*BASE, "optim.validate_every=3"]
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a search of three trials."""
     folder = tmp_path_factory.mktemp("tune")
-    (folder / "said.txt").write_text(command(folder, "tune", *TINY, "search.n_trials=3", "--workers", "2"))
+    (folder / "said.txt").write_text(run_apart(folder, "tune", *TINY, "search.n_trials=3", "--workers", "2"))
     return folder
 
 
@@ -119,12 +120,6 @@ def test_a_folder_of_ones_own_searches(tmp_path: Path):
     setup = prepared([*TINY, "search=rates"], tmp_path / "own", tmp_path)
     assert [one.key for one in setup.search.space] == ["optim.lr"]
     assert setup.folder.name.startswith("rates-")
-
-
-def test_a_search_under_kills_has_every_trial_once(tmp_path: Path):
-    said = command(tmp_path, "bench", "chaos-tune", "--trials", "3", "--kills", "5", "data.synth.minutes=0.2")
-    assert "3 trials with 5 kills" in said
-    assert "all trials as they should be: 0 differences" in said
 
 
 def test_the_judge_of_a_search_can_say_no(home: Path, tmp_path: Path):

@@ -1,0 +1,37 @@
+"""The whole of `memmlp train`, its process killed at unrelated moments."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+from command_line import MAIN, TINY, run
+
+from memmlp.runs import Run, list_runs
+
+MOMENTS = (
+    "data/**/*.npz",  # the first clip of the data is there
+    "runs/*/checkpoint.safetensors",  # the VQ-VAE is being trained
+    "runs/*/clips.json",  # the network is evaluated, and about to be exported
+)
+
+
+def test_kill_9_then_again_gives_the_same_model(tiny_home: Path, tmp_path: Path):
+    """The whole command killed as soon as it comes to each moment, and then let finish."""
+    line = [*MAIN, "train", *TINY]
+    for moment in MOMENTS:
+        process = subprocess.Popen(line, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while process.poll() is None and not list((tmp_path / "outputs").glob(moment)):
+            time.sleep(0.003)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+    run(tmp_path, "train", *TINY)
+    whole = next(made for made in list_runs(tiny_home / "outputs") if "window" in made.results)
+    killed = Run.of(tmp_path / "outputs", whole.id)
+    assert killed.done
+    assert killed.model.read_bytes() == whole.model.read_bytes()
+    rotation = killed.results["stream"]["rotation"]
+    assert rotation == pytest.approx(whole.results["stream"]["rotation"], rel=1e-6)
