@@ -101,6 +101,6 @@ def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tenso
 
 
 def _at(values: Tensor, dim: int, runs: tuple[slice, ...]) -> Tensor:
-    """The runs of a dimension, one after the other; slices, as an index would be copied to a GPU each time."""
+    """The runs of a dimension, one after the other: slices, as an index would go to a GPU each time."""
     found = [values.narrow(dim, run.start, run.stop - run.start) for run in runs]
     return found[0] if len(found) == 1 else torch.cat(found, dim)

@@ -16,6 +16,13 @@ from filelock import FileLock
 from memmlp.cli.main import main
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first; the others as they were."""
+    here = Path(__file__).parent
+    ranks = {here / f"{name}.py": rank for rank, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
+
+
 class Ran(NamedTuple):
     """A command's exit code and what it wrote."""
 
@@ -26,6 +33,13 @@ class Ran(NamedTuple):
 
 # Networks are tiny and test processes many: more threads only wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# Begun first, so that no process is left alone with one of them at the end.
+LONGEST = (
+    "test_axes", "test_reference", "cli/test_tune", "kills/test_search", "kills/test_sweep", "cli/test_sweep",
+    "avatar/test_full", "test_pipeline", "test_deployment", "avatar/test_stream", "kills/test_command",
+    "kills/test_training",
+)  # fmt: skip
 
 INT8 = "export.precision=int8"
 Memmlp = Callable[..., Ran]
