@@ -88,6 +88,16 @@ def test_a_resumed_run_is_the_same_run(make, tmp_path):
     assert [m.values for m in whole.metrics()] == [m.values for m in broken.metrics()]
 
 
+def test_what_is_drawn_after_training_is_the_same_after_a_resume_at_its_end(tmp_path):
+    """Such as the blends of an evaluation with memory.blend=sampled; within a step all draws are seeded."""
+    drawn = []
+    for _ in range(2):
+        train(motion_task(), OPTIM, Run(tmp_path), 0, "to the end, then nothing left to do")
+        drawn.append(torch.rand(3))
+        torch.rand(99)
+    assert torch.equal(*drawn)
+
+
 def test_another_seed_is_another_run(tmp_path):
     runs = [Run(tmp_path / str(seed)) for seed in range(2)]
     for seed, run in enumerate(runs):
