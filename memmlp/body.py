@@ -24,27 +24,6 @@ JOINTS = (
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
 N_JOINTS = len(JOINTS)
 
-
-def _levels() -> tuple[tuple[slice, tuple[slice, ...]], ...]:
-    """The tree's levels below the root: their joints, which lie side by side as SMPL numbers them, and the
-    places of these joints' parents in the level above, as runs of neighbours.
-    """
-    found, above, start = [], range(1), 1
-    while start < N_JOINTS:
-        level = range(start, next((j for j in range(start, N_JOINTS) if PARENTS[j] >= start), N_JOINTS))
-        runs: list[slice] = []
-        for place in (PARENTS[joint] - above.start for joint in level):
-            if runs and runs[-1].stop == place:
-                runs[-1] = slice(runs[-1].start, place + 1)
-            else:
-                runs.append(slice(place, place + 1))
-        found.append((slice(level.start, level.stop), tuple(runs)))
-        above, start = level, level.stop
-    return tuple(found)
-
-
-LEVELS = _levels()
-
 ROOT, HEAD, LEFT_WRIST, RIGHT_WRIST = 0, 15, 20, 21
 TRACKED = (HEAD, LEFT_WRIST, RIGHT_WRIST)  # the three sensors, in the order of the input
 HANDS = (LEFT_WRIST, RIGHT_WRIST)

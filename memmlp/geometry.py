@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from memmlp.body import LEVELS
+from memmlp.body import PARENTS
 
 
 def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
@@ -83,24 +83,16 @@ def geodesic_angle(a: Tensor, b: Tensor) -> Tensor:
 
 
 def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
-    """Global rotations (..., 22, 3, 3) and positions (..., 22, 3) of the joints, a level of the tree at once.
+    """Global rotations (..., 22, 3, 3) and positions (..., 22, 3) of the joints.
 
     Args:
         local: local rotations (..., 22, 3, 3), the root's global.
         root: position of the root joint (..., 3), metres, world.
         rest: rest positions (22, 3), metres; only the offsets between joint and parent count.
     """
-    turns, places, above = [local[..., :1, :, :]], [root[..., None, :]], rest[:1]
-    for level, parents in LEVELS:
-        turn = _at(turns[-1], -3, parents)
-        offset = rest[level] - _at(above, -2, parents)
-        places.append(_at(places[-1], -2, parents) + (turn @ offset[..., None]).squeeze(-1))
-        turns.append(turn @ local[..., level, :, :])
-        above = rest[level]
-    return torch.cat(turns, -3), torch.cat(places, -2)
-
-
-def _at(values: Tensor, dim: int, runs: tuple[slice, ...]) -> Tensor:
-    """The runs of a dimension, one after the other: slices, as an index would go to a GPU each time."""
-    found = [values.narrow(dim, run.start, run.stop - run.start) for run in runs]
-    return found[0] if len(found) == 1 else torch.cat(found, dim)
+    rotations, positions = [local[..., 0, :, :]], [root]
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        offset = rest[joint] - rest[parent]
+        positions.append(positions[parent] + rotations[parent] @ offset)
+        rotations.append(rotations[parent] @ local[..., joint, :, :])
+    return torch.stack(rotations, -3), torch.stack(positions, -2)

@@ -6,6 +6,7 @@ import contextlib
 import io
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -29,17 +30,21 @@ def run(folder: Path, *arguments: str, code: int = 0) -> str:
     In this process, which has torch and the exporter loaded already: half the time of a run of six steps.
     What starts workers goes apart, as they are reaped only with their controller.
     """
-    said, left = io.StringIO(), 0
-    threads = torch.get_num_threads()
+    said, threads = io.StringIO(), torch.get_num_threads()
     with contextlib.chdir(folder), contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-        try:
-            main(list(arguments))
-        except SystemExit as stop:
-            left = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
-        finally:
-            torch.set_num_threads(threads)
+        left = exit_code(arguments)
+    torch.set_num_threads(threads)
     assert left == code, said.getvalue()
     return said.getvalue()
+
+
+def exit_code(arguments: Sequence[str]) -> int:
+    """That of a command line in this process and folder."""
+    try:
+        main(list(arguments))
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    return 0
 
 
 def run_apart(folder: Path, *arguments: str, code: int = 0) -> str:

@@ -13,8 +13,6 @@ import command_line
 import pytest
 from filelock import FileLock
 
-from memmlp.cli.main import main
-
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest files first; the others as they were."""
@@ -94,12 +92,7 @@ def memmlp(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], 
 
     def run(*arguments: str) -> Ran:
         capsys.readouterr()
-        code = 0
-        try:
-            main(list(arguments))
-        except SystemExit as stop:
-            code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
-        return Ran(code, *capsys.readouterr())
+        return Ran(command_line.exit_code(arguments), *capsys.readouterr())
 
     return run
 

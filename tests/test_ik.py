@@ -48,9 +48,7 @@ def test_reachable_targets_are_reached():
     motion = perturbed(0.1)
     assert float(distance(motion).mean()) > 30
     assert float(distance(solve(motion)).max()) < 2.5
-    left = distance(solve(motion, 200))
-    assert float(left.mean()) < 0.1
-    assert float(left.max()) < 0.5  # the last digits decide: 0.08 to 0.25 over six seeds and two roundings
+    assert float(distance(solve(motion, 200)).max()) < 0.15
 
 
 def test_only_rotations_that_move_joints_are_changed():
