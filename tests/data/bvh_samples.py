@@ -1,11 +1,18 @@
-"""Small BVH files of both shipped skeletons, and damage to them."""
+"""Small BVH files of both shipped skeletons, damage to them, and how their refusals are expected."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import permutations
+from pathlib import Path
 
 import numpy as np
+import pytest
+
+from memmlp.data.bvh import Bvh, read_bvh
+from memmlp.errors import InputError
 
 # Joint, parent, offset; a * before an end site's joint, which comes with the offset only.
 DAZ = """
@@ -133,3 +140,26 @@ def mutate(data: bytes, seed: int) -> bytes:
     ]
     words[number] = wrong[random.integers(len(wrong))]
     return b" ".join(words)
+
+
+def write(folder: Path, text: str | bytes, name: str = "clip.bvh") -> Path:
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def read(folder: Path, skeleton: str, frames: int = 5, **options: int) -> Bvh:
+    return read_bvh(write(folder, person(skeleton, frames, **{"seed": 3, **options}).text()))
+
+
+@contextmanager
+def refuse(start: Path | str, *said: str) -> Iterator[None]:
+    """Expect an InputError of one line that begins with `start` and has what is said."""
+    with pytest.raises(InputError) as error:
+        yield
+    message = str(error.value)
+    assert message.startswith(str(start))
+    assert len(message.splitlines()) == 1
+    for part in (*said, "; allowed: "):
+        assert part in message

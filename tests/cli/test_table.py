@@ -1,0 +1,73 @@
+"""`memmlp table`: what it prints and writes, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from conftest import Memmlp, one_line
+from fake_runs import fake_sweep
+
+from memmlp.errors import InputError
+from memmlp.sweep.plan import Entry, Plan
+from memmlp.sweep.spec import Sweep
+
+
+@pytest.fixture
+def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Stands in for composing: every sweep's runs are there, those of Table 1 cannot be known."""
+
+    def plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
+        if sweep.table == 1 or "bad=1" in sweep.extra:
+            raise InputError("data.root: has no value")
+        find = fake_sweep(tmp_path / sweep.name, sweep)
+        entries = [(arm, seed) for arm in sweep.runnable() for seed in sweep.seeds]
+        found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
+        return Plan(sweep.name, tmp_path / sweep.name, tuple(found), ())
+
+    monkeypatch.setattr("memmlp.cli.plan.planned", plan)
+
+
+def test_command_prints_a_table(memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    ran = memmlp("table", "14")
+    assert ran.code == 0
+    assert "Table 14: Placement" in ran.out
+    assert ran.out.count("3/3") == 8
+    assert max(map(len, ran.out.splitlines())) <= 100
+    assert memmlp("table", "13", "--mode", "window").out.count("3/3") == 3
+
+
+def test_command_writes_the_format_of_the_ending(memmlp: Memmlp, planned: None, tmp_path: Path):
+    for ending, word in (("md", "| arm |"), ("tex", r"\toprule"), ("json", '"rows"'), ("html", "<table>")):
+        ran = memmlp("table", "5", "--out", f"out/t.{ending}")
+        assert (ran.code, ran.out) == (0, f"out/t.{ending}\n")
+        assert word in Path(f"out/t.{ending}").read_text()
+    assert json.loads(memmlp("table", "5", "--format", "json").out)["number"] == 5
+
+
+def test_command_prints_all_tables(memmlp: Memmlp, planned: None):
+    out = memmlp("table", "all", "--mode", "stream").out
+    assert [int(number) for number in re.findall(r"^Table (\d+):", out, re.MULTILINE)] == list(range(1, 18))
+    assert "nothing measured: data.root: has no value" in " ".join(out.split())
+
+
+def test_all_as_json_is_one_list(memmlp: Memmlp, planned: None):
+    assert len(json.loads(memmlp("table", "all", "--format", "json").out)) == 17
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["99"], ("no such sweep",)),
+        (["14", "bad=1"], ("data.root",)),
+        (["all", "bad=1"], ("data.root",)),
+        (["14", "--out", "table.pdf"], ("--out table.pdf", "md, tex, json, html")),
+        (["14", "--out", "/proc/nothing/t.md"], ("--out /proc/nothing/t.md",)),
+        (["14", "--mode", "both modes"], ("--mode",)),
+    ],
+)
+def test_bad_input_is_one_line(memmlp: Memmlp, planned: None, arguments: list[str], words: tuple[str, ...]):
+    assert one_line(memmlp("table", *arguments), *words)
