@@ -63,6 +63,7 @@ class ReferenceLoss(Loss):
 @dataclass
 class AGRoLLoss(ReferenceLoss):
     _target_: str = target("memmlp.losses.AGRoLLoss")
+    error: str = one_of("norm", "square")
 
 
 @dataclass
@@ -71,6 +72,7 @@ class AvatarPoserLoss(ReferenceLoss):
     orientation: float = at_least(0)
     rotation: float = at_least(0)
     position: float = at_least(0)
+    anchor: str = one_of("pelvis", "head")
 
 
 @dataclass
