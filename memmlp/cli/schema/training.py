@@ -71,6 +71,7 @@ class ReferenceLoss(Loss):
 class AGRoLLoss(ReferenceLoss):
     name: str = called("agrol")
     _target_: str = target("memmlp.losses.AGRoLLoss")
+    error: str = one_of("norm", "square")
 
 
 @dataclass
@@ -80,6 +81,7 @@ class AvatarPoserLoss(ReferenceLoss):
     orientation: float = at_least(0)
     rotation: float = at_least(0)
     position: float = at_least(0)
+    anchor: str = one_of("pelvis", "head")
 
 
 @dataclass
