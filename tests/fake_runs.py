@@ -59,7 +59,9 @@ def fake_run(
     for mode in ("window", "stream"):
         clips_of_mode = [{"name": row["name"], "frames": row["frames"], **row[mode]} for row in rows]
         mean = _means([row[mode] for row in rows])
-        write_report(run.evaluation(f"{mode}-0"), {"mode": mode, "mean": mean, "clips": clips_of_mode})
+        write_report(
+            run.evaluation(f"{mode}-0"), {"mode": mode, "settings": {}, "mean": mean, "clips": clips_of_mode}
+        )
     if log:
         _log(run, factor)
     return run

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from memmlp.cli.schema import check, restored
 from memmlp.deployment import Deployment
 from memmlp.errors import InputError
 from memmlp.features import Frame, Heading, HeadRelative, World
+from memmlp.identity import flatten
 from memmlp.ik import IK, LBFGS, NoIK
 from memmlp.losses import Loss, MotionLoss
 from memmlp.memory import Memory
@@ -154,6 +155,8 @@ def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
     """
     if not run.done or run.manifest.get("kind") != "memmlp":
         raise InputError(f"run {run.id}: not a finished Mem-MLP run")
+    if foreign := sorted(name for name in _targets(run.config) if not name.startswith("memmlp.")):
+        raise InputError(f"{run.config_path}: {', '.join(foreign)}: allowed are classes of memmlp")
     try:
         cfg = restored(run.config)
     except (OmegaConfBaseException, KeyError, TypeError, ValueError) as error:
@@ -163,6 +166,11 @@ def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
         _override(cfg, word)
     check(cfg)
     return cfg
+
+
+def _targets(tree: Mapping[str, Any]) -> list[str]:
+    """The paths of all classes that a config names."""
+    return [str(value) for key, value in flatten(tree).items() if key.rsplit(".", 1)[-1] == "_target_"]
 
 
 def _override(cfg: DictConfig, word: str) -> None:

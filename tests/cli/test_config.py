@@ -51,7 +51,7 @@ def test_a_profiles_sizes_reach_every_group(profile: str, memory: str):
     assert (cfg.optim.steps, cfg.optim.batch, cfg.optim.lr) == (sizes.steps, sizes.batch, sizes.lr)
     assert (cfg.vqvae.codes, cfg.vqvae.width) == (sizes.codes, sizes.code_width)
     if memory == "none":
-        assert set(cfg.memory) == {"_target_", "_partial_"}
+        assert set(cfg.memory) == {"name", "_target_", "_partial_"}
     else:
         assert (cfg.memory.layers, cfg.memory.width) == (sizes.memory_layers, sizes.memory_width)
 
