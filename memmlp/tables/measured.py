@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from memmlp.errors import InputError
-from memmlp.runs import Run
+from memmlp.files import read_json
+from memmlp.runs import Run, intact
 
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # mode -> branch -> metric -> value
 
@@ -61,29 +61,34 @@ class Measured:
         return np.array([np.nan if number is None else number for number in numbers])
 
 
-def load(folder: Path) -> Measured:
-    """Read a finished run. Raises InputError, naming the file that is damaged."""
+def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
+    """Read a finished run. Raises InputError, naming the file that is damaged.
+
+    stages: identities of the evaluations and the deployment to read; all that there are by default.
+    """
     run = Run(folder)
-    results, manifest = _read(run.results_path, dict), _read(run.manifest_path, dict)
-    clips = _read(run.clips, list)
-    if not all(isinstance(clip, dict) and "name" in clip for clip in clips):
-        raise _unreadable(run.clips)
-    named = {clip["name"]: clip for clip in clips}
-    return Measured(run, results, named, _costs(results.get("latency", {})), _origin(manifest))
+    manifest = _read(run.manifest_path)
+    reports = [_read(path) for path in _evaluations(run, stages)]
+    means = {report["mode"]: report["mean"] for report in reports}
+    clips: dict[str, dict[str, Any]] = {}
+    for report in reports:
+        for clip in report["clips"]:
+            clips.setdefault(clip["name"], {})[report["mode"]] = clip
+    deployed = [run.deployment(name) for name in stages or () if run.deployment(name).done] or [run.shipped]
+    return Measured(run, means, clips, _costs(read_json(deployed[-1].latency)), _origin(manifest))
 
 
-def _read(path: Path, kind: type) -> Any:
-    try:
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError):
-        content = None
-    if not isinstance(content, kind):
-        raise _unreadable(path)
+def _evaluations(run: Run, stages: Sequence[str] | None) -> list[Path]:
+    """The files of some evaluations, or of all of them."""
+    wanted = [run.evaluation(name) for name in stages or ()]
+    return [path for path in wanted if path.is_file()] or sorted(run.evaluations.glob("*.json"))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    content = read_json(path)
+    if not content or ("digest" in content and not intact(path)):
+        raise InputError(f"{path}: cannot be read; do the run again with force=true, or remove its folder")
     return content
-
-
-def _unreadable(path: Path) -> InputError:
-    return InputError(f"{path}: cannot be read; do the run again with force=true, or remove its folder")
 
 
 def _costs(latency: Mapping[str, float]) -> dict[str, float]:
