@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -55,11 +56,12 @@ def build_experiment(cfg: DictConfig) -> pipeline.Experiment:
         data=build_motion(cfg),
         architecture=build_architecture(cfg),
         vqvae_config={"frame": config["frame"], "vqvae": config["vqvae"]},
-        vqvae_optim=build_vqvae_optim(cfg),
+        vqvae_optim=partial(build_vqvae_optim, cfg),
         vqvae_seed=cfg.vqvae.seed,
         loss=build_loss(cfg),
         rollout=built(cfg.rollout),
         optim=Optim(**config["optim"]),
+        weighting=cfg.data.weighting,
         modes=list(cfg.evaluation.modes),
         evaluation_batch=cfg.evaluation.batch,
         ik=build_ik(cfg),
@@ -132,10 +134,11 @@ def build_ik(cfg: DictConfig) -> IK:
     return LBFGS(cfg.evaluation.ik_iterations)
 
 
-def build_vqvae_optim(cfg: DictConfig) -> Optim:
-    """Adam as App. A has it; its epochs are steps here."""
+def build_vqvae_optim(cfg: DictConfig, frames: int) -> Optim:
+    """Adam as App. A has it; an epoch is as many frames as there are in training."""
+    steps = cfg.vqvae.steps or math.ceil(cfg.vqvae.epochs * frames / cfg.vqvae.batch)
     return Optim(
-        steps=cfg.vqvae.steps,
+        steps=steps,
         batch=cfg.vqvae.batch,
         lr=cfg.vqvae.lr,
         schedule="milestones",
@@ -143,7 +146,7 @@ def build_vqvae_optim(cfg: DictConfig) -> Optim:
         betas=(0.9, 0.99),
         decoupled=False,
         checkpoint_every=cfg.optim.checkpoint_every,
-        validate_every=cfg.vqvae.steps,
+        validate_every=steps,
         log_every=cfg.optim.log_every,
     )
 

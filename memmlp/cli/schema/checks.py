@@ -77,6 +77,9 @@ def _check_combinations(cfg: DictConfig) -> None:
         _check_reference(cfg)
     else:
         _check_slots(cfg)
+    if (cfg.vqvae.epochs is None) == (cfg.vqvae.steps is None):
+        given = f"vqvae.epochs={cfg.vqvae.epochs}, vqvae.steps={cfg.vqvae.steps}"
+        raise InputError(f"{given}: allowed is one of them, and null for the other")
     split = cfg.data.split
     held_out = split.val + (split.test if isinstance(split.get("test"), float) else 0)
     if held_out >= 1:
