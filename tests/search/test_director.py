@@ -342,15 +342,16 @@ def test_pruning_is_by_the_first_seed_alone(tmp_path: Path):
     for level in (5.0, 6.0):
         for _ in range(2):
             run = begun(replace(plan := one.look(1), tasks=tuple(plan.left())))
-            log(run, 10, level)
-            log(run, STEPS, level)
+            for step in (10, 20, STEPS):
+                log(run, step, level)
             run.finish([])
     run = begun(one.look(1))
     log(run, 10, 5.2)
-    log(run, STEPS, 5.2)
-    run.finish([])
+    one.look(1)
+    log(run, 20, 50.0)
+    run.finish([])  # before anyone looks: what is done is not pruned
     second = begun(replace(plan := one.look(1), tasks=tuple(plan.left())))
-    log(second, 10, 50.0)  # a seed on which the trial is bad is part of its mean, and no reason to end it
+    log(second, 20, 50.0)  # a seed on which the trial is bad is part of its mean, and no reason to end it
     assert second.id in {task.id for task in one.look(1).left()}
     second.fail("not of interest here")
     run = begun(one.look(1))
