@@ -346,13 +346,12 @@ def test_pruning_is_by_the_first_seed_alone(tmp_path: Path):
                 log(run, step, level)
             run.finish([])
     run = begun(one.look(1))
-    log(run, 10, 5.2)
-    one.look(1)
-    log(run, 20, 50.0)
+    log(run, 10, 50.0)
     run.finish([])  # before anyone looks: what is done is not pruned
     second = begun(replace(plan := one.look(1), tasks=tuple(plan.left())))
     log(second, 20, 50.0)  # a seed on which the trial is bad is part of its mean, and no reason to end it
     assert second.id in {task.id for task in one.look(1).left()}
+    assert study.trials[2].intermediate_values == {10: 50.0}
     second.fail("not of interest here")
     run = begun(one.look(1))
     log(run, 10, 50.0)
