@@ -105,7 +105,8 @@ def evaluate(
     """
     clips = frames.clips()
     rows: list[dict[str, Any]] = [
-        {"name": name, "frames": len(clip)} for name, clip in zip(frames.names, clips, strict=True)
+        {"name": name, "group": group, "frames": len(clip)}
+        for name, group, clip in zip(frames.names, frames.groups, clips, strict=True)
     ]
     for mode in modes:
         for row, clip, motion in zip(rows, clips, predict(network, clips, mode, batch), strict=True):

@@ -336,7 +336,7 @@ def evaluate_run(experiment: Experiment, run: Run, cache: Path, modes: Sequence[
     test = Frames.open(cache, "test").to(experiment.device)
     for mode in modes:
         found = evaluation.evaluate(model, test, [mode], experiment.evaluation_batch, experiment.ik)
-        rows = [{key: row[key] for key in ("name", "frames")} | row[mode] for row in found["clips"]]
+        rows = [{key: row[key] for key in ("name", "group", "frames")} | row[mode] for row in found["clips"]]
         report = {"mode": mode, "settings": evaluation_settings(experiment.config, mode)}
         report |= {"mean": found["mean"][mode], "clips": rows, **machine(experiment)}
         write_report(run.evaluation(experiment.evaluations[mode]), report)
