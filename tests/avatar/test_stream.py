@@ -25,9 +25,7 @@ from memmlp.avatar.spaces import SPACES
 from memmlp.avatar.stream import Offsets, Stream
 from memmlp.avatar.trackers import t_pose
 from memmlp.body import HEAD, N_JOINTS, SPARSE_DIM
-from memmlp.data.bvh import read_bvh
-from memmlp.data.retarget import retarget
-from memmlp.data.skeleton import find_skeleton
+from memmlp.data.synthetic import synthesize_clip
 from memmlp.evaluation import joint_positions, local_rotations, stream
 from memmlp.export import export
 from memmlp.features import Heading
@@ -37,7 +35,6 @@ from memmlp.predictor import RotationOnly
 from memmlp.runs import Run
 from memmlp.streaming import streaming
 
-CMU = Path(__file__).parents[2] / ".." / "shared" / "data" / "cmu"
 FRAMES = 240
 TIMES = np.arange(FRAMES) / 60
 PERSON = live.person(TIMES)
@@ -88,13 +85,9 @@ def test_it_is_evaluations_stream(name, tmp_path):
     assert largest_difference(network, tmp_path / "step.onnx", PERSON) < 1e-4
 
 
-@pytest.mark.skipif(
-    not CMU.is_dir(), reason="the CMU clips are not beside the repository (../shared/data/cmu)"
-)
-def test_on_a_dancer_at_60_and_at_120_hz(network, file):
-    bvh = read_bvh(CMU / "salsa" / "10.bvh")
-    clip = retarget(bvh, find_skeleton(bvh), tiny.REST.numpy())
-    poses, trans = torch.tensor(clip.poses[:1200]), torch.tensor(clip.trans[:1200])
+def test_on_a_boxer_at_60_and_at_120_hz(network, file):
+    clip = synthesize_clip("punching", 0, seconds=10.0, fps=120.0)
+    poses, trans = torch.tensor(clip.poses).double(), torch.tensor(clip.trans).double()
     every, second = live.of_poses(poses, trans), live.of_poses(poses[::2], trans[::2])
     assert largest_difference(network, file, second) < 1e-4
     times = np.arange(len(poses)) / 120

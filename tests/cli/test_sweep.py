@@ -108,12 +108,12 @@ def test_seeds_come_one_after_another_each_with_all_arms(home: Path, monkeypatch
 
 
 def test_the_first_failure_ends_the_sweep_where_that_is_wanted(tmp_path: Path):
-    lasting = ["memory=none", "optim.steps=100000"]
-    write(tmp_path, {"lasting": lasting, "wild": ["memory=none", "optim.lr=1e30"], "late": ["memory=none"]})
+    endless, failing = ["memory=none", "optim.steps=100000"], ["memory=none", "optim.lr=1e30"]
+    write(tmp_path, {"endless": endless, "failing": failing, "late": ["memory=none"]})
     words = ["sweep", "trial.yaml", *TINY, "--workers", "2", "--fail-fast"]
     said = run_apart(tmp_path, *words, code=1)
     assert "0 of 3 runs done" in said
-    assert "wild seed 0: failed, loss is nan" in said
+    assert "failing seed 0: failed, loss is nan" in said
     assert re.search(r"^failed: run .*: loss is nan", said, re.M)
     runs = list_runs(tmp_path / "outputs")
     assert len(runs) <= 2  # the last arm's was not begun

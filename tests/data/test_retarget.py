@@ -235,9 +235,7 @@ def test_a_performance_comes_back_from_its_file(tmp_path: Path, skeleton: str, a
     assert find_skeleton(bvh).name == skeleton
     found = retarget(bvh, find_skeleton(bvh), REST)
     assert (len(found), found.fps) == (len(clip), 120)
-    known = [
-        joint for joint, name in enumerate(JOINTS) if chosen.joints.get(name, END).endswith(END) is False
-    ]
+    known = [joint for joint, name in enumerate(JOINTS) if not chosen.joints.get(name, END).endswith(END)]
     turned = on_body(found)[0][:, known].swapaxes(-1, -2) @ on_body(clip)[0][:, known]
     angles = Rotation.from_matrix(turned.reshape(-1, 3, 3)).magnitude()
     assert np.degrees(angles.max()) < 0.01
