@@ -39,7 +39,7 @@ PATHS = ("_target_", "_partial_")
 
 EVALUATION = ("evaluation",)
 DEPLOYMENT = ("export",)
-INFERENCE = ("memory.blend", "model.sampling_steps")
+INFERENCE = ("memory.blend", "memory.history", "model.sampling_steps")
 """Keys of the later stages; those of INFERENCE count for both, and for a training that rolls out."""
 
 SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand")
