@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter, ScalarFormatter
 
 from memmlp.sweep.spec import COSTS
-from memmlp.tables.collect import Cell, Table
 from memmlp.tables.grid import heading
+from memmlp.tables.table import Cell, Table
 
 INK, FAINT = "#010203", "#010204"
 SERIES = tuple(f"#0102{number:02x}" for number in range(0x10, 0x18))

@@ -15,10 +15,11 @@ from memmlp.report import figures
 from memmlp.report.figures import Curve, Point
 from memmlp.runs import Metrics
 from memmlp.sweep.spec import COSTS, Sweep
-from memmlp.tables.collect import Runs, Table
+from memmlp.tables.effects import Runs
 from memmlp.tables.grid import caption
 from memmlp.tables.measured import Measured
 from memmlp.tables.render import as_html
+from memmlp.tables.table import Table
 
 ERROR = "MPJRE"  # of Fig. 1, as Sec. 4.3 has it
 MOST_POINTS = 200  # of a curve
@@ -48,7 +49,7 @@ class Entry:
     @cached_property
     def config(self) -> dict[str, Any]:
         """The dotted keys of its config that can change a result."""
-        return relevant(self.measured.run.config)
+        return relevant(self.measured.run.config) if self.measured.run else {}
 
 
 def page(chapters: Sequence[Chapter], published: Sequence[Point], generated: str, commit: str) -> str:
@@ -97,7 +98,7 @@ def _entries(chapters: Sequence[Chapter]) -> list[Entry]:
     for chapter in chapters:
         for label, runs in chapter.runs.items():
             for seed, measured in runs.items():
-                entry = entries.setdefault(measured.run.id, Entry(measured))
+                entry = entries.setdefault(measured.id, Entry(measured))
                 entry.places.append(f"{chapter.sweep.name}: {label}, seed {seed}")
     return list(entries.values())
 
@@ -176,7 +177,10 @@ def _curves(chapter: Chapter) -> dict[str, dict[str, list[Curve]]]:
     names = [f"rotation {metric}" for metric in chapter.table.metrics if metric not in COSTS]
     wanted = {("train", "loss"): "training loss"}
     wanted |= {("val", name): f"validation: {name}" for name in names}
-    logs = {label: [m.run.metrics() for m in runs.values()] for label, runs in chapter.runs.items()}
+    logs = {
+        label: [measured.run.metrics() for measured in runs.values() if measured.run]
+        for label, runs in chapter.runs.items()
+    }
     panels: dict[str, dict[str, list[Curve]]] = {}
     for (phase, name), title in wanted.items():
         arms = {label: [_curve(log, phase, name) for log in found] for label, found in logs.items()}
@@ -213,7 +217,7 @@ def _latency(entries: Sequence[Entry]) -> str:
     )
     rows = []
     for entry in entries:
-        values = entry.measured.run.results.get("latency", {})
+        values = entry.measured.latency
         numbers = [
             _number(values, key, scale, form)
             for key, scale, form in (
@@ -221,9 +225,7 @@ def _latency(entries: Sequence[Entry]) -> str:
                 ("parameters", 1, ",.0f"), ("macs", 1e6, ".1f"), ("onnx_bytes", 1e6, ".2f"),
             )
         ]  # fmt: skip
-        rows.append(
-            [entry.measured.run.id, *numbers, entry.measured.origin.hardware, "; ".join(entry.places)]
-        )
+        rows.append([entry.measured.id, *numbers, entry.measured.origin.hardware, "; ".join(entry.places)])
     return _rows(
         head, rows, "One streaming step on one CPU core; the reference is a fixed stack of matrix products."
     )
@@ -240,14 +242,15 @@ def _runs(entries: Sequence[Entry]) -> str:
     common = _common([entry.config for entry in entries])
     rows = []
     for entry in entries:
-        manifest, origin = entry.measured.run.manifest, entry.measured.origin
+        run, origin = entry.measured.run, entry.measured.origin
+        manifest = run.manifest if run else {}
         seconds = manifest.get("seconds")
         minutes = f"{sum(seconds.values()) / 60:.1f}" if isinstance(seconds, dict) else "-"
         keys = sorted({*entry.config, *common})
         differing = [f"{k}={entry.config.get(k, '-')}" for k in keys if entry.config.get(k) != common.get(k)]
         code = origin.code + (" + changes" if origin.changed else "")
         when = str(manifest.get("started", "-"))[:16].replace("T", " ")
-        row = [entry.measured.run.id, when, minutes, code, origin.data, "; ".join(differing) or "-"]
+        row = [entry.measured.id, when, minutes, code, origin.data, "; ".join(differing) or "-"]
         rows.append([*row, "; ".join(entry.places)])
     head = (
         "run",
