@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from torch import Tensor
@@ -14,7 +13,7 @@ from memmlp.export import export
 from memmlp.model import WindowModel
 from memmlp.parity import TOLERANCE, parity
 from memmlp.quantization import compared, quantise
-from memmlp.runs import Run
+from memmlp.runs import Deployed
 from memmlp.streaming import Stream, has_stream, streaming
 
 GRAPHS: dict[str, Callable[[WindowModel], WindowModel | Stream]] = {
@@ -40,31 +39,40 @@ class Deployment:
     precision: str = "fp32"
 
     def ship(
-        self, model: WindowModel, run: Run, train: Sequence[Tensor], test: Sequence[Tensor]
+        self,
+        model: WindowModel,
+        place: Deployed,
+        run_id: str,
+        train: Sequence[Tensor],
+        test: Sequence[Tensor],
     ) -> dict[str, Any]:
         """Write a run's ONNX files, proved on the first test clip; their sizes, times and int8's accuracy.
 
         Args:
-            train, test: clips (N, 252).
+            place: where the files go. run_id: of the run, for their metadata. train, test: clips (N, 252).
+
+        Raises:
+            RuntimeError: where ONNX Runtime's numbers are not torch's.
         """
+        place.folder.mkdir(parents=True, exist_ok=True)
         network = GRAPHS[self.graph](model)
-        export(network, run.onnx, run.id)
-        worst = parity(model, run.onnx, test[0])
-        run.write_manifest({"onnx_parity": worst})
+        export(network, place.onnx, run_id)
+        worst = parity(model, place.onnx, test[0])
         if not worst <= TOLERANCE:
             raise RuntimeError(
-                f"{run.onnx}: ONNX Runtime differs from torch by {worst:.2e} (> {TOLERANCE:.0e})"
+                f"{place.onnx}: ONNX Runtime differs from torch by {worst:.2e} (> {TOLERANCE:.0e})"
             )
-        record = latency.measure(run.onnx, self.latency_steps) | latency.size(model, network, run.onnx)
-        record["graph"] = "streaming" if isinstance(network, Stream) else "naive"
+        record = latency.measure(place.onnx, self.latency_steps) | latency.size(model, network, place.onnx)
+        record |= {"graph": "streaming" if isinstance(network, Stream) else "naive", "onnx_parity": worst}
         if self.precision == "int8" and isinstance(network, Stream):
-            record["int8"] = self._int8(network, run.onnx, run.int8, train, test)
+            record["int8"] = self._int8(network, place, train, test)
         return record
 
     def _int8(
-        self, network: Stream, source: Path, path: Path, train: Sequence[Tensor], test: Sequence[Tensor]
+        self, network: Stream, place: Deployed, train: Sequence[Tensor], test: Sequence[Tensor]
     ) -> dict[str, Any]:
         """Write the int8 file beside the float32 one: its accuracy, time and size."""
-        quantise(source, path, network.ends, train)
-        cost = compared(source, path, network.frame, test)
-        return {**cost, **latency.measure(path, self.latency_steps), "onnx_bytes": path.stat().st_size}
+        quantise(place.onnx, place.int8, network.ends, train)
+        cost = compared(place.onnx, place.int8, network.frame, test)
+        measured = latency.measure(place.int8, self.latency_steps)
+        return {**cost, **measured, "onnx_bytes": place.int8.stat().st_size}

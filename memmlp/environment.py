@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import functools
 import hashlib
@@ -14,6 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import memmlp
+
+PACKAGE = Path(memmlp.__file__).parent
+NOT_NUMBERS = ("avatar", "cli", "player", "render", "report", "search", "sweep", "tables")
+"""Folders of the package whose code no result of a run comes from."""
+PATCH = 1_000_000  # characters of changes that are kept with a run, at most
 
 
 def environment() -> dict[str, Any]:
@@ -46,17 +52,50 @@ def _version(package: str) -> str | None:
 @functools.cache
 def _git() -> dict[str, Any] | None:
     """Commit of the checkout that the package lies in and whether it was changed; None when installed."""
-
-    def git(*args: str) -> str:
-        command = ["git", "-C", str(Path(memmlp.__file__).parent), *args]
-        return subprocess.run(command, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
-
     try:
-        git("ls-files", "--error-unmatch", "__init__.py")
-        commit = git("rev-parse", "HEAD")
-        return {"commit": commit, "dirty": bool(git("status", "--porcelain", "--", "."))}
+        _in_git("ls-files", "--error-unmatch", "__init__.py")
+        commit = _in_git("rev-parse", "HEAD")
+        return {"commit": commit, "dirty": bool(_in_git("status", "--porcelain", "--", "."))}
     except (OSError, subprocess.SubprocessError):
         return None
+
+
+def _in_git(*args: str) -> str:
+    """What git says in the package's folder."""
+    command = ["git", "-C", str(PACKAGE), *args]
+    return subprocess.run(command, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
+
+
+def changes() -> str:
+    """A patch from the package's commit to its code as it is, with the names of new files; or nothing."""
+    git = _git()
+    if not git or not git["dirty"]:
+        return ""
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        new = _in_git("ls-files", "--others", "--exclude-standard", "--", ".")
+        listed = "".join(f"# not in the commit: {name}\n" for name in new.splitlines())
+        return (listed + _in_git("diff", "HEAD", "--", ".") + "\n")[:PATCH]
+    return ""
+
+
+@functools.cache
+def sources() -> dict[str, str]:
+    """A digest of the code, without comments and docstrings, of each file that a run's numbers come from."""
+    files = [path for path in sorted(PACKAGE.rglob("*.py")) if _counts(path.relative_to(PACKAGE))]
+    return {path.relative_to(PACKAGE).as_posix(): code_digest(path.read_text("utf-8")) for path in files}
+
+
+def _counts(path: Path) -> bool:
+    return not path.parts[0].startswith("_") and path.parts[0] not in NOT_NUMBERS
+
+
+def code_digest(text: str) -> str:
+    """12 hex digits of Python code, whatever its layout, comments and docstrings."""
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
+            node.body = node.body[1:] or [ast.Pass()]
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12]
 
 
 def _cpu() -> str:

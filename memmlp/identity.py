@@ -1,63 +1,193 @@
-"""The identity of a run: a digest of all that can change its result."""
+"""Identities: a digest of all that can change a result, for each of the stages that results come from.
+
+A **run** is a training (of a VQ-VAE or of a network): its identity is its config, its data, the run that it
+builds upon, and the recipe numbers of the components it uses. An **evaluation** of it (one mode, with or
+without inverse kinematics) and a **deployment** (ONNX, int8, latency) have identities of their own, of what
+can change their result alone. So a new mode, inverse kinematics or precision on a finished run is that
+stage's work and no training. A component is known by its name in the config, never by where its class lies.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from memmlp.files import plain
+from memmlp.recipes import recipes
 
-RECIPE = 1
-"""Part of every identity: raise it when the code's results change for an unchanged config."""
-
-IGNORED = (
+NEUTRAL = (
     "data",  # its digest stands for it: frames, clips, split and rest pose
     "profile",  # sizes, read by the groups that use them
     "paths",
     "tracker",
-    "device",
+    "device",  # recorded, and flagged where runs that are compared differ in it
     "threads",
     "force",
     "save_predictions",
     "optim.checkpoint_every",
     "optim.log_every",
-    "export",  # how long the clock runs
+    "optim.validate_every",
     "hydra",
 )
-"""Config keys that cannot change a run's result, and so are no part of its identity."""
+"""Config keys that change no result of any stage."""
+
+PATHS = ("_target_", "_partial_")
+"""Where a component's class lies; its `name` says what it is."""
+
+EVALUATION = ("evaluation",)
+DEPLOYMENT = ("export",)
+INFERENCE = ("memory.blend", "model.sampling_steps")
+"""Keys of the later stages; those of INFERENCE count for both, and for a training that rolls out."""
+
+SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand")
 
 
-NEUTRAL: Mapping[str, Any] = {
-    "evaluation.ik": "off",
-    "evaluation.ik_iterations": 15,
-}
-"""Keys that came after the first release, with the value that stands for what was before: at it they are no
-part of the identity, so that runs made before them stay known."""
+@dataclass(frozen=True)
+class Identity:
+    """What a run is.
+
+    Attributes:
+        kind: "vqvae" or "memmlp".
+        config: the resolved config; only the keys that change a training's result count.
+        data: digest of the prepared data. upstream: the run whose artifact this one uses.
+    """
+
+    kind: str
+    config: Mapping[str, Any]
+    data: str
+    upstream: Identity | None = None
+
+    @property
+    def recipes(self) -> dict[str, int]:
+        """The recipe numbers of the components that the training uses."""
+        return recipes(list(trained_components(self.kind, self.config)))
+
+    @property
+    def id(self) -> str:
+        """16 hex digits over all that can change the result."""
+        above = self.upstream.id if self.upstream else None
+        return run_id(self.kind, self.config, data=self.data, upstream=above)
+
+    @property
+    def what(self) -> str:
+        """The same less the recipe numbers: equal in runs that differ in the age of their code alone."""
+        above = self.upstream.what if self.upstream else None
+        return _digest(_training(self.kind, self.config, self.data, above))
 
 
 def run_id(kind: str, config: Mapping[str, Any], *, data: str, upstream: str | None) -> str:
-    """The identity of a run: 16 hex digits over all that can change its result.
+    """The identity of a training: 16 hex digits over all that can change its result.
 
     Args:
-        kind: the stage ("vqvae", "memmlp").
-        config: resolved config; IGNORED keys do not count, nor does 1 against 1.0.
+        kind: "vqvae" or "memmlp".
+        config: resolved config; what is neutral or of a later stage does not count, nor does 1 against 1.0.
         data: digest of the prepared data. upstream: id of the run whose artifact this one uses.
     """
-    what = {"recipe": RECIPE, "kind": kind, "config": relevant(config), "data": data, "upstream": upstream}
+    what = _training(kind, config, data, upstream)
+    return _digest(what | {"recipes": recipes(list(trained_components(kind, config)))})
+
+
+def evaluation_id(config: Mapping[str, Any], mode: str) -> str:
+    """The identity of a run's evaluation in a mode: a word and 16 hex digits."""
+    settings = evaluation_settings(config, mode)
+    used = ["metrics", f"mode.{mode}", *([f"ik.{settings['ik']}"] if settings["ik"] != "off" else [])]
+    name = mode if settings["ik"] == "off" else f"{mode}-{settings['ik']}"
+    return f"{name}-{_digest({'settings': settings, 'recipes': recipes(used)})}"
+
+
+def evaluation_settings(config: Mapping[str, Any], mode: str) -> dict[str, Any]:
+    """What an evaluation's result follows from, beside the run and its data."""
+    group = config.get("evaluation", {})
+    ik = group.get("ik", "off")
+    solver = {"ik": ik} | ({"ik_iterations": group.get("ik_iterations")} if ik != "off" else {})
+    return {"mode": mode, **solver, **_inference(config)}
+
+
+def deployment_id(config: Mapping[str, Any]) -> str:
+    """The identity of what a run is shipped as: a word and 16 hex digits."""
+    settings = deployment_settings(config)
+    graph = settings.get("graph", "auto")
+    used = [
+        "export",
+        "latency",
+        *(f"graph.{name}" for name in ("streaming", "naive") if graph in (name, "auto")),
+    ]
+    used += ["int8"] if settings.get("precision") == "int8" else []
+    name = settings.get("precision", "fp32")
+    return f"{name}-{_digest({'settings': settings, 'recipes': recipes(used)})}"
+
+
+def deployment_settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What a deployment's result follows from, beside the run and its data."""
+    return {key: _canonical(value) for key, value in config.get("export", {}).items()} | _inference(config)
+
+
+def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
+    """The components that a training's numbers come from."""
+    yield from ("features", "sampler", "training")
+    if coordinates := config.get("frame", {}).get("coordinates"):
+        yield f"coordinates.{coordinates}"
+    names = {slot: (config.get(slot) or {}).get("name") for slot in SLOTS}
+    yield from (f"{slot}.{name}" for slot, name in names.items() if name)
+    if schedule := config.get("optim", {}).get("schedule"):
+        yield f"schedule.{schedule}"
+    if kind == "vqvae" or names["memory"] == "vq_joint":
+        yield from ("vqvae", f"codebook.{config.get('vqvae', {}).get('codebook')}")
+    if kind == "vqvae":
+        yield "schedule.milestones"
+
+
+def trained_by(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The dotted keys of a config that can change the result of a training."""
+    later = (*EVALUATION, *DEPLOYMENT, *(() if _rolls_out(config) else INFERENCE))
+    out = (*NEUTRAL, *later, *_unused(config))
+    flat = {key: _canonical(value) for key, value in flatten(config).items()}
+    return {key: value for key, value in flat.items() if not _below(key, out) and _leaf(key) not in PATHS}
+
+
+def _training(kind: str, config: Mapping[str, Any], data: str, upstream: str | None) -> dict[str, Any]:
+    return {"kind": kind, "config": trained_by(config), "data": data, "upstream": upstream}
+
+
+def used_as_configured(settings: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
+    """Whether a stage's settings use the network as the run's own config does."""
+    return all(settings.get(key) == value for key, value in _inference(config).items())
+
+
+def _inference(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The keys that act when the network is used, where the network has them."""
+    flat = flatten(config)
+    return {key: _canonical(flat[key]) for key in INFERENCE if key in flat}
+
+
+def _rolls_out(config: Mapping[str, Any]) -> bool:
+    """Whether the training uses the network as it is used live, so that what acts then acts here too."""
+    return (config.get("rollout") or {}).get("name", "teacher_forcing") != "teacher_forcing"
+
+
+def _unused(config: Mapping[str, Any]) -> Iterable[str]:
+    """Keys that nothing reads, given the others."""
+    if config.get("optim", {}).get("schedule", "step") != "step":
+        yield "optim.drop_at"
+    if config.get("vqvae", {}).get("codebook", "ema") != "ema":
+        yield "vqvae.decay"
+
+
+def _below(key: str, names: Iterable[str]) -> bool:
+    """Whether a dotted key is one of some, or below one."""
+    return any(key == name or key.startswith(f"{name}.") for name in names)
+
+
+def _leaf(key: str) -> str:
+    return key.rsplit(".", 1)[-1]
+
+
+def _digest(what: Mapping[str, Any]) -> str:
     text = json.dumps(plain(what), sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def relevant(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The dotted keys of a config that are part of the identity."""
-
-    def counts(key: str) -> bool:
-        return not any(key == ignored or key.startswith(f"{ignored}.") for ignored in IGNORED)
-
-    flat = {key: _canonical(value) for key, value in flatten(config).items() if counts(key)}
-    return {key: value for key, value in flat.items() if key not in NEUTRAL or value != NEUTRAL[key]}
 
 
 def _canonical(value: Any) -> Any:

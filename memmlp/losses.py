@@ -6,12 +6,12 @@ in the world: 6D components, metres, per frame.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor, nn
 
-from memmlp.body import FRAME_DIM, HANDS, LOWER, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
+from memmlp.body import FRAME_DIM, HANDS, LOWER, N_JOINTS, POSITION, ROOT, ROTATION, SPARSE_DIM
 from memmlp.features import Frame, World
 
 Terms = dict[str, Tensor]
@@ -195,44 +195,78 @@ class MotionLoss(Loss):
         return terms
 
 
-class AGRoLLoss(Loss):
-    """Mean squared error of the 6D rotations in network space, where the diffusion model's noise lies too.
+def joint_norms(error: Tensor) -> Tensor:
+    """Mean over frames and joints of the L2 norm of each joint's 6D error, of errors (..., 132)."""
+    return error.unflatten(-1, (N_JOINTS, 6)).norm(dim=-1).mean()
 
-    The L2 of Du et al. 2023 on the denoiser's prediction of the clean motion; their MLP's is taken to be the
-    same (reading).
+
+def mean_square(error: Tensor) -> Tensor:
+    """Mean of the squared components of errors (..., 132)."""
+    return error.square().mean()
+
+
+ERRORS: dict[str, Callable[[Tensor], Tensor]] = {"norm": joint_norms, "square": mean_square}
+
+
+class AGRoLLoss(Loss):
+    """AGRoL's error of the 6D rotations, in network space, where the diffusion model's noise lies too.
+
+    Args:
+        error: "norm", as its released code trains both of its networks (`joint_norms`), or "square", the
+            mean squared error that its paper can be read as (Du et al. 2023, L2).
     """
 
-    def __init__(self):
+    def __init__(self, error: str = "norm"):
         super().__init__()
+        self.error = ERRORS[error]
         self.weighting = Fixed({"rotation": 1.0})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
         """The one term, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
         place = frame.place(sparse)
         error = frame.encode_motion(motion, place) - frame.encode_motion(truth, place)
-        return {"rotation": error[..., ROTATION].square().mean()}
+        return {"rotation": self.error(error[..., ROTATION])}
+
+
+def from_pelvis(positions: Tensor) -> Tensor:
+    """Joint positions (..., 22, 3) less the pelvis' own."""
+    return positions - positions[..., ROOT : ROOT + 1, :]
+
+
+def from_origin(positions: Tensor) -> Tensor:
+    """Joint positions (..., 22, 3) in the world."""
+    return positions
+
+
+ANCHORS: dict[str, Callable[[Tensor], Tensor]] = {"pelvis": from_pelvis, "head": from_origin}
 
 
 class AvatarPoserLoss(Loss):
     """Mean absolute errors of root orientation, local rotations and joint positions (Jiang et al. 2022).
 
-    The positions are by forward kinematics with the head on its tracker (reading).
+    The positions are by forward kinematics, over the 22 joints (its authors' mean is over the fingers too,
+    which move with the wrists).
 
     Args:
-        orientation, rotation, position: weights of the three terms; the paper's are 0.05, 1 and 1.
+        orientation, rotation, position: weights of the three terms. The first is 0.02 in the released code
+            and 0.05 in the paper.
+        anchor: where the compared bodies meet: "pelvis", as in the released code, which knows no
+            translation, or "head", the predicted body's put on its tracker.
     """
 
-    def __init__(self, orientation: float = 0.05, rotation: float = 1.0, position: float = 1.0):
+    def __init__(
+        self, orientation: float = 0.02, rotation: float = 1.0, position: float = 1.0, anchor: str = "pelvis"
+    ):
         super().__init__()
         weights = {"orientation": orientation, "rotation": rotation, "position": position}
-        self.weighting = Fixed(weights)
+        self.weighting, self.anchored = Fixed(weights), ANCHORS[anchor]
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
         """Each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
         error = (motion - truth)[..., ROTATION].abs()
-        position = (frame.pose(motion, sparse) - joints(truth)).abs()
+        position = self.anchored(frame.pose(motion, sparse)) - self.anchored(joints(truth))
         return {
             "orientation": error[..., :6].mean(),
             "rotation": error[..., 6:].mean(),
-            "position": position.mean(),
+            "position": position.abs().mean(),
         }

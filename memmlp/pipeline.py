@@ -1,4 +1,7 @@
-"""A whole experiment: data, VQ-VAE run, motion network's run. Every finished stage is found again."""
+"""A whole experiment: data, VQ-VAE run, motion network's run, its evaluations, its deployment.
+
+Each stage has an identity (memmlp.identity), is found where it was made before, and is made where it was not.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +22,15 @@ from memmlp.data.motion import Motion
 from memmlp.data.prepare import Manifest
 from memmlp.deployment import Deployment
 from memmlp.features import Frame, World
-from memmlp.files import write_json
-from memmlp.identity import run_id
+from memmlp.files import read_json, write_json
+from memmlp.identity import Identity, deployment_id, deployment_settings, evaluation_id, evaluation_settings
 from memmlp.ik import IK
 from memmlp.losses import Loss
 from memmlp.memory import Memory
 from memmlp.model import MemMLP, WindowModel
 from memmlp.predictor import Predictor
 from memmlp.rollout import PersistentStreams, Rollout
-from memmlp.runs import Run
+from memmlp.runs import Run, write_report
 from memmlp.tracking import Tracker, project_safely
 from memmlp.training import MotionTask, Optim, VQVAETask, Watch, train, unwatched
 from memmlp.vqvae import VQVAE
@@ -35,7 +38,6 @@ from memmlp.vqvae import VQVAE
 VALIDATION_PIECE = 240  # frames: validation streams through pieces of clips of 4 s
 PICTURE_FRAMES = 600  # the picture shows the first 10 s of the first test clip
 VQVAE_SETTINGS = ("codes", "width", "encoder_depth", "decoder_depth", "commitment", "decay", "codebook")
-MOTION_ARTIFACTS = ("model.safetensors", "clips.json", "results.json", "step.onnx", "latency.json")
 
 
 @dataclass(frozen=True)
@@ -145,13 +147,34 @@ class Experiment:
     save_predictions: Path | None
     tracker: Tracker
 
+    @property
+    def evaluations(self) -> dict[str, str]:
+        """The identity of the evaluation in each of the modes."""
+        return {mode: evaluation_id(self.config, mode) for mode in self.modes}
+
+    @property
+    def deployed(self) -> str:
+        """The identity of the deployment."""
+        return deployment_id(self.config)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The identities of all that is made of the trained network."""
+        return (*self.evaluations.values(), self.deployed)
+
 
 @dataclass(frozen=True)
 class Outcome:
-    """A run, and whether it was made just now."""
+    """A run as an experiment asks for it.
+
+    Attributes:
+        made: the stages that were made just now: "training", "evaluation", "deployment".
+        results: mode -> branch -> metric, and "latency".
+    """
 
     run: Run
-    fresh: bool
+    made: tuple[str, ...]
+    results: dict[str, Any]
 
 
 def run(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
@@ -161,48 +184,114 @@ def run(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     """
     cache, manifest = experiment.data.prepare()
     upstream = vqvae_run(experiment, cache, manifest) if experiment.architecture.uses_codes else None
-    above = upstream.id if upstream else None
-    run = Run.of(experiment.outputs, motion_id(experiment, manifest.digest))
+    run = Run.of(experiment.outputs, motion_identity(experiment, manifest.digest).id)
     with run.lock():
-        fresh = experiment.force or not run.done
-        if fresh:
-            if experiment.force:
-                run.reset()
-            run.begin("memmlp", experiment.config, data=manifest.digest, upstream=above)
-            motion_run(experiment, run, cache, manifest, upstream, watch)
+        if experiment.force:
+            run.reset()
+        made = []
+        if not run.done:
+            train_run(experiment, run, cache, manifest, upstream, watch)
+            made.append("training")
+        made += finish(experiment, run, cache)
         if experiment.save_predictions is not None:
             model = experiment.architecture.load(run).to(experiment.device)
             save_predictions(experiment, model, cache)
-    if fresh:
+    if made:
         project_safely(experiment.tracker, run)
-    return Outcome(run, fresh)
+    return Outcome(run, tuple(made), results_of(experiment, run))
 
 
-def vqvae_id(experiment: Experiment, data: str) -> str | None:
+def finished(
+    experiment: Experiment, run: Run, cache: Path, again: bool = False
+) -> tuple[dict[str, Any], list[str]]:
+    """What was measured of a trained run as the experiment asks for it, and the stages that were made for it.
+
+    again: evaluate anew what was evaluated before.
+    """
+    with run.lock():
+        if again:
+            evaluate_run(experiment, run, cache, experiment.modes)
+        made = [*(["evaluation"] if again else []), *finish(experiment, run, cache)]
+    if made:
+        project_safely(experiment.tracker, run)
+    return results_of(experiment, run), made
+
+
+def finish(experiment: Experiment, run: Run, cache: Path) -> list[str]:
+    """Make what is missing of a trained run's evaluations and deployment; the names of the stages made."""
+    made = []
+    missing = [mode for mode, identity in experiment.evaluations.items() if not run.has(identity)]
+    if missing:
+        evaluate_run(experiment, run, cache, missing)
+        made.append("evaluation")
+    if not run.has(experiment.deployed):
+        deploy_run(experiment, run, cache)
+        made.append("deployment")
+    return made
+
+
+def results_of(experiment: Experiment, run: Run) -> dict[str, Any]:
+    """What was measured of a run as the experiment asks for it: mode -> branch -> metric, and "latency"."""
+    files = {mode: run.evaluation(name) for mode, name in experiment.evaluations.items() if run.has(name)}
+    latency = read_json(run.deployment(experiment.deployed).latency)
+    means = {mode: read_json(path)["mean"] for mode, path in files.items()}
+    return means | ({"latency": latency} if latency else {})
+
+
+def clip_rows(experiment: Experiment, run: Run) -> list[dict[str, Any]]:
+    """Each test clip's name, frames, and metrics by mode and branch, as the experiment asks for them."""
+    rows: dict[str, dict[str, Any]] = {}
+    for mode, name in experiment.evaluations.items():
+        for clip in read_json(run.evaluation(name))["clips"]:
+            facts = {key: value for key, value in clip.items() if not isinstance(value, dict)}
+            branches = {key: value for key, value in clip.items() if isinstance(value, dict)}
+            rows.setdefault(clip["name"], facts)[mode] = branches
+    return list(rows.values())
+
+
+def vqvae_identity(experiment: Experiment, data: str) -> Identity | None:
     """The identity of the VQ-VAE run that the experiment needs on data of that digest, if it needs one."""
     if not experiment.architecture.uses_codes:
         return None
-    return run_id("vqvae", experiment.vqvae_config, data=data, upstream=None)
+    return Identity("vqvae", experiment.vqvae_config, data)
 
 
-def motion_id(experiment: Experiment, data: str) -> str:
+def motion_identity(experiment: Experiment, data: str) -> Identity:
     """The identity of the experiment's run on data of that digest."""
     # A frozen VQ-VAE's own identity stands for its config; a joint one is not trained by that stage's keys.
     own = {key: value for key, value in experiment.config.items() if key != "vqvae"}
     if experiment.architecture.trains_codes:
         own["vqvae"] = {key: experiment.config["vqvae"][key] for key in VQVAE_SETTINGS}
-    return run_id("memmlp", own, data=data, upstream=vqvae_id(experiment, data))
+    return Identity("memmlp", own, data, vqvae_identity(experiment, data))
+
+
+def begin(experiment: Experiment, run: Run, identity: Identity, config: dict[str, Any]) -> None:
+    """Begin a training: its config, and in its manifest what it is and what it runs on."""
+    above = identity.upstream.id if identity.upstream else None
+    facts = {"recipes": identity.recipes, "what": identity.what, **machine(experiment)}
+    run.begin(identity.kind, config, data=identity.data, upstream=above, **facts)
+
+
+def machine(experiment: Experiment) -> dict[str, Any]:
+    """What can change the last digits of a result: device, graphics processor, threads, precision."""
+    cuda = experiment.device.type == "cuda"
+    return {
+        "device": str(experiment.device),
+        "gpu": torch.cuda.get_device_name(experiment.device) if cuda else None,
+        "threads": torch.get_num_threads(),
+        "precision": experiment.optim.precision,
+    }
 
 
 def vqvae_run(experiment: Experiment, cache: Path, manifest: Manifest) -> Run:
     """The finished run of the VQ-VAE that this configuration needs, trained where it is missing."""
-    identity = vqvae_id(experiment, manifest.digest)
+    identity = vqvae_identity(experiment, manifest.digest)
     assert identity is not None
-    run = Run.of(experiment.outputs, identity)
+    run = Run.of(experiment.outputs, identity.id)
     with run.lock():
         if run.done:
             return run
-        run.begin("vqvae", experiment.vqvae_config, data=manifest.digest, upstream=None)
+        begin(experiment, run, identity, experiment.vqvae_config)
         started = time.monotonic()
         frames, validation = (Frames.open(cache, split).to(experiment.device) for split in ("train", "val"))
         torch.manual_seed(experiment.vqvae_seed)
@@ -212,7 +301,7 @@ def vqvae_run(experiment: Experiment, cache: Path, manifest: Manifest) -> Run:
         train(task, experiment.vqvae_optim, run, experiment.vqvae_seed, "VQ-VAE")
         checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
         write_json(run.results_path, {"val": task.validate()})
-        run.write_manifest({"seconds": round(time.monotonic() - started, 1)})
+        run.write_manifest({"seconds": {"train": round(time.monotonic() - started, 1)}})
         run.finish(("model.safetensors", "results.json"))
     project_safely(experiment.tracker, run)
     return run
@@ -225,29 +314,51 @@ def load_vqvae(architecture: Architecture, run: Run) -> VQVAE:
     return model.eval()
 
 
-def motion_run(
+def train_run(
     experiment: Experiment, run: Run, cache: Path, manifest: Manifest, upstream: Run | None, watch: Watch
 ) -> None:
-    """Train, evaluate, export and time one network, and mark its run as done."""
-    seconds: dict[str, float] = {}
+    """Train one network, and mark its run as done."""
+    begin(experiment, run, motion_identity(experiment, manifest.digest), experiment.config)
     started = time.monotonic()
     model = trained(experiment, run, cache, manifest, upstream, watch)
     checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
-    seconds["train"], started = time.monotonic() - started, time.monotonic()
-    test = Frames.open(cache, "test")
-    results = evaluation.evaluate(
-        model, test.to(experiment.device), experiment.modes, experiment.evaluation_batch, experiment.ik
-    )
-    write_json(run.clips, results["clips"])
-    picture(model, test, run)
-    seconds["evaluate"], started = time.monotonic() - started, time.monotonic()
-    train = Frames.open(cache, "train").clips()
-    measured = experiment.deployment.ship(model, run, train, test.clips())
-    write_json(run.latency, measured)
-    seconds["export"] = time.monotonic() - started
-    write_json(run.results_path, {**results["mean"], "latency": measured})
-    run.write_manifest({"seconds": {name: round(value, 1) for name, value in seconds.items()}})
-    run.finish([*MOTION_ARTIFACTS, *(["step.int8.onnx"] if run.int8.exists() else [])])
+    note_seconds(run, "train", started)
+    run.finish(("model.safetensors",))
+
+
+def evaluate_run(experiment: Experiment, run: Run, cache: Path, modes: Sequence[str]) -> None:
+    """Evaluate a trained run in some modes, each a file that is there whole or not at all."""
+    run.attempt("evaluation")
+    started = time.monotonic()
+    model = experiment.architecture.load(run).to(experiment.device)
+    test = Frames.open(cache, "test").to(experiment.device)
+    for mode in modes:
+        found = evaluation.evaluate(model, test, [mode], experiment.evaluation_batch, experiment.ik)
+        rows = [{key: row[key] for key in ("name", "frames")} | row[mode] for row in found["clips"]]
+        report = {"mode": mode, "settings": evaluation_settings(experiment.config, mode)}
+        report |= {"mean": found["mean"][mode], "clips": rows, **machine(experiment)}
+        write_report(run.evaluation(experiment.evaluations[mode]), report)
+    if not (run.folder / "poses.png").exists():
+        picture(model, test, run)
+    note_seconds(run, "evaluate", started)
+
+
+def deploy_run(experiment: Experiment, run: Run, cache: Path) -> None:
+    """Export a trained run, prove the file, and time it."""
+    run.attempt("deployment")
+    started = time.monotonic()
+    model = experiment.architecture.load(run)
+    clips = [Frames.open(cache, split).clips() for split in ("train", "test")]
+    place = run.deployment(experiment.deployed)
+    record = experiment.deployment.ship(model, place, run.id, *clips)
+    place.finish({"settings": deployment_settings(experiment.config), **record})
+    note_seconds(run, "export", started)
+
+
+def note_seconds(run: Run, stage: str, started: float) -> None:
+    """Add to the manifest how long a stage took, since a time of the monotonic clock."""
+    seconds = run.manifest.get("seconds") or {}
+    run.write_manifest({"seconds": {**seconds, stage: round(time.monotonic() - started, 1)}})
 
 
 def trained(

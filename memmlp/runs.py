@@ -1,8 +1,13 @@
-"""Run folders: lock, manifest, metrics log, completion. The folder is the truth; nothing else is."""
+"""Run folders: lock, manifest, metrics log, completion. The folder is the truth; nothing else is.
+
+A run is done when it is trained. What was evaluated and shipped of it lies below its folder, a file or folder
+for each evaluation and deployment, named by its identity, there whole or not at all.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import re
@@ -17,10 +22,10 @@ from typing import Any, NamedTuple
 import yaml
 from filelock import FileLock, Timeout
 
-from memmlp.environment import environment, host
+from memmlp.environment import changes, environment, host, sources
 from memmlp.errors import InputError
 from memmlp.files import atomic_write, file_digest, plain, read_json, sync_folder, write_json
-from memmlp.identity import RECIPE, flatten
+from memmlp.identity import flatten, used_as_configured
 
 HEARTBEAT = 5.0  # seconds between signs of life of a run's process
 STALE = 60.0  # seconds without one after which a process on another machine counts as dead
@@ -49,28 +54,70 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
+class Deployed:
+    """What a run was shipped as: a folder runs/<id>/deployments/<identity>/.
+
+    Attributes:
+        onnx, int8, latency: its files; the last one is written last, and says what was measured.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.onnx = folder / "step.onnx"
+        self.int8 = folder / "step.int8.onnx"
+        self.latency = folder / "latency.json"
+
+    @property
+    def done(self) -> bool:
+        """Whether all of it is there."""
+        return self.latency.is_file()
+
+    def finish(self, record: Mapping[str, Any]) -> None:
+        """Write what was measured, with the digests of the files: the sign that all of it is there."""
+        artifacts = {path.name: file_digest(path) for path in (self.onnx, self.int8) if path.exists()}
+        made = {"made": now(), "made_by": environment(), "artifacts": artifacts}
+        write_json(self.latency, {**record, **made})
+
+    @property
+    def made(self) -> str:
+        """When."""
+        return str(read_json(self.latency).get("made", ""))
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What was asked for."""
+        return dict(read_json(self.latency).get("settings", {}))
+
+    @property
+    def prefers_int8(self) -> bool:
+        """Whether its int8 file is as accurate as the other one."""
+        return self.int8.exists() and bool(read_json(self.latency).get("int8", {}).get("default"))
+
+
 class Run:
     """A folder outputs/runs/<id>/.
 
     Attributes:
         folder: the folder; `id` is its name.
-        config_path, manifest_path, metrics_path, results_path, checkpoint, model, clips, onnx, latency,
-            marker: its files; `config`, `manifest`, `metrics()` and `results` are what the first four hold.
+        config_path, manifest_path, metrics_path, results_path, checkpoint, model, marker: its files;
+            `config`, `manifest` and `metrics()` are what the first three hold.
+        evaluations, deployments: the folders of what was made of the trained network.
     """
 
     FILES = (
         "config.yaml",
         "manifest.json",
+        "code.patch",
         "metrics.jsonl",
         "checkpoint.safetensors",
         "model.safetensors",
-        "clips.json",
         "results.json",
-        "step.onnx",
-        "step.int8.onnx",
-        "latency.json",
         "poses.png",
         "FAILED",
+        "evaluations/*.json",
+        "deployments/*/step.onnx",
+        "deployments/*/step.int8.onnx",
+        "deployments/*/latency.json",
     )
 
     def __init__(self, folder: Path | str):
@@ -81,11 +128,9 @@ class Run:
         self.metrics_path = self.folder / "metrics.jsonl"
         self.checkpoint = self.folder / "checkpoint.safetensors"
         self.model = self.folder / "model.safetensors"
-        self.clips = self.folder / "clips.json"
         self.results_path = self.folder / "results.json"
-        self.onnx = self.folder / "step.onnx"
-        self.int8 = self.folder / "step.int8.onnx"
-        self.latency = self.folder / "latency.json"
+        self.evaluations = self.folder / "evaluations"
+        self.deployments = self.folder / "deployments"
         self.marker = self.folder / "DONE"
         self._repaired = False
 
@@ -94,11 +139,37 @@ class Run:
         """The run of that id below an outputs folder, whether it exists or not."""
         return cls(Path(outputs) / "runs" / run_id)
 
+    def evaluation(self, identity: str) -> Path:
+        """The file of an evaluation, whether it was made or not."""
+        return self.evaluations / f"{identity}.json"
+
+    def deployment(self, identity: str) -> Deployed:
+        """The folder of a deployment, whether it was made or not."""
+        return Deployed(self.deployments / identity)
+
+    def has(self, stage: str) -> bool:
+        """Whether the evaluation or deployment of that identity was made."""
+        return self.evaluation(stage).is_file() or self.deployment(stage).done
+
+    @property
+    def shipped(self) -> Deployed:
+        """The deployment to use, of those with the run's own settings: one whose int8 is as accurate, or the
+        last one.
+        """
+        made = [Deployed(path.parent) for path in self.deployments.glob("*/latency.json")]
+        own = [one for one in made if used_as_configured(one.settings, self.config)]
+        best = max(own, key=lambda one: (one.prefers_int8, one.made), default=None)
+        return best or Deployed(self.deployments / "none")
+
     @property
     def deployed(self) -> Path:
         """The ONNX file to use: in int8 where the run has one that is as accurate (`export.precision`)."""
-        record = read_json(self.latency) if self.int8.exists() else {}
-        return self.int8 if record.get("int8", {}).get("default") else self.onnx
+        return self.shipped.int8 if self.shipped.prefers_int8 else self.shipped.onnx
+
+    @property
+    def onnx(self) -> Path:
+        """The float32 ONNX file of the deployment to use."""
+        return self.shipped.onnx
 
     def __repr__(self) -> str:
         return f"Run({str(self.folder)!r})"
@@ -147,7 +218,11 @@ class Run:
     @property
     def status(self) -> str:
         """One of: done, failed, running (a process is at it), lost (its process died), stopped, new."""
-        if self.done:
+        return self.state(self.done)
+
+    def state(self, complete: bool) -> str:
+        """The status of work on the run that is complete or not."""
+        if complete:
             return "done"
         holder = read_json(self.folder / ".holder")
         if holder:
@@ -174,17 +249,30 @@ class Run:
             self.write_manifest({"forgiven": len(attempts)})
         (self.folder / "FAILED").unlink(missing_ok=True)
 
-    def begin(self, kind: str, config: Mapping[str, Any], *, data: str, upstream: str | None) -> None:
-        """Write config.yaml and the manifest of a run that starts or resumes."""
+    def begin(
+        self, kind: str, config: Mapping[str, Any], *, data: str, upstream: str | None, **facts: Any
+    ) -> None:
+        """Write config.yaml and the manifest of a run that starts or resumes.
+
+        The patch of code that was changed since its commit is kept beside them.
+
+        Args:
+            facts: further entries of the manifest: recipes, device, threads, ...
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
         atomic_write(self.config_path, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
+        if patch := changes():
+            atomic_write(self.folder / "code.patch", patch)
+        identity = {"id": self.id, "kind": kind, "data": data, "upstream": upstream, **facts}
+        self.attempt("training")
+        times = {"started": self.manifest.get("started", now()), "finished": None}
+        self.write_manifest(identity | times | environment() | {"sources": sources()})
+
+    def attempt(self, stage: str) -> None:
+        """Note that a process is at a stage of the run."""
         self.retry()
-        started = self.manifest.get("started", now())
-        attempt = {"started": now(), "pid": os.getpid(), "host": host(), "step": self.step}
-        attempts = [*self.manifest.get("attempts", []), attempt]
-        identity = {"id": self.id, "kind": kind, "data": data, "upstream": upstream, "recipe": RECIPE}
-        times = {"started": started, "finished": None, "attempts": attempts}
-        self.write_manifest(identity | times | environment())
+        begun = {"started": now(), "pid": os.getpid(), "host": host(), "step": self.step, "stage": stage}
+        self.write_manifest({"attempts": [*self.manifest.get("attempts", []), begun]})
 
     def write_manifest(self, fields: Mapping[str, Any]) -> None:
         """Add fields to the manifest, or replace them."""
@@ -208,8 +296,25 @@ class Run:
 
     @property
     def results(self) -> dict[str, Any]:
-        """The results; empty before the evaluation."""
-        return read_json(self.results_path)
+        """What was measured with the run's own settings: mode -> branch -> metric, "latency"; of a VQ-VAE its
+        own results.
+
+        Where a branch was evaluated by inverse kinematics of several lengths, the last one counts; tables ask
+        for theirs by its identity.
+        """
+        found, config = read_json(self.results_path), self.config
+        reports = [read_json(path) for path in self.evaluations.glob("*.json")]
+        own = [report for report in reports if used_as_configured(report["settings"], config)]
+        for report in sorted(own, key=lambda report: report["made"]):
+            found[report["mode"]] = {**found.get(report["mode"], {}), **report["mean"]}
+        latency = read_json(self.shipped.latency)
+        return found | ({"latency": latency} if latency else {})
+
+    @property
+    def changed_sources(self) -> list[str]:
+        """The package's files whose code is not what the run was made by; none if that is unknown."""
+        before = self.manifest.get("sources", {})
+        return sorted(name for name, digest in sources().items() if before and before.get(name) != digest)
 
     def log(self, step: int, values: Mapping[str, float], phase: str = "train") -> None:
         """Append one line to the metrics, in one write: a kill tears at most that line."""
@@ -263,8 +368,14 @@ class Run:
 
     def verify(self) -> list[str]:
         """The artifacts of a finished run that are missing or changed since."""
-        artifacts = read_json(self.marker).get("artifacts", {})
-        return [name for name, digest in artifacts.items() if not self._same(name, digest)]
+        artifacts = dict(read_json(self.marker).get("artifacts", {}))
+        for latency in sorted(self.deployments.glob("*/latency.json")):
+            where = latency.parent.relative_to(self.folder)
+            made = read_json(latency).get("artifacts", {})
+            artifacts |= {str(where / name): digest for name, digest in made.items()}
+        changed = [name for name, digest in artifacts.items() if not self._same(name, digest)]
+        reports = sorted(self.evaluations.glob("*.json"))
+        return changed + [str(path.relative_to(self.folder)) for path in reports if not intact(path)]
 
     def _same(self, name: str, digest: str) -> bool:
         path = self.folder / name
@@ -277,9 +388,30 @@ class Run:
         self.marker.unlink(missing_ok=True)
         sync_folder(self.folder)
         for name in (*self.FILES, self.marker.name):
-            for path in (self.folder / name, *self.folder.glob(f".{name}.*.tmp")):
+            temporary = str(Path(name).with_name(f".{Path(name).name}.*.tmp"))
+            for path in (*self.folder.glob(name), *self.folder.glob(temporary)):
                 path.unlink(missing_ok=True)
+        for folder in (*self.deployments.glob("*/"), self.evaluations, self.deployments):
+            with contextlib.suppress(OSError):  # there is none, or there are files of the user's
+                folder.rmdir()
         sync_folder(self.folder)
+
+
+def write_report(path: Path, report: Mapping[str, Any]) -> None:
+    """Write the file of an evaluation: what was measured, when, by what, and its digest."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = plain({**report, "made": now(), "made_by": environment()})
+    write_json(path, content | {"digest": _content_digest(content)})
+
+
+def intact(path: Path) -> bool:
+    """Whether the file of an evaluation is as it was written."""
+    content = read_json(path)
+    return content.pop("digest", None) == _content_digest(content)
+
+
+def _content_digest(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _beat(holder: Path, ended: threading.Event) -> None:

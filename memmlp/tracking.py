@@ -60,7 +60,7 @@ class MLflowTracker:
     """
 
     EXPERIMENT = "memmlp"
-    ARTIFACTS = ("config.yaml", "results.json", "latency.json", "step.onnx", "poses.png")
+    ARTIFACTS = ("config.yaml", "results.json", "poses.png")
     PARAM_LENGTH = 6000  # MLflow's limits
     PARAMS, METRICS = 100, 1000
 
@@ -78,9 +78,9 @@ class MLflowTracker:
             name = self._mlflow_run(client, self._experiment(client), run)
             self._params(client, name, run)
             self._metrics(client, name, run)
-            for artifact in self.ARTIFACTS:
-                if (run.folder / artifact).is_file():
-                    client.log_artifact(name, str(run.folder / artifact))
+            files = [*(run.folder / artifact for artifact in self.ARTIFACTS), run.onnx, run.shipped.latency]
+            for path in filter(Path.is_file, files):
+                client.log_artifact(name, str(path))
             if run.done:
                 client.set_terminated(name, "FINISHED", _milliseconds(run.manifest["finished"]))
 

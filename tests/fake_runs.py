@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from memmlp.runs import Run
+from memmlp.runs import Run, write_report
 from memmlp.sweep.spec import Arm, Sweep
 from memmlp.tables.collect import MODES, collect, finished
 from memmlp.tables.effects import Runs
@@ -27,7 +27,7 @@ CLIPS = (*(f"salsa/{number:02}" for number in range(1, 11)), "kicks/01", "kicks/
 ORIGIN = {
     "version": "0.3.0", "git": {"commit": "0123456789abcdef", "dirty": False}, "data": "d" * 64,
     "cpu": "A processor", "cores": 2, "host": "h" * 12, "packages": {"torch": "2.0.0"}, "device": "cpu",
-    "threads": 1, "precision": "fp32", "recipes": {"memory": 1}, "body": "built-in",
+    "threads": 1, "precision": "fp32", "recipes": {"memory": 1}, "body": "builtin",
 }  # fmt: skip
 
 
@@ -53,18 +53,24 @@ def fake_run(
         "median_ms": 0.8 * factor, "p95_ms": 1.1 * factor, "ratio_to_reference": 0.6, "parameters": 356_798,
         "macs": 13_000_000, "flops": 26_000_000, "onnx_bytes": 1_900_000,
     }  # fmt: skip
-    means = {mode: _means([row[mode] for row in rows]) for mode in ("window", "stream")}
     manifest = {"id": run.id, "kind": "memmlp", "seconds": {"train": 300.0, "evaluate": 20.0}, **ORIGIN}
     manifest |= {"started": "2026-01-02T03:04:05+00:00", **(origin or {})}
     files = {
-        run.clips: rows,
-        run.results_path: means | {"latency": latency},
         run.manifest_path: manifest,
         run.config_path: {"seed": seed, "memory": {"layers": [2, 4]}, **(config or {})},
-        run.marker: {"id": run.id, "artifacts": {"results.json": "0"}},
+        run.marker: {"id": run.id, "artifacts": {}},
+        run.deployment("fp32-0").latency: latency | {"made": "2026"},
     }
     for path, content in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(content))
+    for mode in ("window", "stream"):
+        clips_of_mode = [
+            {key: row[key] for key in ("name", "frames", "group") if key in row} | row[mode] for row in rows
+        ]
+        mean = _means([row[mode] for row in rows])
+        report = {"mode": mode, "settings": {}, "mean": mean, "clips": clips_of_mode}
+        write_report(run.evaluation(f"{mode}-0"), report)
     if log:
         _log(run, factor)
     return run

@@ -81,10 +81,10 @@ def test_page_has_every_table_and_figure(chapters: list[Chapter], text: str):
         )
     assert text.count("<figure>") == text.count("</svg>") == 3 + 1 + 4  # effects, accuracy, training
     runs = {run.id for chapter in chapters for found in chapter.runs.values() for run in found.values()}
-    assert len(runs) == 12 + 9 + 12 + 5
+    assert len(runs) == 15 + 9 + 12 + 5
     for run in runs:
         assert text.count(f"<code>{run}</code>") == 2  # latency and runs
-    assert "Generated today, code 0123456, 38 finished runs" in text
+    assert "Generated today, code 0123456, 41 finished runs" in text
     assert "nothing measured: data.root" in text
 
 

@@ -8,7 +8,7 @@ import tiny
 import torch
 
 from memmlp import evaluation, latency, pipeline
-from memmlp.body import MOTION_DIM, ROTATION, SPARSE_DIM
+from memmlp.body import MOTION_DIM, PARENTS, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.cli.build import build_experiment, config_of
 from memmlp.cli.train import composed
 from memmlp.errors import InputError
@@ -258,26 +258,73 @@ def test_the_encoder_layer_is_torchs():
     torch.testing.assert_close(layer(h.transpose(0, 1)), torchs(h).transpose(0, 1), atol=1e-5, rtol=0)
 
 
-def test_losses_are_the_papers():
-    motion, truth = (
-        torch.randn(2, 3, MOTION_DIM, generator=torch.Generator().manual_seed(i)) for i in (1, 2)
-    )
-    sparse, frame = SPARSE[:, :3].expand(2, -1, -1), tiny.frame(World())
-    difference = (motion - truth)[..., ROTATION].numpy()
-    scaled = difference / frame.std[SPARSE_DIM:][ROTATION].numpy()
-    loss, terms = AGRoLLoss()(motion, truth, sparse, frame)
-    assert float(loss) == pytest.approx(np.mean(scaled**2), rel=1e-4)
+DRAWN = [torch.randn(2, 3, MOTION_DIM, generator=torch.Generator().manual_seed(i)) for i in (1, 2)]
+
+
+@pytest.mark.parametrize("error", ["norm", "square"])
+def test_agrols_loss_is_that_of_its_code_or_of_its_paper(error):
+    """The mean over frames and joints of each joint's L2 norm, or the mean of squares, in network space."""
+    (motion, truth), frame = DRAWN, tiny.frame(World())
+    loss, terms = AGRoLLoss(error)(motion, truth, SPARSE[:, :3].expand(2, -1, -1), frame)
+    scaled = (motion - truth)[..., ROTATION].numpy() / frame.std[SPARSE_DIM:][ROTATION].numpy()
+    norms = [np.sqrt((scaled[b, t, 6 * j : 6 * j + 6] ** 2).sum()) for b, t, j in np.ndindex(2, 3, 22)]
+    expected = {"norm": np.mean(norms), "square": np.mean(scaled**2)}
+    assert float(loss) == pytest.approx(expected[error], rel=1e-4)
     assert set(terms) == {"rotation"}
-    weights = {"orientation": 0.05, "rotation": 1.0, "position": 1.0}
-    loss, terms = AvatarPoserLoss()(motion, truth, sparse, frame)
-    position = frame.pose(motion, sparse).flatten(2).numpy() - truth[..., ROTATION.stop :].numpy()
+    assert float(AGRoLLoss()(motion, truth, SPARSE[:, :3].expand(2, -1, -1), frame)[0]) == pytest.approx(
+        expected["norm"], rel=1e-4
+    )
+
+
+@pytest.mark.parametrize("anchor", ["pelvis", "head"])
+def test_avatar_posers_loss_compares_bodies_at_the_pelvis_or_at_the_tracker(anchor):
+    """Joint by joint down the tree, in NumPy; by default as its released code has it."""
+    (motion, truth), frame = DRAWN, tiny.frame(World())
+    sparse = SPARSE[:, :3].expand(2, -1, -1)
+    loss, terms = AvatarPoserLoss(anchor=anchor)(motion, truth, sparse, frame)
+    difference = (motion - truth)[..., ROTATION].numpy()
+    errors = []
+    for b, t in np.ndindex(2, 3):
+        body = posed(motion[b, t, ROTATION].numpy())
+        true = truth[b, t, ROTATION.stop :].numpy().reshape(22, 3)
+        head = sparse[b, t, SPARSE_POSITION][:3].numpy()
+        pair = {"pelvis": (body, true - true[0]), "head": (body + head - body[15], true)}
+        errors.append(np.abs(pair[anchor][0] - pair[anchor][1]))
     expected = {
         "orientation": np.abs(difference[..., :6]).mean(),
         "rotation": np.abs(difference[..., 6:]).mean(),
-        "position": np.abs(position).mean(),
+        "position": np.mean(errors),
     }
     assert {name: float(term) for name, term in terms.items()} == pytest.approx(expected, rel=1e-4)
+    weights = {"orientation": 0.02, "rotation": 1.0, "position": 1.0}
     assert float(loss) == pytest.approx(sum(weights[name] * expected[name] for name in weights), rel=1e-4)
+    assert (float(AvatarPoserLoss()(motion, truth, sparse, frame)[0]) == float(loss)) == (anchor == "pelvis")
+
+
+def posed(rotation: np.ndarray) -> np.ndarray:
+    """Joints (22, 3) of local 6D rotations (132,), the pelvis at the origin."""
+    turns, places = [], []
+    for joint, sixd in enumerate(rotation.reshape(22, 2, 3).astype(np.float64)):
+        x = sixd[0] / np.linalg.norm(sixd[0])
+        y = sixd[1] - (x @ sixd[1]) * x
+        y /= np.linalg.norm(y)
+        local, parent = np.stack([x, y, np.cross(x, y)], 1), PARENTS[joint]
+        rest = tiny.REST.numpy()
+        turns.append(local if parent < 0 else turns[parent] @ local)
+        places.append(
+            np.zeros(3) if parent < 0 else places[parent] + turns[parent] @ (rest[joint] - rest[parent])
+        )
+    return np.array(places)
+
+
+def test_reference_networks_see_what_their_authors_give_them():
+    """World coordinates, and z-scores of the diffusion model alone; what is asked for wins."""
+    features = {name: tuple(composed([f"model={name}"]).frame.values()) for name in NAMES}
+    raw = ("world", False)
+    assert features == {"agrol_mlp": raw, "avatar_poser": raw, "agrol_diffusion": ("world", True)}
+    asked = composed(["model=agrol_mlp", "frame.coordinates=heading", "frame.normalize=true"]).frame
+    assert tuple(asked.values()) == ("heading", True)
+    assert tuple(composed([]).frame.values()) == ("heading", True)
 
 
 def test_avatar_posers_loss_on_positions_reaches_the_rotations():
@@ -367,7 +414,14 @@ REFUSED = [
     (["model=avatar_poser", "model.heads=7"], "model.heads"),
     (["model=agrol_diffusion", "model.sampling_steps=2000"], "model.sampling_steps"),
     (["model=agrol_diffusion", "model.diffusion_steps=0"], "model.diffusion_steps"),
-    (["loss=agrol"], "loss"),
+    (["loss=agrol"], "predictor=rotation_only with hand=off"),
+    (["loss=agrol", "predictor=rotation_only", "hand=fk"], "predictor=rotation_only with hand=off"),
+    (
+        ["loss=avatar_poser", "predictor=rotation_only", "hand=off"],
+        "allowed is loss=uncertainty or loss=manual",
+    ),
+    (["model=agrol_mlp", "loss.error=cube"], "loss.error=cube"),
+    (["model=avatar_poser", "loss.anchor=foot"], "loss.anchor=foot"),
 ]
 
 

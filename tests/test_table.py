@@ -17,7 +17,7 @@ from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, runs_of, table_of
 from rich.console import Console
 
 from memmlp.errors import InputError
-from memmlp.runs import Run
+from memmlp.runs import Run, write_report
 from memmlp.statistics import Verdict, holm, paired_effects
 from memmlp.sweep.spec import Sweep, load_sweep, parse_sweep
 from memmlp.tables.collect import collect, without_runs
@@ -66,12 +66,13 @@ def printed(table: Table, width: int) -> str:
 
 
 def test_mean_and_sd_over_seeds(sweep: Sweep, table: Table, tmp_path: Path):
-    values = [Run.of(tmp_path, run.name).results for run in (tmp_path / "runs").iterdir()]
-    mine = [
-        results["window"]["rotation"]["MPJPE"]
-        for run, results in zip((tmp_path / "runs").iterdir(), values, strict=True)
-        if Run(run).config["overrides"] == ["memory=none"]
+    runs = [Run(folder) for folder in (tmp_path / "runs").iterdir()]
+    reports = [
+        json.loads(run.evaluation("window-0").read_text())
+        for run in runs
+        if run.config["overrides"] == ["memory=none"]
     ]
+    mine = [report["mean"]["rotation"]["MPJPE"] for report in reports]
     found = cell(table, "no | memory", "MPJPE", "window")
     assert sorted(found.values.values()) == sorted(mine)
     assert found.mean == pytest.approx(np.mean(mine))
@@ -291,9 +292,10 @@ def test_a_clip_that_is_no_number_is_left_out(sweep: Sweep, tmp_path: Path):
     find = fake_sweep(tmp_path, sweep)
     run = find(sweep.arms[3], 1)
     assert run is not None
-    rows = json.loads(run.clips.read_text())
-    rows[0]["stream"]["rotation"]["Jitter"] = "nan"
-    run.clips.write_text(json.dumps(rows))
+    path = run.evaluation("stream-0")
+    report = json.loads(path.read_text())
+    report["clips"][0]["rotation"]["Jitter"] = "nan"
+    write_report(path, {key: report[key] for key in ("mode", "mean", "clips")})
     table = table_of(sweep, find)
     assert [cell(table, "no | memory", metric).effect.clips for metric in ("Jitter", "MPJPE")] == [11, 12]
 
@@ -367,7 +369,7 @@ def test_one_group_of_clips_is_said_and_starred_by_nobody(sweep: Sweep, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("number", "body", "flagged"), [(1, "built-in", 1), (1, "SMPL-H", 0), (4, "built-in", 0)]
+    ("number", "body", "flagged"), [(1, "builtin", 1), (1, "SMPL-H", 0), (4, "builtin", 0)]
 )
 def test_the_built_in_body_beside_smplh_numbers(
     sweep: Sweep, tmp_path: Path, number: int, body: str, flagged: int
@@ -390,20 +392,30 @@ def test_damaged_results_are_one_line(tmp_path: Path, sweep: Sweep):
     find = fake_sweep(tmp_path, sweep)
     run = find(sweep.arms[3], 1)
     assert run is not None
-    for text in ("[{", "[5]"):
-        run.clips.write_text(text)
-        with pytest.raises(InputError, match=re.escape(str(run.clips))):
+    for text in ("[{", "[5]", "{}"):
+        run.evaluation("stream-0").write_text(text)
+        with pytest.raises(InputError, match=re.escape(str(run.evaluation("stream-0")))):
             table_of(sweep, find)
 
 
 def test_costs_that_are_no_numbers_are_left_out(tmp_path: Path):
     run = fake_run(tmp_path, "a")
-    results = json.loads(run.results_path.read_text())
-    results["latency"]["flops"] = "nan"
-    run.results_path.write_text(json.dumps(results))
+    path = run.deployment("fp32-0").latency
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"flops": "nan"}))
     costs = load(run.folder).costs
     assert "FLOPs" not in costs
     assert "parameters" in costs
+
+
+def test_the_evaluations_of_a_table_are_its_own(tmp_path: Path):
+    """Of two evaluations of one mode each table has the one it asks for."""
+    run = fake_run(tmp_path, "a")
+    report = json.loads(run.evaluation("stream-0").read_text())
+    other = {"mode": "stream", "mean": {"combined": {"MPJPE": 1.0}}, "clips": report["clips"]}
+    write_report(run.evaluation("stream-1"), other)
+    assert load(run.folder, ["stream-0"]).value("stream", "combined", "MPJPE") != 1.0
+    assert load(run.folder, ["stream-1"]).value("stream", "combined", "MPJPE") == 1.0
+    assert load(run.folder, ["stream-1"]).value("stream", "rotation", "MPJPE") is None
 
 
 def test_only_costs_need_one_block(tmp_path: Path):
@@ -443,7 +455,7 @@ def test_shipped_tables_fit_the_screen(tmp_path: Path, path: Path, width: int):
         assert arm.label.split()[0] in text
         for value in (arm.paper or {}).values():
             assert f"{value:.1f}" in text or f"{value:.2f}" in text
-    assert text.count("3/3") + text.count("1/1") >= len(sweep.runnable())
+    assert text.count(f"{len(sweep.seeds)}/{len(sweep.seeds)}") >= len(sweep.runnable())
 
 
 def test_screen_shows_everything_of_an_arm(table: Table):

@@ -8,14 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra.utils import get_class, instantiate
+from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from memmlp import pipeline
 from memmlp.body import builtin_rest_joints
+from memmlp.cli.components import built
 from memmlp.cli.motion import build_motion
 from memmlp.cli.report import show
-from memmlp.cli.schema import Config, check
+from memmlp.cli.schema import check, restored
 from memmlp.deployment import Deployment
 from memmlp.errors import InputError
 from memmlp.features import Frame, Heading, HeadRelative, World
@@ -53,9 +55,9 @@ def build_experiment(cfg: DictConfig) -> pipeline.Experiment:
         architecture=build_architecture(cfg),
         vqvae_config={"frame": config["frame"], "vqvae": config["vqvae"]},
         vqvae_optim=build_vqvae_optim(cfg),
-        vqvae_seed=0,
+        vqvae_seed=cfg.vqvae.seed,
         loss=build_loss(cfg),
-        rollout=instantiate(cfg.rollout),
+        rollout=built(cfg.rollout),
         optim=Optim(**config["optim"]),
         modes=list(cfg.evaluation.modes),
         evaluation_batch=cfg.evaluation.batch,
@@ -80,7 +82,7 @@ def untrained(overrides: Sequence[str]) -> WindowModel:
 def build_tracker(cfg: DictConfig) -> Tracker:
     """What shows the config's runs elsewhere."""
     places = {"outputs": Path(cfg.paths.outputs)} if "uri" in cfg.tracker else {}
-    return instantiate(cfg.tracker, **places)
+    return built(cfg.tracker, **places)
 
 
 def device(name: str) -> torch.device:
@@ -95,8 +97,8 @@ def build_architecture(cfg: DictConfig) -> pipeline.Architecture:
     space = {"coordinates": COORDINATES[cfg.frame.coordinates](), "normalize": cfg.frame.normalize}
     vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in pipeline.VQVAE_SETTINGS})
     if "_target_" in cfg.model:
-        return pipeline.ReferenceArchitecture(**space, vqvae=vqvae, network=instantiate(cfg.model))
-    memory, kind = instantiate(cfg.memory, _convert_="all"), memory_class(cfg)
+        return pipeline.ReferenceArchitecture(**space, vqvae=vqvae, network=built(cfg.model))
+    memory, kind = built(cfg.memory), memory_class(cfg)
     return pipeline.MemMLPArchitecture(
         **space,
         vqvae=vqvae,
@@ -105,7 +107,7 @@ def build_architecture(cfg: DictConfig) -> pipeline.Architecture:
         depth=cfg.model.depth,
         memory=partial(memory, vqvae=vqvae) if kind.trains_codes else memory,
         memory_kind=kind,
-        predictor=instantiate(cfg.predictor),
+        predictor=built(cfg.predictor),
     )
 
 
@@ -116,15 +118,15 @@ def memory_class(cfg: DictConfig) -> type[Memory]:
 
 def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
     """What makes the loss over a network's branches: of Mem-MLP weighting and hand term, else as it is."""
-    loss = instantiate(cfg.loss)
+    loss = built(cfg.loss)
     if isinstance(loss, Loss):
         return lambda branches: loss
-    return partial(MotionLoss, loss, instantiate(cfg.hand))
+    return partial(MotionLoss, loss, built(cfg.hand))
 
 
 def build_ik(cfg: DictConfig) -> IK:
-    """The inverse kinematics of a checked config; off in a run from before there was any."""
-    if cfg.evaluation.get("ik", "off") == "off":
+    """The inverse kinematics of a checked config."""
+    if cfg.evaluation.ik == "off":
         return NoIK()
     return LBFGS(cfg.evaluation.ik_iterations)
 
@@ -145,21 +147,30 @@ def build_vqvae_optim(cfg: DictConfig) -> Optim:
     )
 
 
-def config_of(run: Run) -> DictConfig:
-    """The typed config of a finished run of a motion network. Raises InputError where it is none of ours."""
+def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
+    """The typed and checked config of a finished run of a motion network, with overrides of its keys.
+
+    Raises InputError where it is none of this version's, or an override is wrong.
+    """
     if not run.done or run.manifest.get("kind") != "memmlp":
         raise InputError(f"run {run.id}: not a finished Mem-MLP run")
-    cfg = OmegaConf.create(run.config)
-    targets = [str(value) for key, value in _leaves(run.config) if key == "_target_"]
-    foreign = [name for name in targets if not name.startswith("memmlp.")]
-    if foreign or set(run.config) != set(Config.__dataclass_fields__):
-        raise InputError(f"{run.config_path}: not a config of this version of memmlp ({foreign or 'keys'})")
+    try:
+        cfg = restored(run.config)
+    except (OmegaConfBaseException, KeyError, TypeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{run.config_path}: not a config of this version of memmlp ({reason})") from None
+    for word in overrides:
+        _override(cfg, word)
+    check(cfg)
     return cfg
 
 
-def _leaves(tree: dict[str, Any]) -> list[tuple[str, Any]]:
-    """Key and value of every leaf of nested mappings."""
-    leaves = []
-    for key, value in tree.items():
-        leaves += _leaves(value) if isinstance(value, dict) else [(key, value)]
-    return leaves
+def _override(cfg: DictConfig, word: str) -> None:
+    """Set a key of a typed config to the value of a word KEY=VALUE."""
+    key, equals, _ = word.partition("=")
+    if not equals:
+        raise InputError(f"{word}: allowed is KEY=VALUE")
+    try:
+        cfg.merge_with_dotlist([word])
+    except OmegaConfBaseException as error:
+        raise InputError(f"{key}: {str(error).splitlines()[0]}") from None

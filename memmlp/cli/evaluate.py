@@ -1,8 +1,7 @@
-"""`memmlp eval`: the metrics of a finished run again, and its predictions as files."""
+"""`memmlp eval`: a finished run's metrics, found or made, in any mode, with any inverse kinematics."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
@@ -12,31 +11,44 @@ from memmlp.cli.options import outputs_option
 
 @click.command("eval")
 @click.argument("run")
+@click.argument("overrides", nargs=-1)
 @click.option("--save-predictions", type=click.Path(path_type=Path), help="Folder for one npz a test clip.")
 @click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write per-clip values here.")
+@click.option("--again", is_flag=True, help="Evaluate anew what was evaluated before.")
 @click.option("--device", default="auto", type=click.Choice(["auto", "cpu", "cuda"]), show_default=True)
 @outputs_option
 def evaluate(
-    run: str, save_predictions: Path | None, json_path: Path | None, device: str, outputs: Path
+    run: str,
+    overrides: tuple[str, ...],
+    save_predictions: Path | None,
+    json_path: Path | None,
+    again: bool,
+    device: str,
+    outputs: Path,
 ) -> None:
-    """Evaluate a finished run (id, its beginning, or folder) on its test clips in its modes."""
+    """Show the metrics of a finished run (id, its beginning, or folder) on its test clips.
+
+    OVERRIDES are keys of the evaluation or the export, such as evaluation.ik=lbfgs, evaluation.modes=[stream]
+    or export.precision=int8. What was not measured so before is measured now; nothing is trained.
+    """
     from dataclasses import replace
 
     from rich.console import Console
 
-    from memmlp import evaluation, pipeline
+    from memmlp import pipeline
     from memmlp.cli.opened import opened
     from memmlp.cli.report import metrics_table
     from memmlp.files import write_json
 
-    _, experiment, cache, _ = found = opened(outputs, run, device)
-    model = experiment.architecture.load(found.run).to(experiment.device)
-    frames = found.test
-    modes, batch = experiment.modes, experiment.evaluation_batch
-    results = evaluation.evaluate(model, frames, modes, batch, experiment.ik)
-    Console(highlight=False).print(metrics_table(results["mean"]))
+    found = opened(outputs, run, device, overrides)
+    experiment = found.experiment
+    results, made = pipeline.finished(experiment, found.run, found.cache, again=again)
+    said = f"{' and '.join(made)} done" if made else "measured before"
+    click.echo(f"run {found.run.id}: {said}")
+    Console(highlight=False).print(metrics_table(results))
     if json_path is not None:
-        write_json(json_path, json.loads(json.dumps(results)))
+        write_json(json_path, {"mean": results, "clips": pipeline.clip_rows(experiment, found.run)})
     if save_predictions is not None:
-        pipeline.save_predictions(replace(experiment, save_predictions=save_predictions), model, cache)
-        click.echo(f"predictions of {len(frames.names)} clips under {save_predictions}")
+        model = experiment.architecture.load(found.run).to(experiment.device)
+        pipeline.save_predictions(replace(experiment, save_predictions=save_predictions), model, found.cache)
+        click.echo(f"predictions of {len(found.test.names)} clips under {save_predictions}")

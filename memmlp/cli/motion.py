@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hydra.utils import instantiate
 from omegaconf import DictConfig
 
+from memmlp.cli.components import built
 from memmlp.data.motion import Motion
 from memmlp.data.prepare import Source
 
@@ -24,6 +24,6 @@ def build_motion(cfg: DictConfig) -> Motion:
 
             synthesize(folder, minutes=minutes, seed=seed)
 
-    split = instantiate(data.split, _convert_="all")
+    split = built(data.split)
     source = Source(root, split, str(data.body), data.min_frames, data.strict)
     return Motion(source, generate, Path(cfg.paths.outputs) / "cache")

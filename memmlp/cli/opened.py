@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from memmlp.cli.build import build_experiment, config_of, device
 from memmlp.data.dataset import Frames
 from memmlp.data.prepare import Manifest
 from memmlp.errors import InputError
+from memmlp.identity import trained_by
 from memmlp.runs import Run, find_run
 
 
@@ -30,13 +32,21 @@ class Opened(NamedTuple):
         return Frames.open(self.cache, "test").to(self.experiment.device)
 
 
-def opened(outputs: Path, name: str, device_name: str = "cpu") -> Opened:
+def opened(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequence[str] = ()) -> Opened:
     """The finished run of an id, of the beginning of one, or of a folder.
 
-    Raises InputError where there is none, or its data is not what it was trained and tested on.
+    Args:
+        overrides: of keys of the evaluation and the deployment, KEY=VALUE.
+
+    Raises:
+        InputError: where there is none, an override is of its training, or its data is not what it was
+            trained and tested on.
     """
     run = find_run(outputs, name)
-    experiment = replace(build_experiment(config_of(run)), device=device(device_name))
+    experiment = replace(build_experiment(config_of(run, overrides)), device=device(device_name))
+    if trained_by(run.config) != trained_by(experiment.config):
+        words = ", ".join(overrides)
+        raise InputError(f"{words}: changes the training; allowed are keys of evaluation and export")
     cache, manifest = experiment.data.prepare()
     if manifest.digest != run.manifest["data"]:
         root = experiment.data.source.root

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 from memmlp.cli.shipped import shipped
 from memmlp.errors import InputError
 from memmlp.files import read_json, write_json
-from memmlp.identity import RECIPE
 from memmlp.sweep.plan import Entry, Plan, Task, unique
 from memmlp.sweep.spec import Sweep, load_sweep
 
@@ -24,9 +23,6 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from memmlp.pipeline import Experiment
-
-
-CODE = ("build.py", "motion.py", "plan.py", "schema/*.py")  # what turns a config into an experiment
 
 
 def find_sweep(name: str) -> Sweep:
@@ -72,7 +68,7 @@ def orphans(sweep: Sweep, plan: Plan) -> list[Entry]:
     labels = {arm.label for arm in sweep.arms}
     now = {(entry.label, entry.seed): entry.id for entry in plan.entries}
     used = set(now.values())
-    entries = [Entry(**entry) for entry in recorded]
+    entries = [Entry(entry["label"], entry["seed"], entry["id"]) for entry in recorded]
     return [
         entry
         for entry in entries
@@ -94,7 +90,7 @@ def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[s
             complete &= known is not None
             if known is not None:
                 found = tasks_of(experiment, known)
-                entries.append(Entry(arm.label, seed, found[-1].id))
+                entries.append(Entry(arm.label, seed, found[-1].id, found[-1].stages))
                 tasks += found
     plan = Plan(sweep.name, outputs, tuple(entries), unique(tasks))
     return plan, list(data.values()) if complete else None
@@ -118,11 +114,12 @@ def _experiments(
 
 def tasks_of(experiment: Experiment, data: str) -> list[Task]:
     """The runs of an experiment on prepared data of that digest, the last one its own."""
-    from memmlp.pipeline import motion_id, vqvae_id
+    from memmlp.pipeline import motion_identity
 
-    above = vqvae_id(experiment, data)
+    own = motion_identity(experiment, data)
+    above = own.upstream.id if own.upstream else None
     upstream = [Task(above, "vqvae", experiment.config)] if above else []
-    return [*upstream, Task(motion_id(experiment, data), "memmlp", experiment.config, above)]
+    return [*upstream, Task(own.id, "memmlp", experiment.config, above, experiment.stages)]
 
 
 def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[str, Any]]) -> str | None:
@@ -151,11 +148,11 @@ def _fresh(data: dict[str, Any]) -> bool:
 
 
 def _stamp(sweep: Sweep, outputs: Path) -> str:
-    """Digest of all that a plan follows from but the data: sweep, outputs, configs, what reads them."""
-    here = Path(__file__).parent
-    files = [*shipped("conf").rglob("*.yaml"), *(file for name in CODE for file in here.glob(name))]
-    texts = [(file.name, file.read_text(encoding="utf-8")) for file in sorted(files)]
-    return digest([RECIPE, asdict(sweep), str(outputs), texts])
+    """Digest of all that a plan follows from but the data: sweep, outputs, configs, the package's code."""
+    package = Path(__file__).parent.parent
+    files = [*shipped("conf").rglob("*.yaml"), *package.rglob("*.py")]
+    texts = [(str(file), file.read_text(encoding="utf-8")) for file in sorted(files)]
+    return digest([asdict(sweep), str(outputs), texts])
 
 
 def _remember(sweep: Sweep, plan: Plan, path: Path) -> None:

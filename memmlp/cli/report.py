@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
 from memmlp.pipeline import Outcome
+from memmlp.runs import Run
 from memmlp.units import UNITS
 
+STAGES = ("training", "evaluation", "deployment")
 BRANCHES = ("rotation", "position", "combined")
 COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHES]
 
@@ -17,9 +20,10 @@ COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHE
 def show(outcome: Outcome) -> None:
     """Print a run's metrics in both modes, its latency and sizes, and what to look at next."""
     console = Console(highlight=False)
-    run, results = outcome.run, outcome.run.results
-    if not outcome.fresh:
-        console.print(f"run {run.id} is finished already; nothing was done (force=true does it again)")
+    run, results = outcome.run, outcome.results
+    console.print(said(outcome), soft_wrap=True)
+    if changed := run.changed_sources:
+        console.print(older_code(run, changed), style="yellow", soft_wrap=True)
     console.print(metrics_table(results))
     measured = results["latency"]
     console.print(
@@ -35,6 +39,24 @@ def show(outcome: Outcome) -> None:
     )
     console.print(f"run      {run.folder}", soft_wrap=True)
     console.print(f"picture  {run.folder / 'poses.png'}", soft_wrap=True)
+
+
+def said(outcome: Outcome) -> str:
+    """What was done, and what was found done."""
+    if not outcome.made:
+        return f"run {outcome.run.id} is finished already; nothing was done (force=true does it again)"
+    found = [stage for stage in STAGES if stage not in outcome.made]
+    before = f"; {' and '.join(found)} found done" if found else ""
+    return f"run {outcome.run.id}: {', '.join(outcome.made)} done{before}"
+
+
+def older_code(run: Run, changed: Sequence[str]) -> str:
+    """The warning that a run was made before code changed under the same recipe numbers."""
+    names = ", ".join(changed[:5]) + (f" and {len(changed) - 5} more" if len(changed) > 5 else "")
+    return (
+        f"run {run.id} was made before the code of {names} changed, under the same recipe numbers: "
+        "force=true makes it again"
+    )
 
 
 def metrics_table(results: dict[str, Any]) -> Table:

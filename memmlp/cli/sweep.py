@@ -157,7 +157,7 @@ def track(plan: Plan) -> None:
     from memmlp.cli.build import build_tracker
     from memmlp.tracking import harmless
 
-    labels = {entry.id: entry.label for entry in plan.entries if plan.run_of(entry).done}
+    labels = {entry.id: entry.label for entry in plan.entries if plan.complete(entry)}
     if labels:
         config = next(task.config for task in plan.tasks if task.id in labels)
         with harmless(f"sweep {plan.name}"):
@@ -206,7 +206,7 @@ def report(chosen: Sweep, plan: Plan, words: Sequence[str]) -> None:
     from memmlp.tables.measured import load
 
     states = plan.states()
-    failed = [task for task in plan.tasks if states[task.id] in ("failed", "blocked")]
+    failed = [task for task in plan.tasks if states[task.key] in ("failed", "blocked")]
     command = " ".join(["memmlp sweep", *words])
     on_screen([of_plan(chosen, plan, MODES["both"], command, load).table])
     click.echo(f"{sum(state == 'done' for state in states.values())} of {len(states)} runs done")

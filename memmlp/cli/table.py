@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from memmlp.tables.planning import Need
     from memmlp.tables.table import Table
 
-    Read = Callable[[Path], Measured]
+    Read = Callable[[Path, tuple[str, ...]], Measured]
 MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", "window")}
 
 
@@ -150,9 +150,12 @@ def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, 
 def finder(plan: Plan, read: Read) -> Find:
     """What finds the results of a planned sweep's finished runs."""
 
+    entries = {(entry.label, entry.seed): entry for entry in plan.entries}
+
     def find(arm: Arm, seed: int) -> Measured | None:
-        run = plan.run(arm.label, seed)
-        return read(run.folder) if run is not None and run.done else None
+        entry = entries.get((arm.label, seed))
+        complete = entry is not None and plan.complete(entry)
+        return read(plan.run_of(entry).folder, entry.stages) if entry and complete else None
 
     return find
 
@@ -160,9 +163,12 @@ def finder(plan: Plan, read: Read) -> Find:
 def states(plan: Plan) -> Say:
     """What tells how far a planned sweep's unfinished runs are, where they began."""
 
+    entries = {(entry.label, entry.seed): entry for entry in plan.entries}
+
     def state(arm: Arm, seed: int) -> str | None:
-        run = plan.run(arm.label, seed)
-        return run.status if run is not None and run.status not in ("new", "done") else None
+        entry = entries.get((arm.label, seed))
+        word = plan.run_of(entry).state(plan.complete(entry)) if entry else "new"
+        return word if word not in ("new", "done") else None
 
     return state
 

@@ -48,11 +48,10 @@ def perform(path: Path, threads: int, plan: Plan, task: Task) -> None:
 
 def check_identity(experiment: Experiment, task: Task) -> None:
     """Raise InputError where this code takes the task's config for another run than the plan does."""
-    from memmlp.pipeline import motion_id, vqvae_id
+    from memmlp.cli.plan import tasks_of
 
     digest = experiment.data.prepare()[1].digest
-    found = vqvae_id(experiment, digest) if task.kind == "vqvae" else motion_id(experiment, digest)
-    if found != task.id:
+    if task.key not in {found.key for found in tasks_of(experiment, digest)}:
         raise InputError(f"run {task.id}: the data or the code changed since the sweep began; start it again")
 
 

@@ -10,7 +10,7 @@ from functools import cached_property
 from importlib import resources
 from typing import Any
 
-from memmlp.identity import relevant
+from memmlp.identity import trained_by
 from memmlp.report import figures
 from memmlp.report.figures import Curve, Point
 from memmlp.runs import Metrics
@@ -49,7 +49,7 @@ class Entry:
     @cached_property
     def config(self) -> dict[str, Any]:
         """The dotted keys of its config that can change a result."""
-        return relevant(self.measured.run.config) if self.measured.run else {}
+        return trained_by(self.measured.run.config) if self.measured.run else {}
 
 
 def page(chapters: Sequence[Chapter], published: Sequence[Point], generated: str, commit: str) -> str:

@@ -67,7 +67,7 @@ class Director:
         """Whether the trial has ended; the study is told."""
         run = self.plan.run_of(tasks[-1])
         news = self._report(trial, run)
-        if run.done:
+        if self.plan.complete(tasks[-1]):
             self.study.complete(trial, objectives(self.study.search.objectives, run))
             return True
         for task in tasks:

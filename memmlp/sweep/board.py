@@ -59,9 +59,9 @@ class Board(Screen):
         """A line for each task whose state is another than before."""
         if self.before is None:
             return []
-        changed = [task for task in plan.tasks if self.before.get(task.id) != states[task.id]]
+        changed = [task for task in plan.tasks if self.before.get(task.key) != states[task.key]]
         done = sum(state == "done" for state in states.values())
-        return [f"{done} of {len(states)} done; {_change(plan, t, states[t.id])}" for t in changed]
+        return [f"{done} of {len(states)} done; {_change(plan, t, states[t.key])}" for t in changed]
 
 
 def _change(plan: Plan, task: Task, state: str) -> str:
@@ -72,27 +72,27 @@ def _change(plan: Plan, task: Task, state: str) -> str:
 
 def name(plan: Plan, task: Task) -> str:
     """The task as a person knows it."""
-    cells = [f"{entry.label} seed {entry.seed}" for entry in plan.entries if entry.id == task.id]
+    cells = [f"{entry.label} seed {entry.seed}" for entry in plan.entries if entry.key == task.key]
     return cells[0] if cells else f"VQ-VAE {task.id}"
 
 
 def render(plan: Plan, states: Mapping[str, str]) -> Group:
     """Arms by seeds, the VQ-VAEs, the counts, and the reasons of what failed."""
-    tasks = {task.id: task for task in plan.tasks}
+    tasks = {task.key: task for task in plan.tasks}
     seeds = sorted({entry.seed for entry in plan.entries})
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=f"sweep {plan.name}", title_justify="left")
     table.add_column("arm", overflow="fold")
     for seed in seeds:
         table.add_column(f"seed {seed}", no_wrap=True)
     for label in dict.fromkeys(entry.label for entry in plan.entries):
-        cells = {e.seed: cell(plan, tasks[e.id], states[e.id]) for e in plan.entries if e.label == label}
+        cells = {e.seed: cell(plan, tasks[e.key], states[e.key]) for e in plan.entries if e.label == label}
         table.add_row(Text(label), *(cells.get(seed, Text("-")) for seed in seeds))
-    below = [_upstream(plan, task, states[task.id]) for task in plan.tasks if task.kind == "vqvae"]
+    below = [_upstream(plan, task, states[task.key]) for task in plan.tasks if task.kind == "vqvae"]
     below += [Text(_counts(states))]
     below += [
         Text(f"{name(plan, task)}: {plan.run_of(task).failure}", style="red")
         for task in plan.tasks
-        if states[task.id] == "failed"
+        if states[task.key] == "failed"
     ]
     return Group(table, *below)
 

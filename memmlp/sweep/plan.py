@@ -23,21 +23,34 @@ class Task:
         id: of the run. kind: "vqvae" or "memmlp".
         config: the resolved config of an experiment that needs it.
         upstream: the run that must be done before; None for none.
+        stages: identities of the evaluations and the deployment that are wanted of it.
     """
 
     id: str
     kind: str
     config: Mapping[str, Any]
     upstream: str | None = None
+    stages: tuple[str, ...] = ()
+
+    @property
+    def key(self) -> str:
+        """What tells it from others: arms may want other evaluations of the same run."""
+        return " ".join((self.id, *self.stages))
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A cell of the sweep: the run of an arm with a seed."""
+    """A cell of the sweep: the run of an arm with a seed, and the stages that the arm shows of it."""
 
     label: str
     seed: int
     id: str
+    stages: tuple[str, ...] = ()
+
+    @property
+    def key(self) -> str:
+        """That of its task."""
+        return " ".join((self.id, *self.stages))
 
 
 @dataclass(frozen=True)
@@ -70,19 +83,24 @@ class Plan:
         """The run of a task."""
         return Run.of(self.outputs, task.id)
 
+    def complete(self, task: Task | Entry) -> bool:
+        """Whether the run is trained and all of its stages that are wanted were made."""
+        run = self.run_of(task)
+        return run.done and all(map(run.has, task.stages))
+
     def states(self) -> dict[str, str]:
-        """The state of every task's run: its status, or "blocked" where its upstream run failed."""
-        states = {task.id: self.run_of(task).status for task in self.tasks}
+        """The state of every task by its key: its run's, or "blocked" where its upstream run failed."""
+        states = {task.key: self.run_of(task).state(self.complete(task)) for task in self.tasks}
         for task in self.tasks:
-            if states[task.id] != "done" and states.get(task.upstream or "") == "failed":
-                states[task.id] = "blocked"
+            if states[task.key] != "done" and states.get(task.upstream or "") == "failed":
+                states[task.key] = "blocked"
         return states
 
     def left(self) -> list[Task]:
         """The tasks that are neither done nor failed nor blocked nor cancelled."""
         states = self.states()
         ended = ("done", "failed", "blocked")
-        return [t for t in self.tasks if states[t.id] not in ended and t.id not in self.cancelled]
+        return [t for t in self.tasks if states[t.key] not in ended and t.id not in self.cancelled]
 
     def counts(self) -> Counter[str]:
         """How many tasks are in which state."""
@@ -98,15 +116,20 @@ class Plan:
         """A saved plan. Raises InputError where the file is none."""
         try:
             content = json.loads(path.read_bytes())
-            content["entries"] = tuple(Entry(**entry) for entry in content["entries"])
-            content["tasks"] = tuple(Task(**task) for task in content["tasks"])
+            content["entries"] = tuple(Entry(**_stages(entry)) for entry in content["entries"])
+            content["tasks"] = tuple(Task(**_stages(task)) for task in content["tasks"])
             content["cancelled"] = tuple(content["cancelled"])
             return cls(**{**content, "outputs": Path(content["outputs"])})
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(f"{path}: not a sweep's plan ({error}); start the sweep again") from None
 
 
+def _stages(fields: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a task or entry, its stages as they were before they were JSON."""
+    return fields | {"stages": tuple(fields.get("stages", ()))}
+
+
 def unique(tasks: Iterable[Task]) -> tuple[Task, ...]:
     """Each task once, upstream runs first, else in the order given."""
-    known = {task.id: task for task in tasks}
+    known = {task.key: task for task in tasks}
     return tuple(sorted(known.values(), key=lambda task: task.upstream is not None or task.kind != "vqvae"))

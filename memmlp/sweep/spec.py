@@ -6,9 +6,13 @@ base: [experiment=paper]           # overrides that all arms share
 seeds: [0, 1, 2]
 reference: 2, 4, 6, 8              # the arm that the others are compared with; the first one by default
 metrics: [MPJRE, MPJPE, MPJVE, Jitter]
+branch: combined                   # whose errors the rows show: rotation (the default), position or combined
+branch_source: its last row is Table 6's after inverse kinematics                   # how we know
+smallest: {MPJPE: 0.1}             # smallest effect of interest by metric; SMALLEST has the defaults
 arms:
   2, 4, 6, 8: {overrides: [], paper: {MPJRE: 2.57}}
   "2": {overrides: ['memory.layers=[2]'], paper: {MPJRE: 2.63}, note: as printed}
+  "4": {overrides: ['memory.layers=[4]'], branch: rotation, against: "2"}     # its own branch and control
 axes: {model.frames: [11, 21], seed: [0, 1, 2]}      # a grid, instead of arms or over each of them
 """
 
@@ -16,20 +20,24 @@ from __future__ import annotations
 
 import difflib
 import itertools
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from memmlp.errors import InputError
-from memmlp.units import UNITS
+from memmlp.units import SMALLEST, UNITS
 
 BRANCHES = ("rotation", "position", "combined")
-KEYS = ("title", "table", "notes", "base", "seeds", "reference", "metrics", "arms", "axes")
-ARM_KEYS = ("overrides", "branch", "paper", "note")
+KEYS = (
+    "title", "table", "notes", "base", "seeds", "reference", "metrics", "branch", "branch_source", "smallest",
+    "arms", "axes",
+)  # fmt: skip
+ARM_KEYS = ("overrides", "branch", "against", "paper", "note")
 COSTS = ("FLOPs", "MACs", "parameters", "size", "ms", "ratio", "FPS")
 """Columns that are no errors: GFLOP, GMAC, millions, MB, ms, those over the reference network's, 1 / s."""
 
@@ -44,6 +52,8 @@ class Arm:
         branch: whose errors the row shows: rotation, position, or combined (after inverse kinematics).
         paper: the paper's values by metric, as printed.
         note: a word of warning shown under the table.
+        against: label of the arm that this one is compared with; None for the sweep's reference.
+        fixed: whether the branch is the arm's own, and not the sweep's.
     """
 
     label: str
@@ -51,6 +61,8 @@ class Arm:
     branch: str = "rotation"
     paper: Mapping[str, float] | None = None
     note: str | None = None
+    against: str | None = None
+    fixed: bool = False
 
 
 @dataclass(frozen=True)
@@ -71,6 +83,8 @@ class Sweep:
         base: overrides of all arms. seeds: of each arm.
         arms: the rows in order. reference: the label that the others are compared with.
         metrics: the columns. extra: overrides of the command line.
+        branch_source: how we know which branch the paper's values belong to, where the file says.
+        smallest: smallest effect of interest by metric, in the metric's unit; every metric but costs has one.
     """
 
     name: str
@@ -83,6 +97,21 @@ class Sweep:
     reference: str
     metrics: tuple[str, ...]
     extra: tuple[str, ...] = ()
+    branch_source: str | None = None
+    smallest: Mapping[str, float] = field(default_factory=lambda: SMALLEST)
+
+    def with_branch(self, branch: str) -> Sweep:
+        """The same sweep, its arms showing another branch; an arm whose file gives it its own keeps it.
+
+        Raises InputError for a branch that there is none of.
+        """
+        name = _branch(branch, "branch")
+        arms = tuple(arm if arm.fixed else replace(arm, branch=name) for arm in self.arms)
+        return replace(self, arms=arms)
+
+    def control(self, arm: Arm) -> str | None:
+        """The label of the arm that one is compared with; None for the reference without a control."""
+        return arm.against or (self.reference if arm.label != self.reference else None)
 
     def with_overrides(self, overrides: Sequence[str]) -> Sweep:
         """The same sweep, further overrides standing after its base and before its arms' differences.
@@ -144,16 +173,19 @@ def load_sweep(path: Path) -> Sweep:
 def parse_sweep(name: str, content: Any) -> Sweep:
     """The sweep of a file's content. Raises InputError, naming the key."""
     content = _mapping(content, "the file", KEYS)
-    arms = [_arm(label, value) for label, value in _labelled(content.get("arms", {})).items()]
+    branch = _branch(content.get("branch", BRANCHES[0]), "branch")
+    arms = [_arm(label, value, branch) for label, value in _labelled(content.get("arms", {})).items()]
     axes = dict(_mapping(content.get("axes", {}), "axes"))
     seeds = _seeds(axes.pop("seed", content.get("seeds", [0])), "seeds")
-    arms = list(_grid(arms, axes)) if axes else arms
+    arms = list(_grid(arms, axes, branch)) if axes else arms
     runnable = [arm.label for arm in arms if arm.overrides is not None]
     if not runnable:
         raise InputError("arms: none to run; allowed is at least one arm with overrides, or axes")
     reference = str(content.get("reference", runnable[0]))
     if reference not in runnable:
         raise InputError(f"reference: '{reference}' is no arm; allowed are {', '.join(runnable)}")
+    _check_controls(arms, runnable)
+    source = content.get("branch_source")
     return Sweep(
         name=name,
         title=_text(content.get("title", name), "title"),
@@ -164,41 +196,60 @@ def parse_sweep(name: str, content: Any) -> Sweep:
         arms=tuple(arms),
         reference=reference,
         metrics=_metrics(content.get("metrics", ["MPJRE", "MPJPE", "MPJVE", "Jitter"])),
+        branch_source=None if source is None else _text(source, "branch_source"),
+        smallest=SMALLEST | _smallest(content.get("smallest", {})),
     )
 
 
-def _arm(label: str, value: Any) -> Arm:
-    """An arm from its mapping, or from its overrides alone."""
+def _arm(label: str, value: Any, branch: str) -> Arm:
+    """An arm from its mapping, or from its overrides alone; the branch is the sweep's."""
     name = f"arms.{label}"
     if isinstance(value, list):
-        return Arm(label, tuple(_overrides(value, name)))
+        return Arm(label, tuple(_overrides(value, name)), branch)
     value = _mapping(value or {}, name, ARM_KEYS)
     overrides = value.get("overrides", [])
-    branch = value.get("branch", BRANCHES[0])
-    if branch not in BRANCHES:
-        raise InputError(f"{name}.branch: '{branch}'; allowed are {', '.join(BRANCHES)}")
     return Arm(
         label,
         None if overrides is None else tuple(_overrides(overrides, f"{name}.overrides")),
-        branch,
+        _branch(value.get("branch", branch), f"{name}.branch"),
         _paper(value.get("paper", {}), f"{name}.paper"),
         value.get("note"),
+        str(value["against"]) if value.get("against") is not None else None,
+        "branch" in value,
     )
 
 
-def _grid(arms: Sequence[Arm], axes: Mapping[str, Any]) -> Iterable[Arm]:
+def _branch(value: Any, name: str) -> str:
+    """The name of a branch."""
+    if value not in BRANCHES:
+        raise InputError(f"{name}: '{value}'; allowed are {', '.join(BRANCHES)}")
+    return value
+
+
+def _check_controls(arms: Sequence[Arm], runnable: Sequence[str]) -> None:
+    """Refuse an arm that is compared with itself, or with what isn't run."""
+    for arm in arms:
+        others = [label for label in runnable if label != arm.label]
+        if arm.against is not None and arm.against not in others:
+            raise InputError(
+                f"arms.{arm.label}.against: '{arm.against}' is no other arm; allowed are {', '.join(others)}"
+            )
+
+
+def _grid(arms: Sequence[Arm], axes: Mapping[str, Any], branch: str) -> Iterable[Arm]:
     """Every arm with every combination of the axes' values."""
     for key, values in axes.items():
         if not isinstance(values, list) or not values:
             raise InputError(f"axes.{key}: allowed is a list of values, not empty")
-    for arm in arms or [Arm("")]:
+    for arm in arms or [Arm("", branch=branch)]:
         if arm.overrides is None:
             yield arm
             continue
         for values in itertools.product(*axes.values()):
             words = [f"{key}={_word(value)}" for key, value in zip(axes, values, strict=True)]
             label = ", ".join([arm.label, *words] if arm.label else words)
-            yield replace(arm, label=label, overrides=(*arm.overrides, *words))
+            control = f"{arm.against}, {', '.join(words)}" if arm.against else None
+            yield replace(arm, label=label, overrides=(*arm.overrides, *words), against=control)
 
 
 def _word(value: Any) -> str:
@@ -290,6 +341,16 @@ def _paper(value: Any, name: str) -> dict[str, float]:
     for metric, number in values.items():
         if not isinstance(number, int | float) or isinstance(number, bool):
             raise InputError(f"{name}.{metric}: {number!r}; allowed is a number")
+    return values
+
+
+def _smallest(value: Any) -> dict[str, float]:
+    """Smallest effects of interest by metric."""
+    values = dict(_mapping(value or {}, "smallest", [*UNITS]))
+    for metric, number in values.items():
+        real = isinstance(number, int | float) and not isinstance(number, bool)
+        if not real or not 0 < number < math.inf:
+            raise InputError(f"smallest.{metric}: {number!r}; allowed is a number above 0")
     return values
 
 

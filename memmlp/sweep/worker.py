@@ -55,7 +55,7 @@ def attempt(plan: Plan, task: Task, perform: Perform) -> bool:
     with run.lock(wait=False) as mine:
         if not mine:
             return False
-        if run.done or run.failure:
+        if plan.complete(task) or run.failure:
             return True  # somebody else ended it since the plan was looked at
         if deaths(run) >= DEATHS:
             run.fail(f"{DEATHS} processes died at step {run.step} of it, one after another")

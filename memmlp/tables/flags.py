@@ -10,7 +10,7 @@ from memmlp.tables.effects import Runs, control
 from memmlp.tables.measured import Measured
 
 Say = Callable[[Arm, int], str | None]
-BUILT_IN = "built-in"
+BUILT_IN = "builtin"
 SMPLH = (1, 2, 3)  # the paper's tables on AMASS, whose rest joints are each subject's SMPL-H body's
 ORIGIN = {
     "code": "code", "data": "data", "hardware": "hardware", "device": "device", "gpu": "GPU",

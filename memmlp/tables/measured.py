@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from memmlp.errors import InputError
-from memmlp.runs import Run
+from memmlp.files import read_json
+from memmlp.runs import Run, intact
 
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # mode -> branch -> metric -> value
 UNKNOWN = "?"
@@ -23,7 +23,8 @@ class Origin:
 
     Attributes:
         code: commit, or the version where there is no checkout. changed: whether it had uncommitted changes.
-        data: digest of the prepared data. body: whose rest joints the motion is on ("built-in", "SMPL-H").
+        data: digest of the prepared data. body: whose rest joints the motion is on, "builtin" or a body
+            model's file.
         hardware: the processor. device: "cpu" or "cuda"; gpu: its name. threads: of torch on the processor.
         torch: its version. precision: of training.
         recipes: number of the recipe by component. vqvae: id of the VQ-VAE's run, where there is one.
@@ -87,38 +88,37 @@ class Measured:
         return any(branch in branches for branches in self.means.values())
 
 
-def load(folder: Path) -> Measured:
-    """Read a finished run. Raises InputError, naming the file that is damaged."""
+def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
+    """Read a finished run. Raises InputError, naming the file that is damaged.
+
+    stages: identities of the evaluations and the deployment to read; all that there are by default.
+    """
     run = Run(folder)
-    results, manifest = _read(run.results_path, dict), _read(run.manifest_path, dict)
-    rows = _read(run.clips, list)
-    if not all(isinstance(row, dict) and "name" in row for row in rows):
-        raise _unreadable(run.clips)
-    latency = results.get("latency", {})
-    return Measured(
-        id=run.id,
-        means={mode: results[mode] for mode in ("window", "stream") if mode in results},
-        clips={row["name"]: row for row in rows},
-        groups={row["name"]: row["group"] for row in rows if row.get("group")},
-        costs=_costs(latency),
-        origin=_origin(manifest),
-        latency=latency,
-        run=run,
-    )
+    manifest = _read(run.manifest_path)
+    means: dict[str, dict[str, Any]] = {}
+    clips: dict[str, dict[str, Any]] = {}
+    groups: dict[str, str] = {}
+    for report in sorted(map(_read, _evaluations(run, stages)), key=lambda report: report["made"]):
+        means.setdefault(report["mode"], {}).update(report["mean"])
+        for clip in report["clips"]:
+            clips.setdefault(clip["name"], {}).setdefault(report["mode"], {}).update(clip)
+            groups |= {clip["name"]: clip["group"]} if clip.get("group") else {}
+    deployed = [run.deployment(name) for name in stages or () if run.deployment(name).done] or [run.shipped]
+    latency = read_json(deployed[-1].latency)
+    return Measured(run.id, means, clips, groups, _costs(latency), _origin(manifest), latency, run)
 
 
-def _read(path: Path, kind: type) -> Any:
-    try:
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError):
-        content = None
-    if not isinstance(content, kind):
-        raise _unreadable(path)
+def _evaluations(run: Run, stages: Sequence[str] | None) -> list[Path]:
+    """The files of some evaluations, or of all of them."""
+    wanted = [run.evaluation(name) for name in stages or ()]
+    return [path for path in wanted if path.is_file()] or sorted(run.evaluations.glob("*.json"))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    content = read_json(path)
+    if not content or ("digest" in content and not intact(path)):
+        raise InputError(f"{path}: cannot be read; do the run again with force=true, or remove its folder")
     return content
-
-
-def _unreadable(path: Path) -> InputError:
-    return InputError(f"{path}: cannot be read; do the run again with force=true, or remove its folder")
 
 
 def _costs(latency: Mapping[str, float]) -> dict[str, float]:

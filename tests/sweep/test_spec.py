@@ -9,7 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from memmlp.errors import InputError
+from memmlp.sweep import spec
 from memmlp.sweep.spec import load_sweep, parse_sweep
+from memmlp.units import SMALLEST, UNITS
 
 ARMS = {"full": [], "none": {"overrides": ["memory=none"], "paper": {"MPJPE": 4.13}}}
 
@@ -63,6 +65,39 @@ def test_rows_of_the_paper_alone_are_not_run():
     assert sweep.reference == "ours"
 
 
+def test_arms_show_the_sweeps_branch_or_their_own_and_another_where_asked():
+    arms = {"full": [], "one head": {"overrides": ["memory=none"], "branch": "rotation"}}
+    content = {"branch": "combined", "branch_source": "Table 6", "arms": arms}
+    sweep = parse_sweep("s", content)
+    assert [arm.branch for arm in sweep.arms] == ["combined", "rotation"]
+    assert sweep.branch_source == "Table 6"
+    assert [arm.branch for arm in sweep.with_branch("position").arms] == ["position", "rotation"]
+    with pytest.raises(InputError, match="branch: 'hips'; allowed are rotation, position, combined"):
+        sweep.with_branch("hips")
+    plain = parse_sweep("s", {"arms": ARMS, "axes": {"model.frames": [11]}})
+    assert {arm.branch for arm in plain.arms} == {"rotation"}
+    assert plain.branch_source is None
+    grid = parse_sweep("s", {"branch": "position", "axes": {"model.frames": [11]}})
+    assert [arm.branch for arm in grid.arms] == ["position"]
+
+
+def test_an_arm_is_compared_with_the_reference_or_with_its_own_control():
+    arms = {"a": [], "b": {"against": "a"}, "c": {"overrides": ["loss=manual"], "against": "b"}, "d": []}
+    sweep = parse_sweep("s", {"arms": arms, "reference": "d"})
+    assert [sweep.control(arm) for arm in sweep.arms] == ["d", "a", "b", None]
+    grid = parse_sweep("s", {"arms": arms, "axes": {"model.frames": [11, 21]}})
+    assert grid.arms[3].label == "b, model.frames=21"
+    assert grid.control(grid.arms[3]) == "a, model.frames=21"
+
+
+def test_every_metric_has_a_smallest_effect_that_a_file_may_set():
+    assert set(SMALLEST) == set(UNITS)
+    assert min(SMALLEST.values()) > 0
+    assert parse_sweep("s", {"arms": ARMS}).smallest == SMALLEST
+    mine = parse_sweep("s", {"arms": ARMS, "smallest": {"MPJPE": 0.4}}).smallest
+    assert mine == {**SMALLEST, "MPJPE": 0.4}
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -78,6 +113,18 @@ def test_rows_of_the_paper_alone_are_not_run():
         ({"arms": {"a\nb": []}}, "allowed is a label of one line"),
         ({"arms": ARMS, "metrics": []}, "metrics: empty; allowed is at least one"),
         ({"arms": {"a": {"branch": "hips"}}}, "arms.a.branch: 'hips'; allowed are rotation"),
+        ({"arms": {"a": {"branch": ["rotation"]}}}, "arms.a.branch: '['rotation']'; allowed are rotation"),
+        ({"arms": ARMS, "branch": "hips"}, "branch: 'hips'; allowed are rotation, position, combined"),
+        ({"arms": ARMS, "branch_source": 3}, "branch_source: 3; allowed is text"),
+        ({"arms": ARMS, "smallest": {"MPJPE": 0}}, "smallest.MPJPE: 0; allowed is a number above 0"),
+        ({"arms": ARMS, "smallest": {"MPJPE": True}}, "smallest.MPJPE: True; allowed is a number above 0"),
+        ({"arms": ARMS, "smallest": {"MPJPE": ".1"}}, "smallest.MPJPE: '.1'; allowed is a number above 0"),
+        ({"arms": ARMS, "smallest": {"Jitter": float("inf")}}, "smallest.Jitter: inf"),
+        ({"arms": ARMS, "smallest": {"FLOPs": 1}}, "smallest.FLOPs: no such key"),
+        ({"arms": ARMS, "smallest": 1}, "smallest: 1; allowed is a mapping"),
+        ({"arms": {"a": {"against": "b"}, "c": []}}, "arms.a.against: 'b' is no other arm; allowed are c"),
+        ({"arms": {"a": {"against": "a"}, "c": []}}, "arms.a.against: 'a' is no other arm; allowed are c"),
+        ({"arms": {"a": {"against": "b"}, "b": {"overrides": None}}}, "arms.a.against: 'b' is no other arm"),
         ({"arms": {"a": {"paper": {"MPJPX": 1}}}}, "arms.a.paper.MPJPX: no such key"),
         ({"arms": {"a": {"paper": {"MPJPE": "3"}}}}, "arms.a.paper.MPJPE: '3'; allowed is a number"),
         ({"arms": ARMS, "seeds": [0, 0]}, "seeds: [0, 0]; allowed is a list of whole numbers, each once"),
@@ -107,9 +154,7 @@ def test_a_file_that_is_no_yaml_is_named(tmp_path: Path, text: bytes):
         load_sweep(tmp_path / "absent.yaml")
 
 
-KEYS = st.sampled_from(
-    ["title", "table", "notes", "base", "seeds", "reference", "metrics", "arms", "axes", "x"]
-)
+KEYS = st.sampled_from([*spec.KEYS, "x"])
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),

@@ -153,7 +153,8 @@ def check(folder: Path) -> list[str]:
     if run.status != "done":
         return [f"{run.status}, not done"]
     problems = [f"artifact {name} is missing or changed" for name in run.verify()]
-    begun = [attempt["started"] for attempt in run.manifest["attempts"]]
+    attempts = run.manifest["attempts"]
+    begun = [attempt["started"] for attempt in attempts if attempt["stage"] == "training"]
     if max(begun) > run.manifest["finished"]:
         problems.append("begun again after it was finished")
     if (folder / ".holder").exists():

@@ -5,6 +5,6 @@ same name starts from it, so that unknown keys and wrong types are refused when 
 """
 
 from memmlp.cli.schema.checks import check, unknown_key
-from memmlp.cli.schema.config import SCHEMAS, Config, register
+from memmlp.cli.schema.config import SCHEMAS, Config, register, restored
 
-__all__ = ["SCHEMAS", "Config", "check", "register", "unknown_key"]
+__all__ = ["SCHEMAS", "Config", "check", "register", "restored", "unknown_key"]

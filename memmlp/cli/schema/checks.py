@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from memmlp.cli.schema.config import Config
 from memmlp.cli.schema.network import Reference
-from memmlp.cli.schema.training import ReferenceLoss, TeacherForcing
+from memmlp.cli.schema.training import AGRoLLoss, NoHand, ReferenceLoss, TeacherForcing
 from memmlp.errors import InputError
 
 
@@ -114,14 +114,25 @@ def _check_reference(cfg: DictConfig) -> None:
         )
 
 
+def _check_foreign_loss(cfg: DictConfig, predictor: str) -> None:
+    """AGRoL's loss is of rotations alone, and so may be that of a network that makes nothing else."""
+    if not _is(cfg.loss, AGRoLLoss):
+        raise InputError("loss: that of a reference network; allowed is loss=uncertainty or loss=manual")
+    if not predictor.startswith("RotationOnly") or not _is(cfg.hand, NoHand):
+        raise InputError(
+            "loss=agrol is of rotations alone: allowed is predictor=rotation_only with hand=off, "
+            "or loss=uncertainty or loss=manual"
+        )
+
+
 def _check_slots(cfg: DictConfig) -> None:
     """What stands in Mem-MLP's slots goes together."""
     layers = list(cfg.memory.get("layers", []))
     if layers and max(layers) > cfg.model.depth:
         raise InputError(f"memory.layers={layers}: allowed is up to model.depth={cfg.model.depth}")
-    if _is(cfg.loss, ReferenceLoss):
-        raise InputError("loss: that of a reference network; allowed is loss=uncertainty or loss=manual")
     predictor = cfg.predictor._target_.rsplit(".", 1)[-1]
+    if _is(cfg.loss, ReferenceLoss):
+        _check_foreign_loss(cfg, predictor)
     if cfg.hand._target_.endswith("HandPosition") and predictor.startswith("RotationOnly"):
         raise InputError(
             "hand=position needs the positions of predictor=two_branch: allowed is hand=fk or hand=off"

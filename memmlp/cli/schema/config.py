@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Optional
+from typing import Any, Optional
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING
+from omegaconf import MISSING, DictConfig, OmegaConf
 
 from memmlp.cli.schema.data import Data, ListData, SeededData, SubsetData, SynthData
 from memmlp.cli.schema.network import (
@@ -30,7 +31,18 @@ from memmlp.cli.schema.network import (
     TwoBranch,
     TwoBranchMemory,
 )
-from memmlp.cli.schema.rules import EachOf, OneOf, Text, Within, at_least, key, one_of, positive, target
+from memmlp.cli.schema.rules import (
+    EachOf,
+    OneOf,
+    Text,
+    Within,
+    at_least,
+    called,
+    key,
+    one_of,
+    positive,
+    target,
+)
 from memmlp.cli.schema.training import (
     AGRoLLoss,
     AvatarPoserLoss,
@@ -108,17 +120,20 @@ class Export:
 
 @dataclass
 class Tracker:
+    name: str = key(Text())
     _target_: str = MISSING
 
 
 @dataclass
 class MLflowTracker(Tracker):
+    name: str = called("mlflow")
     _target_: str = target("memmlp.tracking.MLflowTracker")
     uri: Optional[str] = key()
 
 
 @dataclass
 class NoTracker(Tracker):
+    name: str = called("none")
     _target_: str = target("memmlp.tracking.NoTracker")
 
 
@@ -187,6 +202,41 @@ SCHEMAS: dict[str, type] = {
     "tracker_mlflow": MLflowTracker,
     "tracker_none": NoTracker,
 }
+
+
+GROUPS = {
+    "paths": Paths, "profile": Profile, "frame": Frame, "model": Model, "memory": Memory, "vqvae": VQVAE,
+    "predictor": Predictor, "rollout": Rollout, "loss": Loss, "hand": Hand, "optim": Optim,
+    "evaluation": Evaluation, "export": Export, "tracker": Tracker,
+}  # fmt: skip
+DATA = {"seeded": SeededData, "lists": ListData, "subsets": SubsetData}
+
+
+def restored(config: Mapping[str, Any]) -> DictConfig:
+    """The typed config of a run's record, its classes found where this version has them.
+
+    Raises OmegaConf's errors, or KeyError, where it is none of this version's.
+    """
+    cfg = OmegaConf.structured(Config)
+    for group, content in config.items():
+        cfg[group] = _restored(group, content) if isinstance(content, Mapping) else content
+    return cfg
+
+
+def _restored(group: str, content: Mapping[str, Any]) -> Any:
+    """A typed group. A component that is not of this package keeps the path of its class."""
+    if group == "data":
+        schema = SynthData if content["synth"] else DATA[content["split"]["name"]]
+        return OmegaConf.merge(OmegaConf.structured(schema), _bare(content))
+    shipped = SCHEMAS.get(f"{group}_{content.get('name')}")
+    own = _bare(content) if shipped else dict(content)
+    return OmegaConf.merge(OmegaConf.structured(shipped or GROUPS[group]), own)
+
+
+def _bare(content: Mapping[str, Any]) -> dict[str, Any]:
+    """A group without the paths of its classes: those are the schema's."""
+    bare = {key: _bare(value) if isinstance(value, Mapping) else value for key, value in content.items()}
+    return {key: value for key, value in bare.items() if key != "_target_"}
 
 
 @functools.cache

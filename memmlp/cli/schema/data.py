@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Optional
 
-from memmlp.cli.schema.rules import EachOf, Existing, Text, at_least, fraction, key, positive, target
+from memmlp.cli.schema.rules import EachOf, Existing, Text, at_least, called, fraction, key, positive, target
 
 # OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
 # The fields' helpers make dataclass fields, not shared defaults.
@@ -14,6 +14,7 @@ from memmlp.cli.schema.rules import EachOf, Existing, Text, at_least, fraction, 
 
 @dataclass
 class SeededSplit:
+    name: str = called("seeded")
     _target_: str = target("memmlp.data.splits.SeededSplit")
     test: float = fraction()
     val: float = fraction()
@@ -23,6 +24,7 @@ class SeededSplit:
 
 @dataclass
 class ListSplit:
+    name: str = called("lists")
     _target_: str = target("memmlp.data.splits.ListSplit")
     folder: str = key(Existing("folder"))
     val: float = fraction()
@@ -32,6 +34,7 @@ class ListSplit:
 
 @dataclass
 class SubsetSplit:
+    name: str = called("subsets")
     _target_: str = target("memmlp.data.splits.SubsetSplit")
     train: list[str] = key(EachOf())
     test: list[str] = key(EachOf())

@@ -7,7 +7,18 @@ from typing import Union
 
 from omegaconf import MISSING
 
-from memmlp.cli.schema.rules import EachOf, Within, at_least, fraction, key, one_of, positive, target
+from memmlp.cli.schema.rules import (
+    EachOf,
+    Text,
+    Within,
+    at_least,
+    called,
+    fraction,
+    key,
+    one_of,
+    positive,
+    target,
+)
 
 # OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
 # The fields' helpers make dataclass fields, not shared defaults.
@@ -22,6 +33,7 @@ class Frame:
 
 @dataclass
 class Model:
+    name: str = called("mem_mlp")
     frames: int = at_least(2)
     width: int = at_least(1)
     depth: int = at_least(1)
@@ -31,17 +43,20 @@ class Model:
 class Reference(Model):
     """A network without slots: it leaves memory, predictor and hand empty."""
 
+    name: str = key(Text())
     _target_: str = MISSING
     _partial_: bool = True
 
 
 @dataclass
 class AGRoLMLP(Reference):
+    name: str = called("agrol_mlp")
     _target_: str = target("memmlp.reference.agrol.AGRoLMLP")
 
 
 @dataclass
 class AGRoLDiffusion(Reference):
+    name: str = called("agrol_diffusion")
     _target_: str = target("memmlp.reference.agrol.AGRoLDiffusion")
     width: int = at_least(2)
     diffusion_steps: int = at_least(1)
@@ -51,6 +66,7 @@ class AGRoLDiffusion(Reference):
 
 @dataclass
 class AvatarPoser(Reference):
+    name: str = called("avatar_poser")
     _target_: str = target("memmlp.reference.avatar_poser.AvatarPoser")
     heads: int = at_least(1)
     feedforward: int = at_least(1)
@@ -59,6 +75,7 @@ class AvatarPoser(Reference):
 
 @dataclass
 class Predictor:
+    name: str = key(Text())
     _target_: str = MISSING
     _partial_: bool = True
     depth: int = at_least(0)
@@ -66,39 +83,46 @@ class Predictor:
 
 @dataclass
 class TwoBranch(Predictor):
+    name: str = called("two_branch")
     _target_: str = target("memmlp.predictor.TwoBranch")
 
 
 @dataclass
 class RotationOnly(Predictor):
+    name: str = called("rotation_only")
     _target_: str = target("memmlp.predictor.RotationOnly")
 
 
 @dataclass
 class TwoBranchMemory(Predictor):
+    name: str = called("two_branch_memory")
     _target_: str = target("memmlp.predictor.TwoBranchMemory")
     depth: int = at_least(1)
 
 
 @dataclass
 class RotationOnlyMemory(Predictor):
+    name: str = called("rotation_only_memory")
     _target_: str = target("memmlp.predictor.RotationOnlyMemory")
     depth: int = at_least(1)
 
 
 @dataclass
 class Memory:
+    name: str = key(Text())
     _target_: str = MISSING
     _partial_: bool = True
 
 
 @dataclass
 class NoMemory(Memory):
+    name: str = called("none")
     _target_: str = target("memmlp.memory.NoMemory")
 
 
 @dataclass
 class NoCodesMemory(Memory):
+    name: str = called("no_codes")
     _target_: str = target("memmlp.memory.NoCodesMemory")
     layers: list[int] = key(EachOf(Within(1)))
     width: int = at_least(1)
@@ -110,11 +134,13 @@ class NoCodesMemory(Memory):
 
 @dataclass
 class CodeMemory(NoCodesMemory):
+    name: str = called("vq")
     _target_: str = target("memmlp.memory.CodeMemory")
 
 
 @dataclass
 class JointCodeMemory(NoCodesMemory):
+    name: str = called("vq_joint")
     _target_: str = target("memmlp.memory.JointCodeMemory")
 
 
@@ -127,11 +153,13 @@ class RecurrentMemory(Memory):
 
 @dataclass
 class LSTMMemory(RecurrentMemory):
+    name: str = called("lstm")
     _target_: str = target("memmlp.memory.LSTMMemory")
 
 
 @dataclass
 class GRUMemory(RecurrentMemory):
+    name: str = called("gru")
     _target_: str = target("memmlp.memory.GRUMemory")
 
 
@@ -144,6 +172,7 @@ class VQVAE:
     commitment: float = at_least(0)
     decay: float = key(Within(0, 1, strict=True))
     codebook: str = one_of("ema", "gradient")
+    seed: int = key(Within(0, 2**63 - 1))
     steps: int = at_least(1)
     batch: int = at_least(1)
     lr: float = positive()

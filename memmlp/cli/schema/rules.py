@@ -104,6 +104,11 @@ def target(path: str) -> Any:
     return field(default=path, metadata={"rule": OneOf((path,))})
 
 
+def called(name: str) -> Any:
+    """The name of a slot's option, by which a run's identity knows it; fixed."""
+    return field(default=name, metadata={"rule": OneOf((name,))})
+
+
 def one_of(*words: str) -> Any:
     """A key with these words."""
     return key(OneOf(words))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from omegaconf import MISSING
 
-from memmlp.cli.schema.rules import Within, at_least, key, one_of, positive, target
+from memmlp.cli.schema.rules import Text, Within, at_least, called, key, one_of, positive, target
 
 # OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
 # The fields' helpers make dataclass fields, not shared defaults.
@@ -14,39 +14,46 @@ from memmlp.cli.schema.rules import Within, at_least, key, one_of, positive, tar
 
 @dataclass
 class Rollout:
+    name: str = key(Text())
     _target_: str = MISSING
 
 
 @dataclass
 class TeacherForcing(Rollout):
+    name: str = called("teacher_forcing")
     _target_: str = target("memmlp.rollout.TeacherForcing")
 
 
 @dataclass
 class OwnPredictions(Rollout):
+    name: str = called("own_predictions")
     _target_: str = target("memmlp.rollout.OwnPredictions")
     max_passes: int = at_least(1)
 
 
 @dataclass
 class Streams(Rollout):
+    name: str = called("streams")
     _target_: str = target("memmlp.rollout.PersistentStreams")
     streams: int = at_least(1)
 
 
 @dataclass
 class Loss:
+    name: str = key(Text())
     _target_: str = MISSING
 
 
 @dataclass
 class Uncertainty(Loss):
+    name: str = called("uncertainty")
     _target_: str = target("memmlp.losses.Uncertainty")
     lr: float = positive()
 
 
 @dataclass
 class Manual(Loss):
+    name: str = called("manual")
     _target_: str = target("memmlp.losses.Manual")
     rotation: float = at_least(0)
     rotation_velocity: float = at_least(0)
@@ -62,34 +69,42 @@ class ReferenceLoss(Loss):
 
 @dataclass
 class AGRoLLoss(ReferenceLoss):
+    name: str = called("agrol")
     _target_: str = target("memmlp.losses.AGRoLLoss")
+    error: str = one_of("norm", "square")
 
 
 @dataclass
 class AvatarPoserLoss(ReferenceLoss):
+    name: str = called("avatar_poser")
     _target_: str = target("memmlp.losses.AvatarPoserLoss")
     orientation: float = at_least(0)
     rotation: float = at_least(0)
     position: float = at_least(0)
+    anchor: str = one_of("pelvis", "head")
 
 
 @dataclass
 class Hand:
+    name: str = key(Text())
     _target_: str = MISSING
 
 
 @dataclass
 class HandPosition(Hand):
+    name: str = called("position")
     _target_: str = target("memmlp.losses.HandPosition")
 
 
 @dataclass
 class HandFK(Hand):
+    name: str = called("fk")
     _target_: str = target("memmlp.losses.HandFK")
 
 
 @dataclass
 class NoHand(Hand):
+    name: str = called("off")
     _target_: str = target("memmlp.losses.NoHand")
 
 
