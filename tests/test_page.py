@@ -8,9 +8,10 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import Memmlp, one_line
-from fake_runs import fake_sweep, nothing, runs_of, table_of
+from fake_runs import CLIPS, fake_sweep, nothing, runs_of, table_of
 
 from memmlp.errors import InputError
 from memmlp.report import figures
@@ -18,6 +19,7 @@ from memmlp.report.page import Chapter, page, published
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.spec import Sweep, load_sweep
 from memmlp.tables.collect import without_runs
+from memmlp.tables.distributions import distributions
 from memmlp.tables.grid import caption
 
 SHIPPED = Path(__file__).parent.parent / "sweeps"
@@ -79,7 +81,9 @@ def test_page_has_every_table_and_figure(chapters: list[Chapter], text: str):
         assert (
             f'<a href="#{chapter.sweep.name}">{html.escape(caption(chapter.table), quote=True)}</a>' in text
         )
-    assert text.count("<figure>") == text.count("</svg>") == 3 + 1 + 4  # effects, accuracy, training
+    assert (
+        text.count("<figure>") == text.count("</svg>") == 3 + 3 + 1 + 4
+    )  # effects, profiles, accuracy, training
     runs = {run.id for chapter in chapters for found in chapter.runs.values() for run in found.values()}
     assert len(runs) == 15 + 9 + 12 + 5
     for run in runs:
@@ -93,6 +97,28 @@ def test_ids_are_unique_and_links_lead_somewhere(text: str):
     of_page = [name for name in ids if not re.fullmatch(r"[mp][0-9a-f]{10}", name)]
     assert len(set(of_page)) == len(of_page)
     assert set(re.findall(r'<a href="#([^"]+)"', text)) <= set(of_page)
+
+
+def test_distributions_by_hand(tmp_path: Path):
+    """Interquartile means and probabilities of improvement of one metric, and the profile's fractions."""
+    sweep = load_sweep(SHIPPED / "table14.yaml")
+    find = fake_sweep(tmp_path, sweep, {"2": 1.02})
+    found = {one.label: one for one in distributions(sweep, runs_of(sweep, find), "stream")["MPJPE"]}
+    ours, theirs = found["2"], found["2, 4, 6, 8"]
+    assert theirs.improvement is None
+    assert ours.errors.shape == (3, len(CLIPS))
+    wins = [
+        (a > b) + (a == b) / 2
+        for clip in range(len(CLIPS))
+        for a in theirs.errors[:, clip]
+        for b in ours.errors[:, clip]
+    ]
+    assert ours.improvement == pytest.approx(np.mean(wins))
+    assert ours.improvement < 0.5
+    middle = np.sort(ours.errors.ravel())[9:27]
+    assert ours.middle == pytest.approx(middle.mean())
+    text = page([Chapter(sweep, table_of(sweep, find), runs_of(sweep, find))], [], "now", "0")
+    assert f"<td>{ours.middle:.2f}</td><td>{ours.improvement:.2f}</td>" in text
 
 
 def test_colours_are_the_pages(text: str):
@@ -162,7 +188,7 @@ def test_browser_shows_the_page(tmp_path: Path, text: str, chapters: list[Chapte
         ran = browser(tmp_path, f"--window-size={width},900", "--dump-dom", path.as_uri())
         assert console(ran) == []
         assert f'data-report="{width} 0 0"' in ran.stdout
-        assert ran.stdout.count("<svg") == 8
+        assert ran.stdout.count("<svg") == 11
         assert all(f'id="{chapter.sweep.name}"' in ran.stdout for chapter in chapters)
 
 

@@ -15,6 +15,7 @@ from memmlp.report import figures
 from memmlp.report.figures import Curve, Point
 from memmlp.runs import Metrics
 from memmlp.sweep.spec import COSTS, Sweep
+from memmlp.tables.distributions import Distribution, distributions
 from memmlp.tables.effects import Runs
 from memmlp.tables.grid import caption
 from memmlp.tables.measured import Measured
@@ -63,6 +64,7 @@ def page(chapters: Sequence[Chapter], published: Sequence[Point], generated: str
     sections = [
         ("tables", "Tables", [as_html(chapter.table) for chapter in chapters]),
         ("effects", "Effects", _effects(chapters)),
+        ("distributions", "Beyond the mean", _distributions(chapters)),
         ("accuracy", "Accuracy and latency", _accuracy(chapters, published)),
         ("training", "Training curves", _training(chapters)),
         ("latency", "Latency", [_latency(entries)]),
@@ -125,11 +127,47 @@ def _effects(chapters: Iterable[Chapter]) -> list[str]:
         svg = figures.forest(chapter.table)
         if svg:
             note = (
-                f"Difference from '{chapter.table.reference}' with its 95 % interval; filled where it is "
-                "significant after Holm's correction; the diamond is the paper's difference. Left is better."
+                f"Difference from '{chapter.table.reference}', or from the arm's own control, with its 95 % "
+                "interval; filled where it is significant after Holm's correction; the shaded band is the "
+                "smallest effect of interest, the diamond the paper's difference. Left is better."
             )
             parts.append(_figure(chapter.title, svg, note))
     return parts
+
+
+def _distributions(chapters: Iterable[Chapter]) -> list[str]:
+    """Performance profiles, and what a few clips cannot carry away."""
+    parts = []
+    for chapter in chapters:
+        found = distributions(chapter.sweep, chapter.runs, chapter.table.modes[0])
+        if found:
+            svg = figures.profiles(chapter.sweep.name, found)
+            note = (
+                f"{chapter.table.modes[0].capitalize()} mode: the fraction of all runs' test clips whose "
+                "error is at most this; further up and left is better."
+            )
+            parts += [_figure(chapter.title, svg, note), _robust(found)]
+    return parts
+
+
+def _robust(found: Mapping[str, Sequence[Distribution]]) -> str:
+    """Interquartile means and probabilities of improvement, an arm a row."""
+    metrics = list(found)
+    head = ["arm", *(f"{metric}: {what}" for metric in metrics for what in ("IQM", "P(better)"))]
+    rows = [
+        [one.label, *(word for metric in metrics for word in _robust_words(found[metric][place]))]
+        for place, one in enumerate(found[metrics[0]])
+    ]
+    note = (
+        "IQM: the mean of the middle half of all seeds and clips. P(better): how often a run of the arm has "
+        "a smaller error than one of its control on the same clip. Neither is a test."
+    )
+    return _rows(head, rows, note)
+
+
+def _robust_words(one: Distribution) -> tuple[str, str]:
+    better = "-" if one.improvement is None else f"{one.improvement:.2f}"
+    return ("-" if one.middle is None else f"{one.middle:.2f}"), better
 
 
 def _accuracy(chapters: Iterable[Chapter], paper: Sequence[Point]) -> list[str]:

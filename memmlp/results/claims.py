@@ -41,7 +41,7 @@ REFERENCE = re.compile(
 )
 OUTSIDE = re.compile(r"```.*?```|`[^`\n]*`|\{%.*?%\}|\{#.*?#\}|<!--.*?-->|(?<=\])\([^)\s]*\)", re.DOTALL)
 PLACEHOLDER = re.compile(r"\{\{.*?\}\}", re.DOTALL)
-SENTENCE = re.compile(r"(?<=[.!?;:])\s+|\n\s*\n|\n(?=\s*([-*]|\d+\.|#+|>)\s)|(?<!\\)\||\n(?=\s*\|)")
+SENTENCE = re.compile(r"(?<=[.!?;])\s+|\n\s*\n|\n(?=\s*([-*]|\d+\.|#+|>)\s)|(?<!\\)\||\n(?=\s*\|)")
 
 
 class Claim(NamedTuple):

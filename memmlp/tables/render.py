@@ -14,6 +14,7 @@ from typing import Any
 from rich.console import Console
 
 from memmlp.files import plain
+from memmlp.statistics import Verdict
 from memmlp.tables.grid import MINUS, Grid, Line, caption, grids, legend
 from memmlp.tables.table import Table
 
@@ -141,7 +142,9 @@ def _html_line(line: Line) -> str:
 
 
 def _html_mark(text: str) -> str:
-    """A part of a cell, its sign of agreement or significance set off."""
+    """A part of a cell, its sign of agreement or significance set off; a verdict in a class of its name."""
+    if text in set(Verdict):
+        return f'<span class="verdict {text}">{text}</span>'
     marks = {"✓": "same", "✗": "opposite", "*": "significant"}
     escaped = _html(text)
     for mark, name in marks.items():
