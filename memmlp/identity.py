@@ -19,7 +19,7 @@ from memmlp.files import plain
 from memmlp.recipes import recipes
 
 NEUTRAL = (
-    "data",  # its digest stands for it: frames, clips, split and rest pose
+    "data",  # its digest stands for it: frames, clips, split and rest pose; but see `_draws`
     "profile",  # sizes, read by the groups that use them
     "paths",
     "tracker",
@@ -141,11 +141,17 @@ def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
 
 
 def trained_by(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The dotted keys of a config that can change the result of a training."""
+    """The dotted keys of a config that can change the result of a training; null is no key."""
     later = (*EVALUATION, *DEPLOYMENT, *(() if _rolls_out(config) else INFERENCE))
     out = (*NEUTRAL, *later, *_unused(config))
-    flat = {key: _canonical(value) for key, value in flatten(config).items()}
-    return {key: value for key, value in flat.items() if not _below(key, out) and _leaf(key) not in PATHS}
+    flat = {key: _canonical(value) for key, value in flatten(config).items() if value is not None}
+    counting = {key: flat[key] for key in flat if not _below(key, out) and _leaf(key) not in PATHS}
+    return counting | _draws(config)
+
+
+def _draws(config: Mapping[str, Any]) -> dict[str, Any]:
+    """How windows are drawn, the one key of the data that is not in its digest."""
+    return {"data.weighting": config["data"].get("weighting", "frames")} if config.get("data") else {}
 
 
 def _training(kind: str, config: Mapping[str, Any], data: str, upstream: str | None) -> dict[str, Any]:

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-import memmlp.identity
+import memmlp.recipes
 from memmlp.environment import environment
 from memmlp.errors import InputError
 from memmlp.files import atomic_write, write_json
-from memmlp.identity import IGNORED, flatten, run_id
-from memmlp.runs import Run, diff, find_run, list_runs
+from memmlp.identity import NEUTRAL, Identity, deployment_id, evaluation_id, flatten, run_id
+from memmlp.runs import Run, diff, find_run, intact, list_runs, write_report
 
 CONFIG = {"seed": 0, "model": {"width": 16, "layers": [2, 4]}, "optim": {"lr": 1e-3, "log_every": 5}}
 
@@ -41,7 +41,7 @@ def test_identity_is_sixteen_hex_digits_that_never_change():
     [
         {"config": CONFIG | {"seed": 1}},
         {"config": CONFIG | {"model": {"width": 16, "layers": [4, 2]}}},
-        {"config": CONFIG | {"new": None}},
+        {"config": CONFIG | {"new": 0}},
         {"kind": "vqvae"},
         {"data": "e"},
         {"upstream": None},
@@ -51,30 +51,67 @@ def test_what_changes_the_result_changes_the_identity(other: dict):
     assert identity(**other) != identity()
 
 
-def test_recipe_is_part_of_the_identity(monkeypatch: pytest.MonkeyPatch):
-    before = identity()
-    monkeypatch.setattr(memmlp.identity, "RECIPE", memmlp.identity.RECIPE + 1)
-    assert identity() != before
+def test_a_components_recipe_moves_the_runs_that_use_it_and_no_others(monkeypatch: pytest.MonkeyPatch):
+    gru, lstm = ({**CONFIG, "memory": {"name": name}} for name in ("gru", "lstm"))
+    before = identity(gru), identity(lstm)
+    monkeypatch.setitem(memmlp.recipes.RECIPES, "memory.gru", 2)
+    assert identity(gru) != before[0]
+    assert identity(lstm) == before[1]
 
 
-@pytest.mark.parametrize("key", IGNORED)
+def test_what_a_run_is_does_not_move_with_recipes(monkeypatch: pytest.MonkeyPatch):
+    config = {**CONFIG, "memory": {"name": "gru"}}
+    codes = Identity("vqvae", {"vqvae": {"codebook": "ema"}}, "d")
+    own = Identity("memmlp", config, "d", codes)
+    what, before = own.what, own.id
+    monkeypatch.setitem(memmlp.recipes.RECIPES, "vqvae", 2)
+    assert own.id != before  # by its VQ-VAE's
+    assert own.what == what
+    assert Identity("memmlp", config, "e", codes).what != what
+
+
+def test_where_a_class_lies_does_not_count():
+    here, there = ({**CONFIG, "memory": {"name": "gru", "_target_": path}} for path in ("a.B", "c.d.B"))
+    assert identity(here) == identity(there)
+
+
+def test_stages_have_identities_of_what_changes_them_alone():
+    def of(**changes: object) -> tuple[str, str, str]:
+        config = {**CONFIG, "evaluation": {"ik": "off", "ik_iterations": 15, "batch": 4}, "export": {"a": 1}}
+        for key, value in changes.items():
+            group, name = key.split("__")
+            config[group] = {**config.get(group, {}), name: value}
+        return identity(config), evaluation_id(config, "stream"), deployment_id(config)
+
+    def moved(**changes: object) -> list[bool]:
+        return [a != b for a, b in zip(of(), of(**changes), strict=True)]
+
+    assert moved(evaluation__ik="lbfgs") == [False, True, False]
+    assert moved(evaluation__ik_iterations=3) == [False, False, False]  # there is no inverse kinematics
+    assert moved(evaluation__batch=1) == [False, False, False]
+    assert moved(export__a=2) == [False, False, True]
+    assert moved(optim__lr=1) == [True, False, False]
+    assert moved(memory__blend=1) == [False, True, True]
+    rolled = {"rollout": {"name": "own_predictions"}, "memory": {"blend": 1}}
+    assert identity(CONFIG | rolled) != identity(CONFIG | {**rolled, "memory": {"blend": 0}})
+
+
+@pytest.mark.parametrize("key", NEUTRAL)
 def test_what_cannot_change_the_result_does_not(key: str):
     tree: object = "anything"
     for name in reversed(key.split(".")[1:]):
         tree = {name: tree}
     top = key.split(".")[0]
     merged = CONFIG | {top: {**CONFIG.get(top, {}), **tree} if isinstance(tree, dict) else tree}
+    if key == "data":
+        merged = CONFIG | {"data": {"root": "elsewhere"}}
+        assert identity(merged) == identity(CONFIG | {"data": {"root": "here"}})
+        return
     assert identity(merged) == identity()
 
 
 def test_a_key_that_begins_like_an_ignored_one_counts():
     assert identity(CONFIG | {"database": 1}) != identity()
-
-
-def test_a_key_that_came_later_does_not_count_at_the_value_of_before():
-    later = {**CONFIG, "evaluation": {"ik": "off", "ik_iterations": 15}}
-    assert identity(later) == identity()
-    assert identity({**CONFIG, "evaluation": {"ik": "lbfgs"}}) != identity()
 
 
 def test_equal_numbers_and_orders_are_one_identity():
@@ -154,10 +191,20 @@ def test_verify_names_what_changed(tmp_path: Path):
     for name in ("results.json", "clips.json", "latency.json"):
         write_json(run.folder / name, {})
     run.finish(["results.json", "clips.json", "latency.json"])
+    place, report = run.deployment("fp32-0"), run.evaluation("stream-0")
+    place.folder.mkdir(parents=True)
+    place.onnx.write_bytes(b"graph")
+    place.finish({})
+    write_report(report, {"mode": "stream", "mean": {"rotation": {"MPJPE": math.nan}}, "clips": []})
+    assert intact(report)
     assert run.verify() == []
     (run.folder / "clips.json").write_text("{ }")
     (run.folder / "latency.json").unlink()
-    assert run.verify() == ["clips.json", "latency.json"]
+    place.onnx.write_bytes(b"other")
+    report.write_text(report.read_text().replace("nan", "0.1"))
+    assert run.verify() == [
+        "clips.json", "latency.json", "deployments/fp32-0/step.onnx", "evaluations/stream-0.json"
+    ]  # fmt: skip
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -176,7 +223,9 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
 def test_reset_removes_the_runs_files_and_no_others(tmp_path: Path):
     run = begun(tmp_path)
     for name in Run.FILES:
-        (run.folder / name).write_text("{}")
+        path = run.folder / name.replace("*", "0")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("{}")
     (run.folder / ".checkpoint.safetensors.123.tmp").touch()
     (run.folder / "notes.txt").touch()
     run.finish(["results.json"])

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from memmlp.cli import schema
 from memmlp.cli.shipped import shipped
 from memmlp.cli.train import composed
-from memmlp.identity import IGNORED, flatten
+from memmlp.identity import NEUTRAL, flatten
 
 GROUPS = {folder.name: sorted(p.stem for p in folder.glob("*.yaml")) for folder in shipped("conf").glob("*/")}
 del GROUPS["search"]  # of `memmlp tune`
@@ -86,7 +86,7 @@ def test_every_target_is_there(name: str):
 
 def test_ignored_keys_are_keys_of_the_config():
     keys = {*flatten(OmegaConf.to_container(composed([]), resolve=True))}
-    for ignored in set(IGNORED) - {"hydra"}:
+    for ignored in set(NEUTRAL) - {"hydra"}:
         assert any(key == ignored or key.startswith(f"{ignored}.") for key in keys), ignored
 
 
