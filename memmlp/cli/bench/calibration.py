@@ -12,7 +12,8 @@ import click
 import numpy as np
 
 from memmlp.statistics import holm, looks, sequential, spending
-from memmlp.statistics.crossed import by_group, error_by_group
+from memmlp.statistics.crossed import Error, by_group, combined
+from memmlp.statistics.crossed import noise as residual
 
 SEEDS, CLIPS, SIZES = (2, 3, 5, 10), (4, 10, 40, 536), (1, 2, 10)
 ARMS, METRICS = 6, 4
@@ -108,58 +109,66 @@ def _oracle() -> float:
 def simulate(cell: Cell, tables: int, seed: int) -> dict[str, dict[str, float]]:
     """Summaries of tables of true nulls, by choice of shares."""
     tallies = {name: Tally() for name in SHARES}
-    for units, weights in drawn(cell, tables, seed):
-        for name, shares in SHARES.items():
-            count(tallies[name], mixed(units, shares), weights)
-    return {name: tally.summary() for name, tally in tallies.items()}
-
-
-def drawn(cell: Cell, tables: int, seed: int) -> Iterator[tuple[Shares, np.ndarray]]:
-    """Effects of each kind, averaged within groups (K, S or 1, G or 1), each of which gives the mean a variance
-    of 1, and the groups' weights; in chunks of whole tables."""
     rng = np.random.default_rng([seed, *cell])
     size = max(1, CHUNK // (TABLE * cell.seeds * cell.clips))
     for start in range(0, tables, size):
-        yield draw(rng, cell, TABLE * min(size, tables - start))
+        units = draw(rng, cell, TABLE * min(size, tables - start))
+        for name, shares in SHARES.items():
+            count(tallies[name], units, shares)
+    return {name: tally.summary() for name, tally in tallies.items()}
 
 
-def draw(rng: np.random.Generator, cell: Cell, comparisons: int) -> tuple[Any, np.ndarray]:
-    """One chunk of `drawn`."""
+class Units:
+    """Effects of each kind, each of which gives the mean over seeds and clips a variance of 1."""
+
+    def __init__(self, seeds: np.ndarray, fixed: list[np.ndarray], noise: np.ndarray, weights: np.ndarray):
+        """Of seeds (K, S), of groups (K, G) by three causes, noise (K, S, G), and the groups' weights (G,)."""
+        self.seeds, self.fixed, self.weights = seeds, fixed, weights
+        self.looks = {n: (noise[:, :n] @ weights, noise[:, :n].mean(1), residual(noise[:, :n], weights)) for n in {*looks(noise.shape[1])}}
+
+    def mixed(self, shares: Shares, seeds: int) -> tuple[Error, np.ndarray]:
+        """Error and mean (K,) of the first so many seeds with these shares of variance."""
+        first, *middle, last = np.sqrt(np.array(shares) / sum(shares))
+        by_seed, by_group, rest = self.looks[seeds]
+        effects = sum((w * u for w, u in zip(middle, self.fixed, strict=True) if w), 0 * self.fixed[0])
+        of_seeds = first * self.seeds[:, :seeds]
+        a = of_seeds + (effects @ self.weights)[:, None] + last * by_seed
+        b = of_seeds.mean(1)[:, None] + effects + (last * by_group if last else 0)
+        return combined(a, b, last**2 * rest, self.weights), a.mean(1)
+
+
+def draw(rng: np.random.Generator, cell: Cell, comparisons: int) -> Units:
+    """Units of so many comparisons."""
     seeds, clips, _ = cell
     _, weights = by_group(np.zeros((1, 1, clips)), cell.groups)
+
+    def grouped(effects: np.ndarray) -> np.ndarray:
+        return by_group(effects, cell.groups)[0]
+
     by_clip = (comparisons, 1, clips)
-    return Shares(
-        seeds=np.sqrt(seeds) * rng.normal(size=(comparisons, seeds, 1)),
-        groups=rng.normal(size=(comparisons, 1, len(weights))) / np.sqrt(weights @ weights),
-        clips=by_group(np.sqrt(clips) * rng.normal(size=by_clip), cell.groups)[0],
-        skewed=by_group(np.sqrt(clips) * (rng.exponential(size=by_clip) - 1), cell.groups)[0],
-        noise=by_group(np.sqrt(seeds * clips) * rng.normal(size=(comparisons, seeds, clips)), cell.groups)[0],
-    ), weights
+    fixed = [
+        rng.normal(size=(comparisons, len(weights))) / np.sqrt(weights @ weights),
+        np.sqrt(clips) * grouped(rng.normal(size=by_clip))[:, 0],
+        np.sqrt(clips) * grouped(rng.exponential(size=by_clip) - 1)[:, 0],
+    ]
+    noise = np.sqrt(seeds * clips) * grouped(rng.normal(size=(comparisons, seeds, clips)))
+    return Units(np.sqrt(seeds) * rng.normal(size=(comparisons, seeds)), fixed, noise, weights)
 
 
-def mixed(units: Any, shares: Shares) -> np.ndarray:
-    """Differences by group (K, S, G) with these shares of variance, whose mean has a variance of 1."""
-    parts = [np.sqrt(share / sum(shares)) * unit for unit, share in zip(units, shares, strict=True) if share]
-    shape = np.broadcast_shapes(*(unit.shape for unit in units))
-    return np.array(np.broadcast_to(sum(parts), shape))
-
-
-def count(tally: Tally, means: np.ndarray, weights: np.ndarray) -> None:
-    """Add tables (K, S, G) of true nulls to a tally.
+def count(tally: Tally, units: Units, shares: Shares) -> None:
+    """Add tables of true nulls to a tally.
 
     Of true nulls alone, Holm calls something significant where its first step does.
     """
-    known, distance = error_by_group(means, weights), (means @ weights).mean(1)
-    half = known.half(LEVEL / TABLE)
-    tally.covered.append(np.abs(distance) <= known.half(LEVEL))
-    tally.starred.append(_any(np.abs(distance) > half))
-    tally.needed.append(half - distance)
-    rounds = looks(means.shape[1])
-    false = np.zeros(len(means), bool)
+    rounds = looks(units.seeds.shape[1])
+    false = False
     for seeds, level in zip(rounds, spending(len(rounds)), strict=True):
-        part = means[:, :seeds]
-        now = error_by_group(part, weights).half(level / TABLE)
-        false |= np.abs((part @ weights).mean(1)) > now
+        known, mean = units.mixed(shares, seeds)
+        false |= np.abs(mean) > known.half(level / TABLE)
+    half = known.half(LEVEL / TABLE)
+    tally.covered.append(np.abs(mean) <= known.half(LEVEL))
+    tally.starred.append(_any(np.abs(mean) > half))
+    tally.needed.append(half - mean)
     tally.sequential.append(_any(false))
 
 
