@@ -104,7 +104,13 @@ def skewed(freedom: float) -> float:
 def error(differences: np.ndarray, groups: Groups = None) -> Error:
     """The error of the means of differences (K, S, C) over seeds and clips."""
     means, weights = by_group(differences, groups)
-    return combined(means @ weights, means.mean(1), noise(means, weights), weights)
+    _, s, g = means.shape
+    none = np.zeros(len(means))
+    a = (means @ weights).var(1, ddof=1) / s if s > 1 else none
+    b = means.mean(1).var(1, ddof=1) * (weights @ weights) if g > 1 else none
+    e = noise(means, weights) if s > 1 and g > 1 else none
+    single = " and ".join(name for name, number in (("seeds", s), ("clips", g)) if number == 1)
+    return Error(np.stack([a, b, e]), max(s - 1, 1), max(g - 1, 1), single)
 
 
 def by_group(differences: np.ndarray, groups: Groups = None) -> tuple[np.ndarray, np.ndarray]:
@@ -120,17 +126,6 @@ def by_group(differences: np.ndarray, groups: Groups = None) -> tuple[np.ndarray
 
 def noise(means: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """E (K,) of means of groups (K, S, G)."""
-    _, seeds, groups = means.shape
-    if seeds == 1 or groups == 1:
-        return np.zeros(len(means))
+    seeds = means.shape[1]
     rest = means - means.mean(1, keepdims=True)
     return rest.var(2, ddof=1).sum(1) * (weights @ weights) / (seeds * (seeds - 1))
-
-
-def combined(seeds: np.ndarray, groups: np.ndarray, noise: np.ndarray, weights: np.ndarray) -> Error:
-    """The error by the means of seeds (K, S) and of groups (K, G), and E (K,)."""
-    (_, s), (_, g), none = seeds.shape, groups.shape, np.zeros(len(noise))
-    a = seeds.var(1, ddof=1) / s if s > 1 else none
-    b = groups.var(1, ddof=1) * (weights @ weights) if g > 1 else none
-    single = [name for name, number in (("seeds", s), ("clips", g)) if number == 1]
-    return Error(np.stack([a, b, noise]), max(s - 1, 1), max(g - 1, 1), " and ".join(single))
