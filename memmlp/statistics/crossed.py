@@ -1,15 +1,15 @@
 """The error of a mean over seeds and groups of clips that were crossed: every seed saw every clip.
 
-d[s, c] = mean + effect of seed s + effect of c's group + effect of clip c + noise, in unknown shares. Clips are
-first averaged within their groups (takes, subjects), which are what was replicated; the mean stays that over
-clips, so that a group weighs w[g], its share of the clips. The means m[s, g] give three variances,
+d[s, c] = mean + effect of seed s + effect of c's group + effect of clip c + noise, in unknown shares. Clips
+are first averaged within their groups (takes, subjects), which are what was replicated; the mean stays that
+over clips, so that a group weighs w[g], its share of the clips. The means m[s, g] give three variances,
 
     A = variance of the S seeds' means / S                                    S - 1 degrees of freedom
     B = variance of the G groups' means x sum of w^2                          G - 1
     E = variance of what neither explains x sum of w^2 / S                    (S - 1) (G - 1)
 
-and A + B - E estimates that of the mean, because the noise is in A and in B. (Groups that differ in size make B
-larger than it should be where clips differ more than groups do, and never smaller.)
+and A + B - E estimates that of the mean, because the noise is in A and in B. (Where groups differ in size,
+and clips more than groups, B is larger than it should be; it is never smaller.)
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Error:
     """What is known of the errors of K means.
 
     Args:
-        variances: A, B and E of the module's text, (3, K); a side with one member alone is 0, and so is E then.
+        variances: A, B and E of the module's text, (3, K); a side with one member is 0, and so is E then.
         seeds, groups: degrees of freedom of A and of B.
         conditional: what has one member alone, so that nothing can be said of others: "seeds", "clips",
             "seeds and clips", or "" where there are several of both.
@@ -49,8 +49,8 @@ class Error:
         """Half the width (K,) of the intervals that miss with a probability of at most `level`, () or (K,).
 
         Each side has Student's quantile of its own degrees of freedom, and then their squares add (Banerjee
-        1960): three seeds that happen to agree can't pass for many, as with Satterthwaite's degrees of freedom.
-        The noise, which is in both sides, counts once, with the larger quantile, and no less than either alone.
+        1960): three seeds that happen to agree can't pass for many, as they do by Satterthwaite's. The noise,
+        which is in both sides, counts once, with the larger quantile, and no less than in either side alone.
 
         Effects of groups may be `skewed`, noise is not. But B that is no more than noise may also be of few
         skewed values that happen to be alike, and the smaller the level the more so; so the lighter quantile
@@ -114,7 +114,7 @@ def error(differences: np.ndarray, groups: Groups = None) -> Error:
 
 
 def by_group(differences: np.ndarray, groups: Groups = None) -> tuple[np.ndarray, np.ndarray]:
-    """Means of differences (K, S, C) over each group's clips (K, S, G), and the groups' shares of clips (G,)."""
+    """Means of differences (K, S, C) over each group's clips (K, S, G), and its share of clips (G,)."""
     clips = differences.shape[2]
     if groups is None:
         return differences, np.full(clips, 1 / clips)

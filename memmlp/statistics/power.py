@@ -66,8 +66,8 @@ def components(known: Error) -> np.ndarray:
 def found(parts: np.ndarray, seeds: int, groups: float, level: float, power: float) -> np.ndarray:
     """Effects (K,) found at this level with this power, where the variance has these parts (3, K).
 
-    An effect is found where it, and the mean's error, exceed half the interval's width. So it is a quantile of
-    that half less the error, over tables drawn with these variances and with `groups` degrees of freedom.
+    An effect is found where it and the mean's error exceed half the interval's width. So it is a quantile
+    of that half less the error, over tables drawn with these variances and with `groups` degrees of freedom.
     """
     z, estimates = _draws(seeds, groups)
     true = parts + parts[2] * [[1], [1], [0]]  # A and B hold the noise

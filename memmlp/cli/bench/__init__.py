@@ -1,4 +1,4 @@
-"""`memmlp bench`: claims about speed, sweeps and searches under kills, and verdicts, measured on this machine."""
+"""`memmlp bench`: claims about speed, sweeps under kills and verdicts, measured on this machine."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ ERROR, LEAST, MOST = 0.06, 0.93, 0.995
 """The promises: family-wise error at most, coverage at least, and at most from 3 seeds and 5 groups on."""
 
 MARGIN, EFFECT = 8.0, 16.0
-"""Where half the arms differ: the smallest effect of interest, and theirs, in standard errors at all seeds."""
+"""Where half of the arms differ: the smallest effect of interest and theirs, in standard errors."""
 CAMPAIGNS = 1000  # tables with effects, a cell
 
 
@@ -46,19 +46,19 @@ SHARES = {
     "groups": Shares(groups=1),
     "clips": Shares(clips=1),
     "noise": Shares(noise=1),
-    "seeds, groups": Shares(seeds=1, groups=1),
-    "seeds, clips": Shares(seeds=1, clips=1),
-    "seeds, noise": Shares(seeds=1, noise=1),
-    "groups, clips": Shares(groups=1, clips=1),
-    "groups, noise": Shares(groups=1, noise=1),
-    "clips, noise": Shares(clips=1, noise=1),
+    "seeds+groups": Shares(seeds=1, groups=1),
+    "seeds+clips": Shares(seeds=1, clips=1),
+    "seeds+noise": Shares(seeds=1, noise=1),
+    "groups+clips": Shares(groups=1, clips=1),
+    "groups+noise": Shares(groups=1, noise=1),
+    "clips+noise": Shares(clips=1, noise=1),
     "equal": Shares(seeds=1, groups=1, clips=1, noise=1),
     "skewed": Shares(skewed=1),
-    "seeds, skewed": Shares(seeds=1, skewed=1),
-    "groups, skewed": Shares(groups=1, skewed=1),
-    "skewed, noise": Shares(skewed=1, noise=1),
-    "skewed, some noise": Shares(skewed=20, noise=1),
-    "noise, some seeds": Shares(seeds=1, noise=20),
+    "seeds+skewed": Shares(seeds=1, skewed=1),
+    "groups+skewed": Shares(groups=1, skewed=1),
+    "skewed+noise": Shares(skewed=1, noise=1),
+    "skewed+noise/20": Shares(skewed=20, noise=1),
+    "seeds/20+noise": Shares(seeds=1, noise=20),
     "equal, skewed": Shares(seeds=1, groups=1, skewed=1, noise=1),
 }
 
@@ -82,7 +82,7 @@ class Cell(NamedTuple):
 
 
 class Look(NamedTuple):
-    """Of K comparisons' first seeds, where every kind of effect gives the mean of all seeds a variance of 1."""
+    """Of K comparisons' first seeds; every kind of effect gives the mean of all seeds a variance of 1."""
 
     noise: np.ndarray  # the seeds' means (K, S) of it
     variance: np.ndarray  # E of it (K,)
@@ -119,8 +119,8 @@ class Sample:
         return known, by_seed.mean(1) + self.means @ weights[1:4]
 
 
-def draw(rng: np.random.Generator, cell: Cell, comparisons: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means by group of effects of groups, clips and skewed clips (K, 3, G), and of noise (K, S, G); weights (G,)."""
+def draw(rng: np.random.Generator, cell: Cell, comparisons: int) -> tuple[np.ndarray, ...]:
+    """Effects of groups, clips and skewed clips as means by group (K, 3, G), noise too (K, S, G); weights."""
     seeds, clips, _ = cell
     by_clip = np.sqrt(clips) * np.stack(
         [rng.normal(size=(comparisons, clips)), rng.exponential(size=(comparisons, clips)) - 1], 1
@@ -165,7 +165,7 @@ def _any(claims: np.ndarray) -> np.ndarray:
 
 
 def summary(counts: Sequence[Counts]) -> dict[str, float]:
-    """Rates, and the power for the effect that an oracle, who knows the variances, finds in 80 % of tables."""
+    """Rates, and the power where an oracle, who knows the variances, finds the effect in 80 % of tables."""
     from scipy.special import ndtri
 
     covered, starred, in_looks, found = map(np.concatenate, zip(*counts, strict=True))
@@ -266,7 +266,9 @@ def broken(row: dict[str, Any], capped: bool) -> list[str]:
     ]
 
 
-HEADER = ("seeds", "clips", "a group", "coverage", "a star", "worst of", "in looks", "power", "effect", "spent", "decided")  # fmt: skip
+HEADER = (
+    "design", "coverage", "star", "of", "looks", "power", "effect", "seeds", "decided",
+)  # fmt: skip
 
 
 def columns(row: dict[str, Any]) -> list[str]:
@@ -275,32 +277,32 @@ def columns(row: dict[str, Any]) -> list[str]:
     error, worst = extreme(row, "error", max)
     equal, spent = row["shares"]["equal"], row["campaign"]
     return [
-        *(str(row[name]) for name in ("seeds", "clips", "size")),
-        f"{least:.1f} to {most:.1f}",
+        f"{row['seeds']} x {row['clips']} / {row['size']}",
+        f"{least:.1f}-{most:.1f}",
         f"{100 * error:.1f}",
         worst,
         f"{100 * extreme(row, 'sequential_error', max)[0]:.1f}",
         f"{100 * equal['power']:.0f}",
-        f"{equal['effect_ratio']:.2f}",
+        f"{equal['effect_ratio']:.3g}",
         f"{spent['seeds']:.1f}",
-        f"{100 * spent['decided']:.0f} / {100 * spent['decided_at_once']:.0f}",
+        f"{100 * spent['decided']:.0f}/{100 * spent['decided_at_once']:.0f}",
     ]
 
 
 def remarks(rows: Sequence[dict[str, Any]], seed: int) -> list[str]:
     """What the columns say."""
     tables = rows[0]["tables"]
-    deviation = 100 * np.sqrt(LEVEL * (1 - LEVEL) / tables)
+    star, covered = (100 * np.sqrt(LEVEL * (1 - LEVEL) / number) for number in (tables, tables * TABLE))
     return [
-        f"{tables} tables of {TABLE} true nulls a cell and shares of variance ({len(SHARES)} of them), seed {seed}. "
-        f"Standard error of a family-wise error of 5 %: {deviation:.2f} %, of a coverage of 95 % "
-        f"{deviation / np.sqrt(TABLE):.2f} %; of many cells the worst is read, which is above its true rate.",
-        "coverage: of the 95 % interval, least and most over the shares, in %.",
-        "a star: tables with any after Holm, in %, where most; in looks: the same, where seeds are added in looks.",
-        "power: in %, where an oracle that knows the variances has 80 %; effect: found in 80 % of tables, over "
-        "the oracle's; both with equal shares, at Holm's first step.",
-        f"spent: seeds an arm, with equal shares, where every other arm differs by {EFFECT:.0f} standard errors "
-        f"and {MARGIN:.0f} are of interest; decided: comparisons, in %, so and with all seeds at once.",
+        f"design: seeds x clips / clips of a group; {tables} tables of {TABLE} true nulls for each of them and "
+        f"of {len(SHARES)} choices of shares of variance, seed {seed}",
+        f"coverage: of the 95 % interval, least and most over the shares, in % (standard error {covered:.2f})",
+        f"star: tables with any after Holm, in % (standard error {star:.2f}), with the shares of the most; "
+        "looks: the same, where seeds are added in looks; the worst of many cells is above its true rate",
+        "power: in %, of an effect that an oracle, who knows the variances, finds in 80 %; effect: found in "
+        "80 %, over the oracle's; both with equal shares, at Holm's first step",
+        f"seeds: of an arm, in looks, with equal shares, where every other arm differs by {EFFECT:.0f} standard "
+        f"errors and {MARGIN:.0f} are of interest; decided: comparisons, in %, so / with all seeds at once",
     ]
 
 
@@ -309,9 +311,9 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
     from rich import box
     from rich.table import Table
 
-    shown = Table(box=box.SIMPLE_HEAD)
+    shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for name in HEADER:
-        shown.add_column(name, justify="left" if name == "worst of" else "right", no_wrap=True)
+        shown.add_column(name, justify="left" if name == "of" else "right", no_wrap=True)
     for row, after in itertools.zip_longest(rows, rows[1:]):
         shown.add_row(*columns(row), end_section=bool(after) and after["seeds"] != row["seeds"])
     return shown
@@ -319,7 +321,7 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
 
 def markdown(rows: Sequence[dict[str, Any]], seed: int) -> str:
     """For the documentation."""
-    lines = [HEADER, ["---" if name == "worst of" else "---:" for name in HEADER], *map(columns, rows)]
+    lines = [HEADER, ["---" if name == "of" else "---:" for name in HEADER], *map(columns, rows)]
     text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     return "\n".join([text, "", *(f"- {line}" for line in remarks(rows, seed))]) + "\n"
 
