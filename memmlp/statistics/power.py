@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import bisect
 import functools
 
 import numpy as np
 from scipy.special import chdtri, ndtri
 from scipy.stats import qmc
 
-from memmlp.statistics.crossed import Error, Groups, by_group, error, freedoms, satterthwaite
+from memmlp.statistics.crossed import Error, Groups, error
 from memmlp.statistics.effects import LEVEL
 
 DRAWS = 4096  # of the error and its estimate; a power of two, for Sobol's sequence
@@ -20,13 +21,12 @@ def detectable(
     """Effects (K,) that tables like these differences (K, S, C) would call significant with this power.
 
     At the first, strictest step of Holm's correction over so many comparisons. The variances that were
-    measured are taken for the true ones, effects of groups for normal. NaN with one seed or one group.
+    measured are taken for the true ones, all effects for normal. NaN with one seed or one group.
     """
     known = error(differences, groups)
     if known.conditional:
         return np.full(len(differences), np.nan)
-    _, weights = by_group(differences, groups)
-    return _detectable(components(known), differences.shape[1], weights, LEVEL / comparisons, power)
+    return found(components(known), differences.shape[1], known.groups, LEVEL / comparisons, power)
 
 
 def seeds_needed(
@@ -39,53 +39,46 @@ def seeds_needed(
 ) -> int | None:
     """The fewest seeds with which this effect would be found, by one comparison's differences (S, C).
 
-    As `detectable`, with the seeds' and the noise's share of the variance divided by the seeds. None where not
-    even `most` would do, because the groups of clips are too few or too unlike, and where one seed or one
-    group tells nothing.
+    As `detectable`, the shares of seeds and noise divided by the seeds. None where not even `most` would do,
+    because the groups of clips are too few or too unlike, and with one seed or one group.
     """
-    known = error(differences.reshape(1, *differences.shape[-2:]), groups)
+    matrix = differences.reshape(1, *differences.shape[-2:])
+    known = error(matrix, groups)
     if known.conditional:
         return None
-    _, weights = by_group(differences.reshape(1, *differences.shape[-2:]), groups)
 
     def enough(seeds: int) -> bool:
-        share = differences.shape[-2] / seeds
-        parts = components(known) * np.array([[share], [1], [share]])
-        return bool(_detectable(parts, seeds, weights, LEVEL / comparisons, power)[0] <= abs(effect))
+        share = matrix.shape[1] / seeds
+        parts = components(known) * [[share], [1], [share]]
+        return bool(found(parts, seeds, known.groups, LEVEL / comparisons, power)[0] <= abs(effect))
 
     if not enough(most):
         return None
-    few, many = 1, most  # one seed alone never decides
-    while many - few > 1:
-        middle = (few + many) // 2
-        few, many = (few, middle) if enough(middle) else (middle, many)
-    return many
+    return bisect.bisect_left(range(most), True, lo=2, key=enough)
 
 
 def components(known: Error) -> np.ndarray:
-    """The share (3, K) of seeds, of groups and of noise in the means' variances."""
+    """The shares (3, K) of seeds, groups and noise in the means' variances."""
     seeds, groups, noise = known.variances
     return np.stack([np.maximum(seeds - noise, 0), np.maximum(groups - noise, 0), noise])
 
 
-def _detectable(
-    parts: np.ndarray, seeds: int, weights: np.ndarray, level: float, power: float
-) -> np.ndarray:
-    """Effects (K,) found at this level with this power where the variance has these parts (3, K).
+def found(parts: np.ndarray, seeds: int, groups: float, level: float, power: float) -> np.ndarray:
+    """Effects (K,) found at this level with this power, where the variance has these parts (3, K).
 
-    An effect is found where it and the mean's error are more than half the interval's width. So it is the
-    quantile of half the width less the error, over tables drawn with these variances.
+    An effect is found where it and the mean's error exceed half the interval's width. So it is a quantile
+    of that half less the error, over tables drawn with these variances and with `groups` degrees of freedom.
     """
-    z, estimates = _draws(seeds, float(satterthwaite(weights)))
-    seeds_, groups, noise = parts[:, :, None] + np.stack([parts[2], parts[2], 0 * parts[2]])[:, :, None]
-    drawn = np.stack(np.broadcast_arrays(seeds_, groups, noise)) * estimates[:, None]
-    half = Error(drawn.reshape(3, -1), freedoms(seeds, weights), "").half(level).reshape(len(parts[0]), -1)
+    z, estimates = _draws(seeds, groups)
+    true = parts + parts[2] * [[1], [1], [0]]  # A and B hold the noise
+    drawn = (true[:, :, None] * estimates[:, None]).reshape(3, -1)
+    half = Error(drawn, seeds - 1, groups).half(level).reshape(-1, DRAWS)
     return np.quantile(half - np.sqrt(parts.sum(0))[:, None] * z, power, axis=1)
 
 
 @functools.cache
 def _draws(seeds: int, groups: float) -> tuple[np.ndarray, np.ndarray]:
-    """Standard normal errors (DRAWS,) and what the three variances are estimated to be of the true, (3, DRAWS)."""
+    """Standard normal errors (DRAWS,), and A, B and E over their expectations (3, DRAWS)."""
     uniform = qmc.Sobol(4, seed=0).random(DRAWS).T
-    true = np.array([[seeds - 1], [groups], [(seeds - 1) * groups]])
-    return ndtri(uniform[0]), chdtri(true, uniform[1:]) / true
+    freedoms = np.array([[seeds - 1], [groups], [(seeds - 1) * groups]])
+    return ndtri(uniform[0]), chdtri(freedoms, uniform[1:]) / freedoms

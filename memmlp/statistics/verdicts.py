@@ -11,7 +11,7 @@ from memmlp.statistics.effects import LEVEL
 
 
 class Verdict(StrEnum):
-    """What a comparison says: of the paper's effect, or of the difference alone where the paper has no sign."""
+    """What a comparison says: of the paper's effect, or of the difference where the paper has no sign."""
 
     HOLDS = "holds"
     OPPOSITE = "opposite"
@@ -71,7 +71,10 @@ def looks(most: int) -> tuple[int, ...]:
 
 
 def spending(number: int) -> tuple[float, ...]:
-    """The level that each of so many looks may spend; together 5 %, so that nothing need be assumed of them."""
+    """The level that each of so many looks may spend; together 5 %, so that nothing need be assumed of them.
+
+    Twice as much at every look: of weights growing by 1, 2 and 3 these lost few decisions and few seeds.
+    """
     weights = 2.0 ** np.arange(number)
     return tuple(map(float, LEVEL * weights / weights.sum()))
 
@@ -82,7 +85,7 @@ def sequential(p: np.ndarray, claimed: np.ndarray, closed: np.ndarray) -> np.nda
     What was decided stays so. Comparisons that this family has claimed leave the correction of the others;
     those that are closed without a claim, because the other family decided them or their arm has stopped,
     stay in it as ones that can't be claimed any more. A first wrong claim then needs a p-value of a true null
-    below the look's level over the number of true nulls, at a look fixed beforehand: the looks' levels add up.
+    below the look's level over their number, at a look fixed beforehand: the looks' levels add up.
 
     Args:
         p: p-values (K,) of this look; NaN where there is none, which never decides.
