@@ -2,7 +2,8 @@
 
 `stream` is live use: one frame at a time, the network's own history, the last frame of each window kept.
 `window` is AGRoL's: non-overlapping windows whose T frames all count; the tail window is shifted back and
-its overlap dropped.
+its overlap dropped. A network that recalls the window which ended one frame before is led through each window
+frame by frame, so that it recalls what it was trained on: in one call it would get the window of T frames ago.
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ class Network(Protocol):
     frame: Frame
     frames: int
 
+    @property
+    def shift(self) -> int:
+        """Frames by which its own past, which it sees, ends before the newest; 0 without one."""
+
     def initial_state(self, batch: int = 1) -> State:
         """A fresh start."""
 
@@ -36,9 +41,21 @@ class Network(Protocol):
         """New inputs (B, n, 54) -> motion (B, newest or T, 198) in the world, and the new state."""
 
 
-@torch.no_grad()
 def stream(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
     """Motion (N, 198) in the world of clips' frames (N, 252), frame by frame."""
+    return frame_by_frame(network, clips, 1)
+
+
+def window(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
+    """Motion (N, 198) in the world of clips' frames (N, 252), by non-overlapping windows."""
+    if 0 < network.shift < network.frames:
+        return frame_by_frame(network, clips, network.frames)
+    return window_by_window(network, clips)
+
+
+@torch.no_grad()
+def frame_by_frame(network: Network, clips: Sequence[Tensor], size: int) -> list[Tensor]:
+    """Motion (N, 198) of clips (N, 252): of each `size` frames, and of what is left, as the last call made them."""
     order = sorted(range(len(clips)), key=lambda i: -len(clips[i]))
     lengths = [len(clips[i]) for i in order]
     inputs = torch.nn.utils.rnn.pad_sequence([clips[i][:, :SPARSE_DIM] for i in order], batch_first=True)
@@ -49,14 +66,17 @@ def stream(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
         while lengths[active - 1] <= t:  # the clips are sorted: those that ended are the last ones
             active -= 1
             state = {name: tensor[:active] for name, tensor in state.items()}
-        output, state = network.advance(inputs[:active, t : t + 1], state, 1)
-        motion[:active, t] = output[:, -1]
+        since = t - t % size
+        output, state = network.advance(inputs[:active, t : t + 1], state, t + 1 - since)
+        motion[:active, since : t + 1] = output[
+            :, since - t - 1 :
+        ]  # over what earlier calls made of these frames
     return [motion[order.index(i), : len(clip)] for i, clip in enumerate(clips)]
 
 
 @torch.no_grad()
-def window(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
-    """Motion (N, 198) in the world of clips' frames (N, 252), by non-overlapping windows."""
+def window_by_window(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
+    """Motion (N, 198) of clips (N, 252), T new frames at each call."""
     size = network.frames
     padded = [_at_least(clip[:, :SPARSE_DIM], size) for clip in clips]
     order = sorted(range(len(clips)), key=lambda i: -len(padded[i]))

@@ -6,11 +6,13 @@ import torch
 from torch import nn
 
 from memmlp.body import MOTION_DIM, ROTATION, SPARSE_DIM, builtin_rest_joints
-from memmlp.evaluation import stream
+from memmlp.data.dataset import WindowSampler
+from memmlp.evaluation import stream, window
 from memmlp.features import Frame, Heading, HeadRelative, World
 from memmlp.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory
 from memmlp.model import MemMLP
 from memmlp.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
+from memmlp.rollout import TeacherForcing
 from memmlp.vqvae import VQVAE
 
 MEMORIES = [
@@ -88,7 +90,7 @@ def test_memory_sees_the_shifted_past(shift):
 
 @pytest.mark.parametrize("shift", ["frame", "window"])
 @torch.no_grad()
-def test_in_window_mode_the_past_is_the_window_before(shift):
+def test_the_past_of_a_call_of_a_window_is_the_window_before(shift):
     """Inputs and output of the call before, whatever the shift."""
     model = tiny.model(CodeMemory, shift=shift)
     seen = []
@@ -101,6 +103,36 @@ def test_in_window_mode_the_past_is_the_window_before(shift):
     torch.testing.assert_close(
         seen[2].motion, model.frame.encode_motion(outputs[1], place), atol=1e-5, rtol=0
     )
+
+
+@pytest.mark.parametrize(("shift", "back"), [("frame", 1), ("window", 7)])
+@torch.no_grad()
+def test_in_window_mode_a_memory_recalls_what_it_was_trained_on(shift, back):
+    """The window that ends `shift` before the newest frame of each one, as teacher forcing had it."""
+    model, clip, seen = tiny.model(CodeMemory, shift=shift), tiny.clip(24), []
+    model.blocks[1].register_forward_hook(lambda module, args, output: seen.append(args[1].sparse))
+    found, size = window(model, [clip])[0], model.frames
+    encoded = model.frame.encode(clip)[None, :, :SPARSE_DIM]
+    kept = seen[size - 1 :: size] if shift == "frame" else seen
+    for t, past in zip(range(size - 1, 24, size), kept, strict=False):
+        expected = torch.cat([encoded[:, :1].expand(-1, back + size, -1), encoded], 1)[:, t + 1 :][:, :size]
+        torch.testing.assert_close(past, expected)
+    trained = TeacherForcing().draw(model, tiny.frames((24,)), WindowSampler(tiny.frames((24,)), 4, 7, 0), 0)
+    model.advance(trained.sparse, trained.state)
+    inputs = model.frame.encode(trained.truth)[..., :SPARSE_DIM]
+    torch.testing.assert_close(seen[-1][:, back:], inputs[:, :-back])
+    assert found.shape == (24, MOTION_DIM)
+
+
+@torch.no_grad()
+def test_in_window_mode_a_frame_by_frame_network_shows_each_windows_last_call():
+    """Windows of 7, and of what is left; each clip side by side as alone."""
+    model, clips = tiny.model(CodeMemory, shift="frame"), [tiny.clip(24), tiny.clip(9, seed=1)]
+    outputs = run(model, clips[0][None, :, :SPARSE_DIM])
+    expected = torch.cat([outputs[6][0], outputs[13][0], outputs[20][0], outputs[23][0, -3:]])
+    found = window(model, clips)
+    torch.testing.assert_close(found[0], expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(found[1], window(model, clips[1:])[0], atol=1e-5, rtol=0)
 
 
 @torch.no_grad()

@@ -24,10 +24,19 @@ class Frames:
         frames: [X | Theta] (F, 252), float32, world.
         starts, lengths: of the clips (C,), int64, on the device of `frames`.
         names: of the clips.
+        groups: of the clips, what belongs together having one name; by default each clip is its own.
     """
 
-    def __init__(self, frames: Tensor, starts: Tensor, lengths: Tensor, names: list[str]):
+    def __init__(
+        self,
+        frames: Tensor,
+        starts: Tensor,
+        lengths: Tensor,
+        names: list[str],
+        groups: list[str] | None = None,
+    ):
         self.frames, self.starts, self.lengths, self.names = frames, starts, lengths, names
+        self.groups = groups or list(names)
 
     @classmethod
     def open(cls, cache: Path, split: str) -> Frames:
@@ -45,13 +54,12 @@ class Frames:
             raise InputError(f"{cache}: {split}.npy is not the manifest's array; prepare the data again")
         starts = torch.tensor([clip.start for clip in clips])
         lengths = torch.tensor([clip.length for clip in clips])
-        return cls(frames, starts, lengths, [clip.name for clip in clips])
+        return cls(frames, starts, lengths, [clip.name for clip in clips], [clip.group for clip in clips])
 
     def to(self, device: torch.device | str) -> Frames:
         """The same frames on a device."""
-        return Frames(
-            self.frames.to(device), self.starts.to(device), self.lengths.to(device), list(self.names)
-        )
+        tensors = (self.frames.to(device), self.starts.to(device), self.lengths.to(device))
+        return Frames(*tensors, list(self.names), list(self.groups))
 
     def __len__(self) -> int:
         """Number of clips."""

@@ -15,7 +15,7 @@ import zipfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -25,11 +25,12 @@ from filelock import FileLock
 
 from memmlp.body import FPS, FRAME_DIM, load_rest_joints
 from memmlp.data.clip import Clip, read_clip, resample
-from memmlp.data.splits import PARTS, Split
+from memmlp.data.splits import PARTS, Split, group_names
 from memmlp.errors import InputError
 from memmlp.progress import track
 
-FORMAT = 1  # of the cache; a new number makes every cache anew
+FORMAT = 2  # of the cache; a new number makes every cache anew
+FRAMES = 1  # of what a frame holds; a new number changes every digest, and so makes every run anew
 CHUNK = 4096  # frames turned into features at a time
 MANIFEST = "manifest.json"
 ITEM_BYTES = FRAME_DIM * 4
@@ -61,6 +62,7 @@ class ClipRecord:
     Attributes:
         name: path below the data root without suffix.
         split: "train", "val" or "test".
+        group: the clips that it belongs with (`splits.group_names`), its own name where it is alone.
         start, length: its frames in that split's array.
         sha256: digest of the source file.
         fps: frame rate found.
@@ -69,6 +71,7 @@ class ClipRecord:
 
     name: str
     split: str
+    group: str
     start: int
     length: int
     sha256: str
@@ -86,7 +89,7 @@ class Skipped:
 
 @dataclass(frozen=True)
 class Survey:
-    """What is in a folder: sound clips (without a split yet), bad files, npz files without motion."""
+    """What is in a folder: sound clips (without split and group yet), bad files, npz files without motion."""
 
     clips: tuple[ClipRecord, ...]
     skipped: tuple[Skipped, ...]
@@ -98,9 +101,10 @@ class Manifest:
     """What a cache holds; `manifest.json`.
 
     Attributes:
-        digest: sha256 over everything that determines the frames.
+        digest: sha256 over everything that determines the frames and their split. Groups, of which no
+            training knows, are not in it.
         request: sha256 over the settings and each source's path, size and time, to find it again.
-        body: "builtin" or the name of the model file.
+        body: "builtin", or the model file's name and a digest of its rest pose: "model.npz 0a1b2c3d".
         rest_joints: rest positions (22, 3), metres.
         split: the split's settings.
         min_frames: shortest clip taken, frames at 60 Hz.
@@ -147,6 +151,11 @@ class Manifest:
     def rest(self) -> np.ndarray:
         """Rest positions (22, 3), metres, float64."""
         return np.array(self.rest_joints)
+
+    @cached_property
+    def groups(self) -> dict[str, str]:
+        """clip name -> its group: what statistics count as one."""
+        return {clip.name: clip.group for clip in self.clips}
 
     def part(self, split: str) -> list[ClipRecord]:
         """The clips of a split, in the order of its array."""
@@ -207,15 +216,16 @@ def _make(source: Source, rest: np.ndarray, request: str, out: Path) -> Manifest
     found = survey(source.root, source.min_frames, source.strict)
     if not found.clips:
         raise InputError(_no_clips(source.root, found))
-    assignment = source.split.assign([clip.name for clip in found.clips])
-    clips = _place(found.clips, assignment.parts)
+    names = [clip.name for clip in found.clips]
+    assignment = source.split.assign(names)
+    clips = _place(found.clips, assignment.parts, group_names(names, source.split.groups))
     if not any(clip.split == "train" for clip in clips):
         raise InputError(f"{source.root}: no clip for training (data.root, data.split); give it other data")
     bad = {_name(file.file) for file in found.skipped}
     manifest = Manifest(
         digest=_digest(clips, rest, source.min_frames),
         request=request,
-        body="builtin" if source.body == "builtin" else Path(source.body).name,
+        body=_body(source.body, rest),
         rest_joints=tuple(map(tuple, rest.tolist())),
         split=source.split.describe(),
         min_frames=source.min_frames,
@@ -307,7 +317,7 @@ def _inspect(path: Path, file: str, min_frames: int) -> ClipRecord:
         raise InputError(f"{path}: {len(clip)} frames at {FPS} Hz, fewer than {min_frames} (data.min_frames)")
     with open(path, "rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    return ClipRecord(name, "", 0, len(clip) - 1, digest, fps, how)
+    return ClipRecord(name, "", "", 0, len(clip) - 1, digest, fps, how)
 
 
 def _load(path: Path, name: str) -> tuple[Clip, float, str]:
@@ -321,14 +331,21 @@ def _name(file: str) -> str:
     return file.removesuffix(".npz")
 
 
-def _place(clips: Sequence[ClipRecord], parts: Mapping[str, str | None]) -> tuple[ClipRecord, ...]:
-    """The clips that have a part, each with its place in that part's array."""
+def _body(body: str, rest: np.ndarray) -> str:
+    """The name of a body: model files of all bodies are called alike."""
+    return "builtin" if body == "builtin" else f"{Path(body).name} {_hash(rest.tolist())[:8]}"
+
+
+def _place(
+    clips: Sequence[ClipRecord], parts: Mapping[str, str | None], groups: Mapping[str, str]
+) -> tuple[ClipRecord, ...]:
+    """The clips that have a part, each with its group and its place in that part's array."""
     ends = dict.fromkeys(PARTS, 0)
     placed = []
     for clip in clips:
         part = parts[clip.name]
         if part is not None:
-            placed.append(ClipRecord(**{**asdict(clip), "split": part, "start": ends[part]}))
+            placed.append(replace(clip, split=part, group=groups[clip.name], start=ends[part]))
             ends[part] += clip.length
     return tuple(placed)
 
@@ -345,7 +362,7 @@ def _total(clips: Sequence[ClipRecord], part: str) -> dict[str, float]:
 
 def _digest(clips: Sequence[ClipRecord], rest: np.ndarray, min_frames: int) -> str:
     sources = [(clip.name, clip.split, clip.sha256) for clip in clips]
-    return _hash([FORMAT, min_frames, rest.tolist(), sources])
+    return _hash([FRAMES, min_frames, rest.tolist(), sources])
 
 
 def _request(source: Source, rest: np.ndarray) -> str:

@@ -62,6 +62,11 @@ class Split(Protocol):
         """Everything that determines `assign`, ready for JSON, without a path of this machine."""
         ...
 
+    @property
+    def groups(self) -> Sequence[str]:
+        """Patterns of clips that belong together."""
+        ...
+
 
 @dataclass(frozen=True)
 class SeededSplit:
@@ -152,6 +157,15 @@ class SubsetSplit:
 
     def describe(self) -> dict[str, Any]:
         return {"kind": "subsets", "train": list(self.train), "test": list(self.test), **_carving(self)}
+
+
+def group_names(names: Iterable[str], patterns: Sequence[str]) -> dict[str, str]:
+    """clip name -> the name of its group: that of the first of its clips, its own where it is alone.
+
+    Clips of one group are no replications of each other: two dancers of one recording, say. Raises
+    InputError for a pattern that is none.
+    """
+    return {name: group[0] for group in _grouped(names, patterns) for name in group}
 
 
 def _carving(split: SeededSplit | ListSplit | SubsetSplit) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import json
 import multiprocessing
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -126,6 +127,59 @@ def test_two_processes_at_once(root, tmp_path):
 def test_the_manifest_has_no_absolute_path(root, tmp_path):
     prepare(source(root), tmp_path / "cache")
     assert str(tmp_path) not in json.dumps(json.loads((tmp_path / "cache" / "manifest.json").read_text()))
+
+
+def test_every_clip_knows_its_group(root, tmp_path):
+    """Ties are transitive: 1, 2 and 3 are one group through two patterns, and named after its first clip."""
+    tied = SeededSplit(0.2, 0.2, groups=["a/[12]$", "a/[23]$"])
+    manifest = prepare(source(root, split=tied), tmp_path / "cache")
+    expected = {f"a/{n}": "a/1" if n in (1, 2, 3) else f"a/{n}" for n in range(10)}
+    assert manifest.groups == expected
+    assert Manifest.load(tmp_path / "cache").groups == expected
+    for part in ("train", "val", "test"):
+        frames = Frames.open(tmp_path / "cache", part).to("cpu")
+        assert frames.groups == [expected[name] for name in frames.names]
+    alone = prepare(source(root), tmp_path / "alone")
+    assert alone.groups == {name: name for name in expected}
+
+
+def test_other_groups_make_the_cache_anew_and_no_run(root, tmp_path):
+    """Where the split is the same, the digest that runs are known by is."""
+    tied = SeededSplit(0, 0, groups=["a/[12]$"])
+    first, second = (
+        prepare(source(root, split=split), tmp_path / "cache") for split in (SeededSplit(0, 0), tied)
+    )
+    assert {clip.split for clip in (*first.clips, *second.clips)} == {"train"}
+    assert first.digest == second.digest
+    assert (first.groups["a/2"], second.groups["a/2"]) == ("a/2", "a/1")
+
+
+def test_a_cache_from_before_there_were_groups_is_made_anew(root, tmp_path):
+    path = tmp_path / "cache" / "manifest.json"
+    first = prepare(source(root), tmp_path / "cache")
+    old = json.loads(path.read_text())
+    old["format"] = 1
+    for clip in old["clips"]:
+        del clip["group"]
+    path.write_text(json.dumps(old))
+    with pytest.raises(InputError, match="format 1, not 2; prepare the data again"):
+        Manifest.load(tmp_path / "cache")
+    assert prepare(source(root), tmp_path / "cache") == first
+
+
+def test_the_manifest_names_the_body(root, tmp_path):
+    """Model files of all bodies have one name: a digest of the rest pose tells them apart."""
+    names = [prepare(source(root), tmp_path / "builtin").body]
+    parents = np.array([[-1, *module.load_rest_joints.__globals__["PARENTS"][1:]], range(22)])
+    for size in (0.9, 1.1):
+        model = tmp_path / str(size) / "model.npz"
+        model.parent.mkdir()
+        body = builtin_rest_joints() * size
+        np.savez(model, J_regressor=np.eye(22), v_template=body, kintree_table=parents)
+        names.append(prepare(source(root, body=str(model)), tmp_path / f"cache{size}").body)
+    assert names[0] == "builtin"
+    assert all(re.fullmatch(r"model\.npz [0-9a-f]{8}", name) for name in names[1:])
+    assert len(set(names)) == 3
 
 
 def test_nothing_to_prepare_is_one_line(tmp_path):
