@@ -319,6 +319,7 @@ def train_run(
 ) -> None:
     """Train one network, and mark its run as done."""
     begin(experiment, run, motion_identity(experiment, manifest.digest), experiment.config)
+    run.write_manifest({"body": manifest.body})
     started = time.monotonic()
     model = trained(experiment, run, cache, manifest, upstream, watch)
     checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
@@ -334,7 +335,10 @@ def evaluate_run(experiment: Experiment, run: Run, cache: Path, modes: Sequence[
     test = Frames.open(cache, "test").to(experiment.device)
     for mode in modes:
         found = evaluation.evaluate(model, test, [mode], experiment.evaluation_batch, experiment.ik)
-        rows = [{key: row[key] for key in ("name", "frames")} | row[mode] for row in found["clips"]]
+        rows = [
+            {"name": row["name"], "frames": row["frames"], "group": group} | row[mode]
+            for row, group in zip(found["clips"], test.groups, strict=True)
+        ]
         report = {"mode": mode, "settings": evaluation_settings(experiment.config, mode)}
         report |= {"mean": found["mean"][mode], "clips": rows, **machine(experiment)}
         write_report(run.evaluation(experiment.evaluations[mode]), report)

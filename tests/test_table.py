@@ -174,6 +174,17 @@ def test_a_row_has_its_own_control(sweep: Sweep, tmp_path: Path):
     assert "of 'no | memory' from 'by position'" in " ".join(printed(table, 200).split())
 
 
+def test_one_head_is_told_by_its_positions(tmp_path: Path):
+    """Those of a network without a position branch are its rotations', to rounding."""
+    run = fake_run(tmp_path, "a")
+    assert not load(run.folder).one_head
+    for mode in ("stream", "window"):
+        report = json.loads(run.evaluation(f"{mode}-0").read_text())
+        mean = {"rotation": {"MPJPE": 26.688274383}, "position": {"MPJPE": 26.688272476}}
+        write_report(run.evaluation(f"{mode}-0"), {"mode": mode, "mean": mean, "clips": report["clips"]})
+    assert load(run.folder).one_head
+
+
 def test_another_branch_and_what_has_one_head(sweep: Sweep, tmp_path: Path):
     source = replace(sweep, branch_source="the text says so").with_branch("combined")
     find = fake_sweep(tmp_path, sweep)
@@ -222,6 +233,8 @@ def test_seeds_that_the_papers_effects_need(sweep: Sweep, tmp_path: Path):
         assert fewer[key].seeds <= (need.seeds or 1000)
     assert fewer["no | memory", "stream", "MPJPE"].seeds <= 3 < found["no | memory", "stream", "MPJPE"].seeds
     assert needs(replace(sweep, seeds=(0,)), runs_of(replace(sweep, seeds=(0,)), find)) == []
+    one = fake_sweep(tmp_path / "one", sweep, groups=dict.fromkeys(CLIPS, "one"))
+    assert needs(sweep, runs_of(sweep, one)) == []
 
 
 def test_costs_come_from_the_latency(table: Table):

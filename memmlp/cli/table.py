@@ -195,7 +195,7 @@ def plans_on_screen(found: Sequence[Found], modes: Sequence[str]) -> None:
         if wanted:
             click.echo(_needed(wanted))
         else:
-            click.echo("no arm and its control have two seeds each, and an effect that the paper prints")
+            click.echo("no arm with an effect that the paper prints has two seeds and two groups of clips")
         click.echo()
 
 

@@ -69,7 +69,7 @@ def with_existing_branches(sweep: Sweep, runs: Mapping[str, Runs]) -> Sweep:
 
     def single(arm: Arm) -> bool:
         found = runs.get(arm.label, {}).values()
-        return bool(found) and not any(run.has("position") for run in found)
+        return bool(found) and all(run.one_head for run in found)
 
     arms = tuple(replace(arm, branch="rotation") if single(arm) else arm for arm in sweep.arms)
     return replace(sweep, arms=arms)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,8 @@ from memmlp.runs import Run, intact
 
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # mode -> branch -> metric -> value
 UNKNOWN = "?"
+SHARED = "MPJPE"  # a metric that both branches have
+SAME = 1e-4  # relative difference of errors up to which they are of the same joints: float32, six digits kept
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,13 @@ class Measured:
     def has(self, branch: str) -> bool:
         """Whether the network was evaluated in that branch."""
         return any(branch in branches for branches in self.means.values())
+
+    @property
+    def one_head(self) -> bool:
+        """Whether the network has rotations alone: what it has of positions is theirs by forward kinematics."""
+        pairs = [(of.get("rotation", {}), of.get("position", {})) for of in self.means.values()]
+        errors = [(float(ours[SHARED]), float(of[SHARED])) for of, ours in pairs if SHARED in ours]
+        return all(math.isclose(one, other, rel_tol=SAME) for one, other in errors)
 
 
 def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:

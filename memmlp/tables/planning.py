@@ -31,15 +31,15 @@ class Need(NamedTuple):
 def needs(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str] = MODES) -> list[Need]:
     """Of every arm and metric whose effect the paper prints, in the table's order.
 
-    The correction is over the comparisons that the runs allow today. Where two runs an arm are missing there
-    is nothing to learn the spread from, and the arm is left out.
+    The correction is over the comparisons that the runs allow today. Under two seeds or two groups of clips
+    there is nothing to learn the spread from, and the arm is left out.
     """
     seen = with_existing_branches(sweep, runs)
     pairs, arms = paired(seen, runs, modes), {arm.label: arm for arm in seen.arms}
     found = []
     for key, pair in pairs.items():
         effect = paper_effect(seen, arms[key.label], key.metric)
-        if effect and len(pair.matrix) > 1:
+        if effect and len(pair.matrix) > 1 and len(set(pair.groups)) > 1:
             number = seeds_needed(pair.matrix, effect, len(pairs), pair.groups)
             found.append(Need(*key, effect, float(pair.matrix.mean()), len(pair.matrix), number))
     return found

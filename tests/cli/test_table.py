@@ -52,7 +52,7 @@ def test_command_plans_seeds(memmlp: Memmlp, planned: None):
     assert len(rows) == 3 * 4
     assert all(row[-2] == "3" or row[-3] == "3" for row in rows)
     assert "needed: seeds for an effect of the paper's size" in out
-    assert "no arm and its control" in memmlp("table", "1", "--plan").out
+    assert "no arm with an effect" in memmlp("table", "1", "--plan").out
 
 
 def test_command_writes_the_format_of_the_ending(memmlp: Memmlp, planned: None, tmp_path: Path):
