@@ -92,10 +92,13 @@ class Measured:
 
     @property
     def one_head(self) -> bool:
-        """Whether the network has rotations alone: what it has of positions is theirs by forward kinematics."""
-        pairs = [(of.get("rotation", {}), of.get("position", {})) for of in self.means.values()]
-        errors = [(float(ours[SHARED]), float(of[SHARED])) for of, ours in pairs if SHARED in ours]
-        return all(math.isclose(one, other, rel_tol=SAME) for one, other in errors)
+        """Whether the network has rotations alone: its positions are theirs by forward kinematics."""
+        pairs = [
+            [_number(self.means, mode, branch, SHARED) for branch in ("rotation", "position")]
+            for mode in self.means
+        ]
+        known = [(one, other) for one, other in pairs if one is not None and other is not None]
+        return all(math.isclose(one, other, rel_tol=SAME) for one, other in known)
 
 
 def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
