@@ -2,8 +2,9 @@
 
 `stream` is live use: one frame at a time, the network's own history, the last frame of each window kept.
 `window` is AGRoL's: non-overlapping windows whose T frames all count; the tail window is shifted back and
-its overlap dropped. A network that recalls the window which ended one frame before is led through each window
-frame by frame, so that it recalls what it was trained on: in one call it would get the window of T frames ago.
+its overlap dropped. A network that recalls the window which ended one frame before is led through each
+window frame by frame, so that it recalls what it was trained on: in one call it would get the window of T
+frames ago. What it shows of a window is its last call's output.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def window(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
 
 @torch.no_grad()
 def frame_by_frame(network: Network, clips: Sequence[Tensor], size: int) -> list[Tensor]:
-    """Motion (N, 198) of clips (N, 252): of each `size` frames, and of what is left, as the last call made them."""
+    """Motion (N, 198) of clips (N, 252), of each `size` frames (and those left) as the last call made it."""
     order = sorted(range(len(clips)), key=lambda i: -len(clips[i]))
     lengths = [len(clips[i]) for i in order]
     inputs = torch.nn.utils.rnn.pad_sequence([clips[i][:, :SPARSE_DIM] for i in order], batch_first=True)
@@ -68,9 +69,7 @@ def frame_by_frame(network: Network, clips: Sequence[Tensor], size: int) -> list
             state = {name: tensor[:active] for name, tensor in state.items()}
         since = t - t % size
         output, state = network.advance(inputs[:active, t : t + 1], state, t + 1 - since)
-        motion[:active, since : t + 1] = output[
-            :, since - t - 1 :
-        ]  # over what earlier calls made of these frames
+        motion[:active, since : t + 1] = output[:, since - t - 1 :]  # over what earlier calls made
     return [motion[order.index(i), : len(clip)] for i, clip in enumerate(clips)]
 
 
@@ -106,7 +105,8 @@ def evaluate(
     """
     clips = frames.clips()
     rows: list[dict[str, Any]] = [
-        {"name": name, "frames": len(clip)} for name, clip in zip(frames.names, clips, strict=True)
+        {"name": name, "group": group, "frames": len(clip)}
+        for name, group, clip in zip(frames.names, frames.groups, clips, strict=True)
     ]
     for mode in modes:
         for row, clip, motion in zip(rows, clips, predict(network, clips, mode, batch), strict=True):

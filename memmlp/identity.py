@@ -103,7 +103,10 @@ def evaluation_settings(config: Mapping[str, Any], mode: str) -> dict[str, Any]:
     group = config.get("evaluation", {})
     ik = group.get("ik", "off")
     solver = {"ik": ik} | ({"ik_iterations": group.get("ik_iterations")} if ik != "off" else {})
-    return {"mode": mode, **solver, **_inference(config)}
+    groups = ((config.get("data") or {}).get("split") or {}).get(
+        "groups"
+    )  # its rows say who belongs together
+    return {"mode": mode, **solver, **_inference(config), **({"groups": groups} if groups else {})}
 
 
 def deployment_id(config: Mapping[str, Any]) -> str:

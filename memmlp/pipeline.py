@@ -135,11 +135,12 @@ class Experiment:
     data: Motion
     architecture: Architecture
     vqvae_config: dict[str, Any]
-    vqvae_optim: Optim
+    vqvae_optim: Callable[[int], Optim]  # of the number of training frames
     vqvae_seed: int
     loss: Callable[[frozenset[str]], Loss]
     rollout: Rollout
     optim: Optim
+    weighting: str  # of the windows' draws
     modes: Sequence[str]
     evaluation_batch: int
     ik: IK
@@ -297,8 +298,9 @@ def vqvae_run(experiment: Experiment, cache: Path, manifest: Manifest) -> Run:
         torch.manual_seed(experiment.vqvae_seed)
         frame = experiment.architecture.frame(manifest, frames.frames).to(experiment.device)
         model = experiment.architecture.vqvae().to(experiment.device)
-        task = VQVAETask(model, frame, frames, validation, experiment.vqvae_optim, experiment.vqvae_seed)
-        train(task, experiment.vqvae_optim, run, experiment.vqvae_seed, "VQ-VAE")
+        optim = experiment.vqvae_optim(len(frames.frames))
+        task = VQVAETask(model, frame, frames, validation, optim, experiment.vqvae_seed)
+        train(task, optim, run, experiment.vqvae_seed, "VQ-VAE")
         checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
         write_json(run.results_path, {"val": task.validate()})
         run.write_manifest({"seconds": {"train": round(time.monotonic() - started, 1)}})
@@ -335,10 +337,7 @@ def evaluate_run(experiment: Experiment, run: Run, cache: Path, modes: Sequence[
     test = Frames.open(cache, "test").to(experiment.device)
     for mode in modes:
         found = evaluation.evaluate(model, test, [mode], experiment.evaluation_batch, experiment.ik)
-        rows = [
-            {"name": row["name"], "frames": row["frames"], "group": group} | row[mode]
-            for row, group in zip(found["clips"], test.groups, strict=True)
-        ]
+        rows = [{key: row[key] for key in ("name", "group", "frames")} | row[mode] for row in found["clips"]]
         report = {"mode": mode, "settings": evaluation_settings(experiment.config, mode)}
         report |= {"mean": found["mean"][mode], "clips": rows, **machine(experiment)}
         write_report(run.evaluation(experiment.evaluations[mode]), report)
@@ -390,6 +389,7 @@ def trained(
         experiment.optim,
         experiment.seed,
         validate=lambda network: evaluation.quick_stream(network, pieces),
+        weighting=experiment.weighting,
     )
     train(task, experiment.optim, run, experiment.seed, "network", watch)
     return model.eval()

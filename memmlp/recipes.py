@@ -51,7 +51,7 @@ RECIPES: dict[str, int] = {
     # how they are evaluated (memmlp.evaluation, memmlp.metrics, memmlp.ik)
     "metrics": 1,
     "mode.stream": 1,
-    "mode.window": 2,
+    "mode.window": 1,
     "ik.lbfgs": 1,
     # how they are shipped (memmlp.export, memmlp.streaming, memmlp.quantization, memmlp.latency)
     "export": 1,

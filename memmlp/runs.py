@@ -304,7 +304,7 @@ class Run:
         """
         found, config = read_json(self.results_path), self.config
         reports = [read_json(path) for path in self.evaluations.glob("*.json")]
-        own = [report for report in reports if used_as_configured(report["settings"], config)]
+        own = [report for report in reports if used_as_configured(report.get("settings", {}), config)]
         for report in sorted(own, key=lambda report: report["made"]):
             found[report["mode"]] = {**found.get(report["mode"], {}), **report["mean"]}
         latency = read_json(self.shipped.latency)

@@ -158,10 +158,11 @@ class MotionTask:
         optim: Optim,
         seed: int,
         validate: Callable[[WindowModel], dict[str, float]],
+        weighting: str = "frames",
     ):
         self.model, self.loss, self.rollout, self.frames = model, loss, rollout, frames
         self.module: nn.Module = nn.ModuleDict({"model": model, "loss": loss, "rollout": rollout})
-        self.sampler = WindowSampler(frames, batch=optim.batch, window=model.frames, seed=seed)
+        self.sampler = WindowSampler(frames, optim.batch, model.frames, seed, weighting)
         self.learn = torch.compile(model.learn) if optim.compile else model.learn
         self._validate = validate
 

@@ -20,30 +20,26 @@ from memmlp.cli.build import build_experiment
 from memmlp.cli.shipped import shipped
 from memmlp.cli.train import composed
 from memmlp.data.dataset import Frames
-from memmlp.pipeline import MOTION_ARTIFACTS
 from memmlp.runs import Run, list_runs
 
 
 def motion_run(folder: Path) -> Run:
-    return next(run for run in list_runs(folder / "outputs") if run.manifest["kind"] == "memmlp")
+    """The run that was there at first."""
+    return [run for run in list_runs(folder / "outputs") if run.manifest["kind"] == "memmlp"][-1]
 
 
 def test_a_run_leaves_everything(home):
     run = motion_run(home)
     assert run.done
     assert run.verify() == []
-    for name in (
-        *MOTION_ARTIFACTS,
-        "config.yaml",
-        "manifest.json",
-        "metrics.jsonl",
-        "checkpoint.safetensors",
-    ):
+    for name in ("config.yaml", "manifest.json", "metrics.jsonl", "checkpoint.safetensors"):
         assert (run.folder / name).stat().st_size > 0
+    assert run.shipped.done
+    assert len(list(run.evaluations.iterdir())) == 2
     assert set(run.results) == {"window", "stream", "latency"}
     assert run.results["stream"]["rotation"]["MPJPE"] > 0
     assert run.results["latency"]["steps"] >= 200
-    assert run.manifest["onnx_parity"] < 1e-4
+    assert run.results["latency"]["onnx_parity"] < 1e-4
     upstream = Run.of(home / "outputs", run.manifest["upstream"])
     assert upstream.done
     assert upstream.manifest["kind"] == "vqvae"
@@ -61,15 +57,19 @@ def test_the_same_command_finds_the_run_and_others_share_the_vqvae(home):
     before = {run.id: run.marker.stat().st_mtime_ns for run in list_runs(home / "outputs")}
     assert "finished already" in command(home, "train", *TINY, INT8)
     assert {run.id: run.marker.stat().st_mtime_ns for run in list_runs(home / "outputs")} == before
-    command(home, "train", *TINY, "seed=1", "evaluation.modes=[stream]")
-    kinds = [run.manifest["kind"] for run in list_runs(home / "outputs")]
-    assert sorted(kinds) == ["memmlp", "memmlp", "vqvae"]
+    for more, codes in ((["vqvae.seed=0"], 1), ([], 2)):  # by default a VQ-VAE follows its run's seed
+        command(home, "train", *TINY, "seed=1", "evaluation.modes=[stream]", *more)
+        kinds = [run.manifest["kind"] for run in list_runs(home / "outputs")]
+        assert kinds.count("vqvae") == codes
 
 
 def test_eval_repeats_the_runs_numbers_and_saves_predictions(home):
     run = motion_run(home)
     first = next(r for r in list_runs(home / "outputs") if "window" in r.results)
-    command(home, "eval", first.id[:6], "--save-predictions", "predictions", "--json", "again.json")
+    said = command(home, "eval", first.id[:6], "--json", "found.json")
+    assert "measured before" in said
+    words = ("--again", "--save-predictions", "predictions", "--json", "again.json")
+    assert "evaluation done" in command(home, "eval", first.id[:6], *words)
     again = json.loads((home / "again.json").read_text())
     for branch, values in again["mean"]["stream"].items():
         assert values == pytest.approx(first.results["stream"][branch], rel=1e-4)
@@ -82,6 +82,40 @@ def test_eval_repeats_the_runs_numbers_and_saves_predictions(home):
     head = arrays["predicted_positions"][:, 15] - arrays["true_positions"][:, 15]
     assert np.abs(head).max() < 1e-5
     assert run.done
+
+
+def test_a_mode_a_solver_or_a_precision_is_that_stages_work_alone(home):
+    """On a run that is trained: not one step more, and the run's own results stay what they were."""
+    run = motion_run(home)
+    weights, log, results = run.model.read_bytes(), run.metrics_path.read_bytes(), run.results
+    stages = [path.name for path in (*run.evaluations.iterdir(), *run.deployments.iterdir())]
+    ik = ("evaluation.ik=lbfgs", "evaluation.ik_iterations=1")
+    assert "evaluation done" in command(home, "eval", run.id, *ik)
+    assert "finished already" in command(home, "train", *TINY, INT8, *seed_of(run), *ik)
+    assert "deployment done" in command(home, "eval", run.id, "export.precision=fp32", "export.graph=naive")
+    assert "evaluation and deployment done" in command(home, "eval", run.id, "memory.blend=1")
+    assert "changes the training" in command(home, "eval", run.id, "memory.shift=frame", code=2)
+    assert "evaluation.ik=guess" in command(home, "eval", run.id, "evaluation.ik=guess", code=2)
+    assert (run.model.read_bytes(), run.metrics_path.read_bytes()) == (weights, log)
+    now = Run(run.folder).results
+    assert set(now["stream"]) == {*results["stream"], "combined"}
+    assert now["stream"]["rotation"] == results["stream"]["rotation"]  # of m = 0.5, and not of the last one
+    made = [path.name for path in (*run.evaluations.iterdir(), *run.deployments.iterdir())]
+    assert len(made) == len(stages) + 2 + 1 + 3
+
+
+def seed_of(run: Run) -> list[str]:
+    """What makes the run's command line."""
+    return [f"seed={run.config['seed']}", f"vqvae.seed={run.config['vqvae']['seed']}"]
+
+
+def test_a_run_of_other_code_under_the_same_recipes_is_said(home, monkeypatch):
+    run = motion_run(home)
+    changed = {**run.manifest["sources"], "losses.py": "0" * 12}
+    monkeypatch.setattr("memmlp.runs.sources", lambda: changed)
+    assert run.changed_sources == ["losses.py"]
+    said = " ".join(command(home, "train", *TINY, INT8, *seed_of(run)).split())
+    assert "before the code of losses.py changed" in said
 
 
 def test_the_live_stream_of_a_run(home, memmlp, monkeypatch):

@@ -29,7 +29,10 @@ def a_run(outputs: Path, name: str = "0" * 16) -> Run:
     for step in range(1, 6):
         run.log(step, {"loss": 1 / step, "bad": math.nan})
     write_json(run.results_path, {"stream": {"rotation": {"MPJPE": 6.5}}, "note": "text"})
-    run.onnx.write_bytes(b"onnx")
+    place = run.deployment("fp32-0")
+    place.folder.mkdir(parents=True, exist_ok=True)
+    place.onnx.write_bytes(b"onnx")
+    place.finish({"settings": {}})
     run.checkpoint.write_bytes(b"large")
     return run
 
@@ -96,7 +99,7 @@ def test_params_and_results(projected: Path):
 def test_small_artifacts_lie_in_the_outputs(projected: Path):
     (run,) = shown(projected)
     names = {item.path for item in client_of(projected).list_artifacts(run.info.run_id)}
-    assert names == {"config.yaml", "results.json", "step.onnx"}
+    assert names == {"config.yaml", "results.json", "step.onnx", "latency.json"}
     assert (projected / "mlflow-artifacts").is_dir()
 
 

@@ -9,6 +9,9 @@ import tiny
 import torch
 
 from memmlp import checkpoint
+from memmlp.cli.build import build_experiment
+from memmlp.cli.train import composed
+from memmlp.data.dataset import WindowSampler
 from memmlp.errors import InputError, TrainingDiverged
 from memmlp.losses import HandPosition, MotionLoss, Uncertainty
 from memmlp.rollout import OwnPredictions, PersistentStreams, TeacherForcing
@@ -52,6 +55,23 @@ TASKS = {
     **{name: partial(reference_task, name) for name in tiny.REFERENCES},
     "vqvae": vqvae_task,
 }
+
+
+def test_the_weighting_of_the_data_decides_which_clips_a_step_sees():
+    """Clips of 60, 45 and 80 frames have 54, 39 and 74 windows of 7: by windows the last is drawn most."""
+    drawn = {}
+    for weighting in ("frames", "clips"):
+        experiment = build_experiment(composed([f"data.weighting={weighting}"]))
+        task = motion_task()
+        task = MotionTask(
+            task.model, task.loss, TeacherForcing(), task.frames, replace(OPTIM, batch=3000), 0,
+            task.validate, experiment.weighting,
+        )  # fmt: skip
+        drawn[weighting] = torch.bincount(task.sampler.draw(0)[0], minlength=3) / 3000
+    expected = {"frames": torch.tensor([54, 39, 74]) / 167, "clips": torch.ones(3) / 3}
+    for weighting, shares in expected.items():
+        torch.testing.assert_close(drawn[weighting], shares, atol=0.03, rtol=0)
+    assert torch.equal(motion_task().sampler.draw(3)[1], WindowSampler(tiny.frames(), 4, 7, 0).draw(3)[1])
 
 
 class Kill(Exception):

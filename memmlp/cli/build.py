@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from memmlp.cli.schema import check, restored
 from memmlp.deployment import Deployment
 from memmlp.errors import InputError
 from memmlp.features import Frame, Heading, HeadRelative, World
+from memmlp.identity import flatten
 from memmlp.ik import IK, LBFGS, NoIK
 from memmlp.losses import Loss, MotionLoss
 from memmlp.memory import Memory
@@ -54,11 +56,12 @@ def build_experiment(cfg: DictConfig) -> pipeline.Experiment:
         data=build_motion(cfg),
         architecture=build_architecture(cfg),
         vqvae_config={"frame": config["frame"], "vqvae": config["vqvae"]},
-        vqvae_optim=build_vqvae_optim(cfg),
+        vqvae_optim=partial(build_vqvae_optim, cfg),
         vqvae_seed=cfg.vqvae.seed,
         loss=build_loss(cfg),
         rollout=built(cfg.rollout),
         optim=Optim(**config["optim"]),
+        weighting=cfg.data.weighting,
         modes=list(cfg.evaluation.modes),
         evaluation_batch=cfg.evaluation.batch,
         ik=build_ik(cfg),
@@ -131,10 +134,11 @@ def build_ik(cfg: DictConfig) -> IK:
     return LBFGS(cfg.evaluation.ik_iterations)
 
 
-def build_vqvae_optim(cfg: DictConfig) -> Optim:
-    """Adam as App. A has it; its epochs are steps here."""
+def build_vqvae_optim(cfg: DictConfig, frames: int) -> Optim:
+    """Adam as App. A has it; an epoch is as many frames as there are in training."""
+    steps = cfg.vqvae.steps or math.ceil(cfg.vqvae.epochs * frames / cfg.vqvae.batch)
     return Optim(
-        steps=cfg.vqvae.steps,
+        steps=steps,
         batch=cfg.vqvae.batch,
         lr=cfg.vqvae.lr,
         schedule="milestones",
@@ -142,7 +146,7 @@ def build_vqvae_optim(cfg: DictConfig) -> Optim:
         betas=(0.9, 0.99),
         decoupled=False,
         checkpoint_every=cfg.optim.checkpoint_every,
-        validate_every=cfg.vqvae.steps,
+        validate_every=steps,
         log_every=cfg.optim.log_every,
     )
 
@@ -154,6 +158,8 @@ def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
     """
     if not run.done or run.manifest.get("kind") != "memmlp":
         raise InputError(f"run {run.id}: not a finished Mem-MLP run")
+    if foreign := sorted(name for name in _targets(run.config) if not name.startswith("memmlp.")):
+        raise InputError(f"{run.config_path}: {', '.join(foreign)}: allowed are classes of memmlp")
     try:
         cfg = restored(run.config)
     except (OmegaConfBaseException, KeyError, TypeError, ValueError) as error:
@@ -163,6 +169,11 @@ def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
         _override(cfg, word)
     check(cfg)
     return cfg
+
+
+def _targets(tree: Mapping[str, Any]) -> list[str]:
+    """The paths of all classes that a config names."""
+    return [str(value) for key, value in flatten(tree).items() if key.rsplit(".", 1)[-1] == "_target_"]
 
 
 def _override(cfg: DictConfig, word: str) -> None:

@@ -80,8 +80,7 @@ def orphans(sweep: Sweep, plan: Plan) -> list[Entry]:
 
 def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[str, Any]] | None]:
     """The plan, and what it relies on of the data; None where some is not prepared."""
-    entries: list[Entry] = []
-    tasks: list[Task] = []
+    cells: list[tuple[Entry, list[Task]]] = []
     data: dict[str, dict[str, Any]] = {}
     complete = True
     for arm in sweep.runnable():
@@ -90,9 +89,10 @@ def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[s
             complete &= known is not None
             if known is not None:
                 found = tasks_of(experiment, known)
-                entries.append(Entry(arm.label, seed, found[-1].id, found[-1].stages))
-                tasks += found
-    plan = Plan(sweep.name, outputs, tuple(entries), unique(tasks))
+                cells.append((Entry(arm.label, seed, found[-1].id, found[-1].stages), found))
+    cells.sort(key=lambda cell: sweep.seeds.index(cell[0].seed))  # a half-done sweep has every arm
+    tasks = unique(task for _, found in cells for task in found)
+    plan = Plan(sweep.name, outputs, tuple(entry for entry, _ in cells), tasks)
     return plan, list(data.values()) if complete else None
 
 

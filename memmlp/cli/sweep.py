@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
@@ -30,6 +32,7 @@ OPTIONS = ("partition", "time", "mem_gb", "cpus", "gpus", "account", "qos", "con
 @click.option("--status", is_flag=True, help="Show how far it is, and do nothing.")
 @click.option("--dry-run", is_flag=True, help="Show what would be run, and do nothing.")
 @click.option("--retry", is_flag=True, help="Run again what failed.")
+@click.option("--fail-fast", is_flag=True, help="End the sweep with the first run that fails.")
 @click.option("--yes", is_flag=True, hidden=True)
 @outputs_option
 def sweep(
@@ -39,6 +42,7 @@ def sweep(
     status: bool,
     dry_run: bool,
     retry: bool,
+    fail_fast: bool,
     yes: bool,
     outputs: Path,
 ) -> None:
@@ -66,6 +70,7 @@ def sweep(
     if retry:
         for task in plan.tasks:
             plan.run_of(task).retry()
+    plan = replace(plan, fail_fast=fail_fast)
     if plan.left():
         bring_to_end(chosen, plan, engine, options, count)
         track(plan)
@@ -181,22 +186,21 @@ def show(chosen: Sweep, plan: Plan) -> None:
 
 
 def forecast(plan: Plan, workers: int) -> None:
-    """How long what is left may take, from finished runs of the same size."""
+    """How long what is left may take, from finished runs of the same size and kind."""
     left = plan.left()
-    known = [sum(seconds) for task in plan.tasks if (seconds := _seconds(plan, task.id))]
+    known = {kind: _seconds(plan, kind) for kind in {task.kind for task in left}}
     line = f"{len(left)} of {len(plan.tasks)} runs to do, {workers} at once"
-    if known and left:
-        minutes = len(left) * sum(known) / len(known) / workers / 60
-        line += f": about {minutes:.0f} min, by {len(known)} finished runs of it"
+    if left and all(known.values()):
+        minutes = sum(fmean(known[task.kind]) for task in left) / workers / 60
+        line += f": about {minutes:.0f} min, by {sum(map(len, known.values()))} finished runs of it"
     click.echo(line)
 
 
-def _seconds(plan: Plan, run_id: str) -> list[float]:
-    """What the stages of a finished Mem-MLP run took."""
-    from memmlp.runs import Run
-
-    seconds = Run.of(plan.outputs, run_id).manifest.get("seconds")
-    return list(seconds.values()) if isinstance(seconds, dict) else []
+def _seconds(plan: Plan, kind: str) -> list[float]:
+    """What the plan's finished runs of that kind took, all their stages together."""
+    runs = [plan.run_of(task) for task in plan.tasks if task.kind == kind]
+    found = [run.manifest.get("seconds", 0) for run in runs if run.done]
+    return [sum(seconds.values()) if isinstance(seconds, dict) else seconds for seconds in found]
 
 
 def report(chosen: Sweep, plan: Plan, words: Sequence[str]) -> None:

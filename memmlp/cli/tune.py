@@ -16,6 +16,7 @@ from memmlp.cli.options import outputs_option
 from memmlp.errors import InputError
 
 if TYPE_CHECKING:
+    from memmlp.pipeline import Experiment
     from memmlp.search.spec import Search, Value
     from memmlp.search.study import Study
     from memmlp.sweep.plan import Task
@@ -33,9 +34,9 @@ def tune(
     """Search the manual loss weights: the paper's first, then what Optuna proposes.
 
     OVERRIDES are those of `memmlp train` for all trials, those of the search (`search.n_trials=50`,
-    `search.objectives=[MPJPE,Jitter] search.pruner=none`, `+search.space.optim.lr={low: 1e-4, high: 1e-2,
-    log: true}`; `search=NAME` takes conf/search/NAME.yaml), and the executor's of `memmlp sweep`. Started
-    again, it goes on where it was left.
+    `search.seeds=3`, `search.objectives=[MPJPE,Jitter] search.pruner=none`, `+search.space.optim.lr={low:
+    1e-4, high: 1e-2, log: true}`; `search=NAME` takes conf/search/NAME.yaml), and the executor's of `memmlp
+    sweep`. Started again, it goes on where it was left.
     """
     from memmlp.cli.sweep import split_executor
     from memmlp.search.study import Study
@@ -86,6 +87,8 @@ def prepared(words: Sequence[str], config_dir: Path | None, outputs: Path) -> Se
     setup = Setup(wanted, rest, outputs, outputs / "tune" / wanted.name, config_dir)
     base = _check_space(setup)
     counted = {**asdict(wanted), "n_trials": None, "storage": None}
+    if wanted.seeds == 1:
+        del counted["seeds"]  # a search that came before the key is the same one
     return setup._replace(folder=outputs / "tune" / f"{wanted.name}-{digest([base, counted])[:8]}")
 
 
@@ -105,28 +108,38 @@ def _check_space(setup: Setup) -> str:
     for word in setup.words:
         if word.partition("=")[0].lstrip("+") in {one.key for one in space}:
             raise InputError(f"{word}: is searched; leave it out of the space with search.space....=null")
-    _tasks(setup, {}, prepare=False)
+    _experiments(setup, {})
     most = max(len(one.corners()) for one in space)
     for number in range(most):
         corner = {one.key: one.corners()[number % len(one.corners())] for one in space}
         try:
-            _tasks(setup, corner, prepare=False)
+            _experiments(setup, corner)
         except InputError as error:
             raise InputError(f"search.space: {error}") from None
-    return _tasks(setup, setup.search.first(), prepare=True)[-1].id
+    return _tasks(setup, setup.search.first())[0][-1].id
 
 
-def _tasks(setup: Setup, values: Mapping[str, Value], prepare: bool = True) -> Sequence[Task]:
-    """The runs of a trial with those values; none where the data is not to be prepared and isn't."""
-    from memmlp.cli.build import build_experiment
+def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[Task]]:
+    """The runs of a trial with those values, seed by seed, the data prepared for them."""
     from memmlp.cli.plan import tasks_of
+
+    experiments = _experiments(setup, values)
+    return [tasks_of(experiment, experiment.data.prepare()[1].digest) for experiment in experiments]
+
+
+def _experiments(setup: Setup, values: Mapping[str, Value]) -> list[Experiment]:
+    """The checked experiments of a trial with those values: the config's seed, and those that follow it."""
+    from memmlp.cli.build import build_experiment
     from memmlp.cli.train import composed
 
     own = ["--config-dir", str(setup.config_dir)] if setup.config_dir else []
     cfg = composed([*own, *setup.overrides(values)])
     cfg.paths.outputs = str(setup.outputs)
-    experiment = build_experiment(cfg)
-    return tasks_of(experiment, experiment.data.prepare()[1].digest) if prepare else ()
+    first, found = cfg.seed, []
+    for number in range(setup.search.seeds):
+        cfg.seed = first + number
+        found.append(build_experiment(cfg))
+    return found
 
 
 def show(setup: Setup) -> None:

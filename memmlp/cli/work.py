@@ -56,6 +56,7 @@ def check_identity(experiment: Experiment, task: Task) -> None:
 
 
 def check_wanted(path: Path, run_id: str, step: int, values: dict[str, float]) -> None:
-    """Raise Cancelled once the plan in that file has given the run up."""
-    if run_id in Plan.load(path).cancelled:
+    """Raise Cancelled once the plan in that file has given the run up, or all of its runs."""
+    plan = Plan.load(path)
+    if run_id in plan.cancelled or plan.stopped:
         raise Cancelled(f"run {run_id} was cancelled at step {step}")

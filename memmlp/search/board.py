@@ -14,7 +14,7 @@ from rich.text import Text
 
 from memmlp.runs import Run
 from memmlp.search.spec import Search
-from memmlp.search.study import Study
+from memmlp.search.study import Study, deviations
 from memmlp.sweep.board import Screen, progress
 
 SHOWN = 5  # of the best trials
@@ -46,8 +46,11 @@ def line(search: Search, trial: FrozenTrial, ended: int) -> str:
 
 
 def figures(trial: FrozenTrial) -> str:
-    """A trial's objective values."""
-    return ", ".join(f"{value:.3f}" for value in trial.values or [])
+    """A trial's objective values, of several seeds with their standard deviations."""
+    shown = [f"{value:.3f}" for value in trial.values or []]
+    if spread := deviations(trial):
+        shown = [f"{value} ± {sd:.3f}" for value, sd in zip(shown, spread, strict=True)]
+    return ", ".join(shown)
 
 
 def render(study: Study, outputs: Path) -> Group:
@@ -63,11 +66,13 @@ def render(study: Study, outputs: Path) -> Group:
 
 
 def _going(trial: FrozenTrial, outputs: Path) -> Text:
-    """How far a trial's run is."""
-    run = Run.of(outputs, trial.user_attrs.get("run", "-"))
-    if run.status != "running":
-        return Text("waiting")
-    return Text(progress(run, trial.user_attrs["steps"]), style="cyan")
+    """How far a trial's runs are."""
+    runs = [Run.of(outputs, run_id) for run_id in trial.user_attrs.get("runs", ())]
+    states = [run.status for run in runs]
+    done = f"{states.count('done')} seeds done, " if "done" in states else ""
+    if "running" not in states:
+        return Text(f"{done}waiting")
+    return Text(done + progress(runs[states.index("running")], trial.user_attrs["steps"]), style="cyan")
 
 
 def trials_table(search: Search, title: str) -> Table:

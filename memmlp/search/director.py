@@ -1,11 +1,14 @@
-"""The director of a search: asks the study for trials, has their runs made, and tells how they ended."""
+"""The director of a search: asks the study for trials, has their runs made, and tells how they ended.
+
+A trial has a run for each seed. The first seed's decides whether it is pruned; the others' are made after it.
+"""
 
 from __future__ import annotations
 
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from optuna.trial import Trial, TrialState
@@ -20,9 +23,39 @@ from memmlp.sweep.controller import LOOK, Fleet
 from memmlp.sweep.plan import Entry, Plan, Task, unique
 
 HOPELESS = 5  # trials that fail before any other ends
+DROPPED = (TrialState.PRUNED, TrialState.FAIL)  # states of trials whose runs nobody wants any more
 
-Compose = Callable[[Mapping[str, Value]], Sequence[Task]]
-"""From a trial's values to the tasks of its run, its own the last; InputError where they make no sense."""
+Compose = Callable[[Mapping[str, Value]], Sequence[Sequence[Task]]]
+"""From a trial's values to each seed's tasks, its run's the last; InputError where they make no sense."""
+
+
+@dataclass
+class Going:
+    """A trial under way.
+
+    Attributes:
+        seeds: each seed's tasks, its run's the last. wanted: of how many seeds runs are to be made by now.
+    """
+
+    trial: Trial
+    seeds: Sequence[Sequence[Task]]
+    wanted: int = 0
+
+    @property
+    def tasks(self) -> list[Task]:
+        """The tasks that are to be done by now."""
+        return [task for tasks in self.seeds[: self.wanted] for task in tasks]
+
+    @property
+    def runs(self) -> list[str]:
+        """The ids of the seeds' runs that are to be made by now."""
+        return [tasks[-1].id for tasks in self.seeds[: self.wanted]]
+
+    def want(self, count: int) -> None:
+        """Have the runs of that many seeds made; the study keeps which those are."""
+        if count != self.wanted:
+            self.wanted = count
+            self.trial.set_user_attr("runs", self.runs)
 
 
 class Director:
@@ -35,46 +68,58 @@ class Director:
 
     def __init__(self, study: Study, compose: Compose, plan: Plan):
         self.study, self.compose, self.plan = study, compose, plan
-        self.going: dict[int, tuple[Trial, Sequence[Task]]] = {}
+        self.going: dict[int, Going] = {}
         for trial in study.running():
             self._begin(trial)
 
     def look(self, capacity: int) -> Plan:
-        """Tell what ended, ask for new trials up to `capacity` at once, and give the plan as it is now.
+        """Tell what ended, ask for trials up to `capacity` runs at once, and give the plan as it is now.
 
         Raises InputError when the first trials all failed.
         """
         for number in list(self.going):
-            if self._ended(*self.going[number]):
+            if self._ended(self.going[number]):
                 del self.going[number]
-        while len(self.going) < capacity and (trial := self.study.ask()):
+        while self._busy() < capacity and (trial := self.study.ask()):
             self._check_hope()
             self._begin(trial)
         return self._planned()
 
     def _begin(self, trial: Trial) -> None:
-        """Take a trial's run into the plan; a trial whose values make no sense fails."""
+        """Take a trial's first run into the plan; a trial whose values make no sense fails."""
         try:
-            tasks = self.compose(values(trial, self.study.search))
+            going = Going(trial, self.compose(values(trial, self.study.search)))
         except InputError as error:
             self.study.fail(trial, str(error))
             return
-        trial.set_user_attr("steps", total_steps(tasks[-1]))
-        trial.set_user_attr("run", tasks[-1].id)
-        self.going[trial.number] = trial, tasks
+        trial.set_user_attr("steps", total_steps(going.seeds[0][-1]))
+        going.want(1)
+        self.going[trial.number] = going
 
-    def _ended(self, trial: Trial, tasks: Sequence[Task]) -> bool:
-        """Whether the trial has ended; the study is told."""
-        run = self.plan.run_of(tasks[-1])
-        news = self._report(trial, run)
-        if self.plan.complete(tasks[-1]):
-            self.study.complete(trial, objectives(self.study.search.objectives, run))
+    def _ended(self, going: Going) -> bool:
+        """Whether the trial has ended; the study is told. With its first run done it wants the others."""
+        runs = [self.plan.run_of(tasks[-1]) for tasks in going.seeds]
+        done = [self.plan.complete(tasks[-1]) for tasks in going.seeds]
+        news = self._report(going.trial, runs[0])
+        if done[0]:
+            going.want(len(runs))
+        if all(done):
+            self.study.complete(going.trial, [objectives(self.study.search.objectives, run) for run in runs])
             return True
-        for task in tasks:
+        for task in going.tasks:
             if failure := self.plan.run_of(task).failure:
-                self.study.fail(trial, failure)
+                self.study.fail(going.trial, failure)
                 return True
-        return 0 < news < total_steps(tasks[-1]) and self.study.prune(trial)
+        total = total_steps(going.seeds[0][-1])
+        return going.wanted == 1 and 0 < news < total and self.study.prune(going.trial)
+
+    def _busy(self) -> int:
+        """How many workers the trials under way can use: for each, one a run that is wanted and not done."""
+        return sum(max(1, sum(not run.done for run in self._runs(going))) for going in self.going.values())
+
+    def _runs(self, going: Going) -> list[Run]:
+        """A trial's runs that are to be made by now."""
+        return [Run.of(self.plan.outputs, run_id) for run_id in going.runs]
 
     def _report(self, trial: Trial, run: Run) -> int:
         """Report the run's new validations, where there is one objective; the last one's step, 0 for none."""
@@ -88,14 +133,19 @@ class Director:
         return max(news, default=0)
 
     def _planned(self) -> Plan:
-        """The plan of the trials under way; runs of pruned trials are cancelled."""
-        wanted = [(number, tasks[-1].id) for number, (_, tasks) in self.going.items()]
-        pruned = {t.user_attrs.get("run", "") for t in self.study.trials if t.state == TrialState.PRUNED}
+        """The plan of the trials under way; runs of pruned and of failed trials are cancelled."""
+        entries = tuple(
+            Entry(f"trial {number}", seed, run_id)
+            for number, going in self.going.items()
+            for seed, run_id in enumerate(going.runs)
+        )
+        dropped = [trial for trial in self.study.trials if trial.state in DROPPED]
+        cancelled = {run_id for trial in dropped for run_id in trial.user_attrs.get("runs", ())}
         return replace(
             self.plan,
-            entries=tuple(Entry(f"trial {number}", 0, run_id) for number, run_id in wanted),
-            tasks=unique(task for _, tasks in self.going.values() for task in tasks),
-            cancelled=tuple(sorted(pruned - {run_id for _, run_id in wanted})),
+            entries=entries,
+            tasks=unique(task for going in self.going.values() for task in going.tasks),
+            cancelled=tuple(sorted(cancelled - {entry.id for entry in entries})),
         )
 
     def _check_hope(self) -> None:

@@ -17,24 +17,45 @@ from optuna.trial import FrozenTrial, TrialState
 
 from memmlp.files import atomic_write
 from memmlp.search.spec import Search
-from memmlp.search.study import Study, values
+from memmlp.search.study import Study, deviations, values
 
 TABLE = 5  # of the paper: manual weights against learned ones
 
 
 def write_trials(study: Study, path: Path) -> None:
-    """All trials: number, state, objectives, values, run, and the reason of a failure."""
+    """All trials: number, state, objectives, values, runs, and the reason of a failure.
+
+    Of several seeds the objectives are means, with each one's standard deviation and the seeds' own values.
+    """
     names = [objective.text for objective in study.search.objectives]
     keys = [one.key for one in study.search.space]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["trial", "state", *names, *keys, "run", "reason"])
+    writer.writerow(["trial", "state", *names, *_seed_columns(study.search), *keys, "run", "reason"])
     for trial in study.trials:
         figures = trial.values or [""] * len(names)
+        by_seed = _seed_values(study.search, trial)
         params = [trial.params.get(key, "") for key in keys]
-        extra = [trial.user_attrs.get(name, "") for name in ("run", "reason")]
-        writer.writerow([trial.number, trial.state.name.lower(), *figures, *params, *extra])
+        extra = [" ".join(trial.user_attrs.get("runs", ())), trial.user_attrs.get("reason", "")]
+        writer.writerow([trial.number, trial.state.name.lower(), *figures, *by_seed, *params, *extra])
     atomic_write(path, text.getvalue())
+
+
+def _seed_columns(search: Search) -> list[str]:
+    """The heads of what `_seed_values` gives."""
+    if search.seeds == 1:
+        return []
+    names = [objective.text for objective in search.objectives]
+    counted = [f"{name}, run {number}" for number in range(1, search.seeds + 1) for name in names]
+    return [*(f"{name} sd" for name in names), *counted]
+
+
+def _seed_values(search: Search, trial: FrozenTrial) -> list[float | str]:
+    """Each objective's standard deviation over seeds, then the seeds' own values, ordered as the runs."""
+    if search.seeds == 1:
+        return []
+    found = [*deviations(trial), *(value for seed in trial.user_attrs.get("values", ()) for value in seed)]
+    return found or [""] * len(_seed_columns(search))
 
 
 def write_experiments(study: Study, folder: Path, groups: Collection[str]) -> list[Path]:
@@ -64,7 +85,7 @@ def experiment(study: Study, trial: FrozenTrial, groups: Collection[str]) -> str
     head = (
         f"# @package _global_\n# Trial {trial.number} of {len(study.trials)} of the search {search.name}: "
         f"{', '.join(o.text for o in search.objectives)} on validation "
-        f"{', '.join(f'{value:.4f}' for value in trial.values)}; run {trial.user_attrs.get('run')}.\n"
+        f"{', '.join(f'{value:.4f}' for value in trial.values)}; run {' '.join(trial.user_attrs['runs'])}.\n"
     )
     return head + yaml.safe_dump({"defaults": [*options, "_self_"], **tree}, sort_keys=False)
 

@@ -10,6 +10,7 @@ space:                              # a tree of config keys; its leaves are rang
   hand: {choices: ['off', fk]}
 objectives: [MPJPE]                 # on validation, to be lowered; [MPJPE, Jitter] gives a Pareto front
 n_trials: 30                        # in all, however often the search is started
+seeds: 1                            # of each trial, whose value is their mean; pruned on the first
 sampler: tpe                        # or random
 startup: 10                         # random trials (after the first) before TPE learns from them
 seed: 0
@@ -33,8 +34,8 @@ SAMPLERS = ("tpe", "random")
 PRUNERS = ("median", "none")
 BRANCHES = ("rotation", "position")
 KEYS = (
-    "name", "base", "space", "objectives", "n_trials", "sampler", "startup", "seed", "pruner", "prune_after",
-    "storage",
+    "name", "base", "space", "objectives", "n_trials", "seeds", "sampler", "startup", "seed", "pruner",
+    "prune_after", "storage",
 )  # fmt: skip
 RANGE_KEYS = ("low", "high", "log", "step", "choices", "first")
 
@@ -99,6 +100,7 @@ class Search:
     space: tuple[Range, ...]
     objectives: tuple[Objective, ...]
     n_trials: int
+    seeds: int
     sampler: str
     startup: int
     seed: int
@@ -138,6 +140,8 @@ def parse_search(content: Mapping[str, Any]) -> Search:
         )
     if len(objectives) > 1 and content["pruner"] != "none":
         raise InputError(f"search.pruner={content['pruner']}: allowed with two objectives is none")
+    if content["seeds"] != 1 and any(one.key == "seed" for one in space):
+        raise InputError(f"search.seeds={content['seeds']}: allowed is 1 where the space has the seed")
     name = str(content["name"])
     if not re.fullmatch(r"[\w-]{1,64}", name):
         raise InputError(f"search.name={name}: allowed are up to 64 letters, digits, - and _")
@@ -152,6 +156,7 @@ def parse_search(content: Mapping[str, Any]) -> Search:
         space=space,
         objectives=objectives,
         n_trials=_whole(content, "n_trials", 1),
+        seeds=_whole(content, "seeds", 1),
         sampler=_one_of(content, "sampler", SAMPLERS),
         startup=_whole(content, "startup", 1),
         seed=_whole(content, "seed", 0),

@@ -1,7 +1,9 @@
 """The Optuna study of a search. One process owns it: it asks for trials and tells how they ended.
 
-A trial's user attribute "run" is the id of its run. Whatever moment the owner is killed at, the next one
-finds every trial either ended or running, and goes on with the running ones under their numbers.
+Of a trial's user attributes, "runs" has the ids of its runs, a seed's each, as far as they were wanted, and
+"values" the objectives of each seed; the trial's own values are their means over seeds. Whatever moment the
+owner is killed at, the next one finds every trial either ended or running, and goes on with the running ones
+under their numbers.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -111,11 +114,16 @@ class Study:
         self.study.tell(trial.number, state=TrialState.PRUNED)
         return True
 
-    def complete(self, trial: Trial, values: Sequence[float]) -> None:
-        """End the trial with its objectives' values; ones that are no numbers make it a failure."""
+    def complete(self, trial: Trial, values: Sequence[Sequence[float]]) -> None:
+        """End the trial with the means of its seeds' objectives; ones that are no numbers make it a failure.
+
+        values: of each seed, each objective's.
+        """
+        trial.set_user_attr("values", [list(seed) for seed in values])
+        means = [fmean(of_seeds) for of_seeds in zip(*values, strict=True)]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            self.study.tell(trial.number, list(values), skip_if_finished=True)
+            self.study.tell(trial.number, means, skip_if_finished=True)
 
     def fail(self, trial: Trial, reason: str) -> None:
         """End the trial without values."""
@@ -204,6 +212,12 @@ def suggest(trial: Trial, one: Range) -> Value:
     if isinstance(one.low, int) and isinstance(one.high, int):
         return trial.suggest_int(one.key, one.low, one.high, step=int(one.step or 1), log=one.log)
     return trial.suggest_float(one.key, one.low, one.high, step=one.step, log=one.log)
+
+
+def deviations(trial: FrozenTrial) -> list[float]:
+    """The standard deviation over seeds of each objective; empty for a trial of a single seed or none."""
+    by_seed = trial.user_attrs.get("values", [])
+    return np.std(by_seed, axis=0, ddof=1).tolist() if len(by_seed) > 1 else []
 
 
 def values(trial: FrozenTrial | Trial, search: Search) -> Mapping[str, Value]:

@@ -71,9 +71,16 @@ def _change(plan: Plan, task: Task, state: str) -> str:
 
 
 def name(plan: Plan, task: Task) -> str:
-    """The task as a person knows it."""
+    """The task as a person knows it: arm and seed, of a VQ-VAE the seeds whose runs need it."""
     cells = [f"{entry.label} seed {entry.seed}" for entry in plan.entries if entry.key == task.key]
-    return cells[0] if cells else f"VQ-VAE {task.id}"
+    return cells[0] if cells else f"VQ-VAE {task.id}{_seeds(plan, task)}"
+
+
+def _seeds(plan: Plan, upstream: Task) -> str:
+    """The seeds of the entries that need that run."""
+    users = {task.id for task in plan.tasks if task.upstream == upstream.id}
+    seeds = sorted({entry.seed for entry in plan.entries if entry.id in users})
+    return f" of seed {', '.join(map(str, seeds))}" if seeds else ""
 
 
 def render(plan: Plan, states: Mapping[str, str]) -> Group:
@@ -108,7 +115,7 @@ def cell(plan: Plan, task: Task, state: str) -> Text:
 
 
 def _upstream(plan: Plan, task: Task, state: str) -> Text:
-    return Text(f"VQ-VAE {task.id}: ") + cell(plan, task, state)
+    return Text(f"{name(plan, task)}: ") + cell(plan, task, state)
 
 
 def result(run: Run) -> str:

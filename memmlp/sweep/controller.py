@@ -61,7 +61,7 @@ class Fleet:
 
 
 def oversee(plan: Plan, fleet: Fleet, board: Board) -> None:
-    """Keep the fleet at the plan until nothing is left; when interrupted, end the workers.
+    """Keep the fleet at the plan until nothing is left; when stopped or interrupted, end the workers.
 
     Runs that other sweeps' workers are at are waited for.
     """
@@ -72,6 +72,8 @@ def oversee(plan: Plan, fleet: Fleet, board: Board) -> None:
                 fleet.keep(len(left))
                 time.sleep(LOOK)
                 board.update(plan)
+        if plan.stopped:
+            fleet.cancel()
     except BaseException:
         fleet.cancel()
         raise

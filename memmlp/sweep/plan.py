@@ -55,12 +55,13 @@ class Entry:
 
 @dataclass(frozen=True)
 class Plan:
-    """The entries of a sweep and the tasks they need, each once, upstream runs first.
+    """The entries of a sweep and the tasks they need, each once, upstream runs before those that need them.
 
     Attributes:
         name: of the sweep. outputs: folder of the runs' folder.
         open: more tasks may come, so workers stay (a search); a sweep's plan is closed.
         cancelled: ids that no worker shall go on with.
+        fail_fast: the first failed run ends the sweep.
     """
 
     name: str
@@ -69,6 +70,7 @@ class Plan:
     tasks: tuple[Task, ...]
     open: bool = False
     cancelled: tuple[str, ...] = ()
+    fail_fast: bool = False
 
     def run(self, label: str, seed: int) -> Run | None:
         """The run of an arm with a seed, finished or not; None where its identity is not known."""
@@ -97,10 +99,17 @@ class Plan:
         return states
 
     def left(self) -> list[Task]:
-        """The tasks that are neither done nor failed nor blocked nor cancelled."""
+        """The tasks that are neither done nor failed nor blocked nor cancelled; none of a stopped plan."""
+        if self.stopped:
+            return []
         states = self.states()
         ended = ("done", "failed", "blocked")
         return [t for t in self.tasks if states[t.key] not in ended and t.id not in self.cancelled]
+
+    @property
+    def stopped(self) -> bool:
+        """Whether a run failed in a plan that the first failure ends."""
+        return self.fail_fast and "failed" in self.states().values()
 
     def counts(self) -> Counter[str]:
         """How many tasks are in which state."""
@@ -130,6 +139,7 @@ def _stages(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def unique(tasks: Iterable[Task]) -> tuple[Task, ...]:
-    """Each task once, upstream runs first, else in the order given."""
+    """Each task once, in the order given, an upstream run right before the first task that needs it."""
     known = {task.key: task for task in tasks}
-    return tuple(sorted(known.values(), key=lambda task: task.upstream is not None or task.kind != "vqvae"))
+    order = (key for task in known.values() for key in (task.upstream, task.key) if key in known)
+    return tuple(known[key] for key in dict.fromkeys(order))

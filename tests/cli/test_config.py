@@ -12,8 +12,10 @@ from conftest import Memmlp, one_line
 from omegaconf import DictConfig, OmegaConf
 
 from memmlp.cli import schema
+from memmlp.cli.build import build_experiment
 from memmlp.cli.shipped import shipped
 from memmlp.cli.train import composed
+from memmlp.errors import InputError
 from memmlp.identity import NEUTRAL, flatten
 
 GROUPS = {folder.name: sorted(p.stem for p in folder.glob("*.yaml")) for folder in shipped("conf").glob("*/")}
@@ -51,7 +53,7 @@ def test_a_profiles_sizes_reach_every_group(profile: str, memory: str):
     assert (cfg.optim.steps, cfg.optim.batch, cfg.optim.lr) == (sizes.steps, sizes.batch, sizes.lr)
     assert (cfg.vqvae.codes, cfg.vqvae.width) == (sizes.codes, sizes.code_width)
     if memory == "none":
-        assert set(cfg.memory) == {"_target_", "_partial_"}
+        assert set(cfg.memory) == {"name", "_target_", "_partial_"}
     else:
         assert (cfg.memory.layers, cfg.memory.width) == (sizes.memory_layers, sizes.memory_width)
 
@@ -73,6 +75,26 @@ def test_the_most_literal_reading():
     assert (cfg.memory.shift, cfg.memory.history, cfg.memory.fusion) == ("frame", "latest", "residual")
     assert cfg.rollout._target_.endswith("TeacherForcing")
     assert (cfg.optim.steps, cfg.optim.batch, cfg.optim.drop_at) == (300_000, 256, 0.75)
+    assert (cfg.vqvae.epochs, cfg.vqvae.steps, cfg.vqvae.codebook) == (100, None, "gradient")
+    assert (cfg.data.weighting, cfg.evaluation.ik) == ("clips", "lbfgs")
+    assert (composed([]).data.weighting, composed([]).evaluation.ik) == ("frames", "off")
+
+
+def test_a_network_without_positions_has_no_inverse_kinematics_in_the_literal_reading():
+    assert composed(["experiment=paper", "model=agrol_mlp"]).evaluation.ik == "off"
+    with pytest.raises(InputError, match=r"evaluation\.ik=lbfgs needs positions"):
+        composed(["experiment=paper", "model=agrol_mlp", "evaluation.ik=lbfgs"])
+
+
+def test_a_vqvaes_epochs_are_of_the_training_frames():
+    """100 epochs of 1000 frames in batches of 256 are 390.6 steps; steps are steps, whatever the frames."""
+    optim = build_experiment(composed(["profile=paper"])).vqvae_optim
+    assert [optim(frames).steps for frames in (1000, 5_000_000)] == [391, 1_953_125]
+    assert optim(1000).validate_every == 391
+    half = build_experiment(composed(["vqvae.epochs=0.5", "vqvae.steps=null"])).vqvae_optim
+    assert half(5120).steps == 10
+    steps = build_experiment(composed([])).vqvae_optim
+    assert [steps(frames).steps for frames in (1000, 5_000_000)] == [2000, 2000]
 
 
 @pytest.mark.parametrize("name", [n for n in schema.SCHEMAS if n != "config"])
@@ -156,6 +178,10 @@ BAD = [
     (["memory.layers=[2,2]"], ["memory.layers=[2, 2]", "without repetitions"]),
     (["evaluation.modes=[stream,stream]"], ["evaluation.modes", "without repetitions"]),
     (["evaluation.modes=[live]"], ["evaluation.modes=['live']", "window or stream"]),
+    (["vqvae.epochs=3"], ["vqvae.epochs=3.0, vqvae.steps=2000", "one of them", "null"]),
+    (["vqvae.steps=null"], ["vqvae.epochs=None, vqvae.steps=None", "one of them"]),
+    (["vqvae.steps=null", "vqvae.epochs=0"], ["vqvae.epochs=0", "above 0"]),
+    (["data.weighting=even"], ["data.weighting=even", "frames or clips"]),
     (["vqvae.codebook=random"], ["vqvae.codebook=random", "ema or gradient"]),
     (["vqvae.decay=1"], ["vqvae.decay=1", "below 1"]),
     (["frame.coordinates=polar"], ["frame.coordinates=polar", "head_relative or world"]),

@@ -21,6 +21,7 @@ from memmlp.cli.sweep import split_executor
 from memmlp.cli.work import perform
 from memmlp.errors import InputError
 from memmlp.runs import Run, list_runs
+from memmlp.sweep.board import name
 
 ARMS = {"full": [], "none": ["memory=none"], "wild": ["optim.lr=1e30"]}
 
@@ -84,6 +85,42 @@ def test_an_edited_file_adds_arms_and_lists_orphans(home: Path):
     finally:
         write(home, ARMS)
     assert "orphan" not in command(home, "--status")
+
+
+def test_seeds_come_one_after_another_each_with_all_arms(home: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(home)
+    plan = planned(
+        find_sweep("trial.yaml").with_overrides([*TINY, "seed=1,0"]), (home / "outputs").absolute()
+    )
+    cells = [(entry.seed, entry.label) for entry in plan.entries]
+    assert cells == [(seed, arm) for seed in (1, 0) for arm in ARMS]
+    own = [task.id for task in plan.tasks if task.kind == "memmlp"]
+    assert own == [entry.id for entry in plan.entries]
+    for task in plan.tasks:
+        assert task.upstream is None or task.upstream in [
+            other.id for other in plan.tasks[: plan.tasks.index(task)]
+        ]
+    (codes,) = (task for task in plan.tasks if task.kind == "vqvae" and task.id == plan.tasks[0].id)
+    assert name(plan, codes).startswith(f"VQ-VAE {codes.id} of seed ")
+    said = command(home, "seed=1,0", "--status")
+    assert re.search(r"arm +seed 0 +seed 1", said)
+    assert re.search(r"none +done .* cm +waiting", said)
+
+
+def test_the_first_failure_ends_the_sweep_where_that_is_wanted(tmp_path: Path):
+    lasting = ["memory=none", "optim.steps=100000"]
+    write(tmp_path, {"lasting": lasting, "wild": ["memory=none", "optim.lr=1e30"], "late": ["memory=none"]})
+    words = ["sweep", "trial.yaml", *TINY, "--workers", "2", "--fail-fast"]
+    said = run_apart(tmp_path, *words, code=1)
+    assert "0 of 3 runs done" in said
+    assert "wild seed 0: failed, loss is nan" in said
+    assert re.search(r"^failed: run .*: loss is nan", said, re.M)
+    runs = list_runs(tmp_path / "outputs")
+    assert len(runs) <= 2  # the last arm's was not begun
+    wait_for(lambda: not any(run.status == "running" for run in runs))
+    assert [run.status for run in runs].count("failed") == 1
+    assert "0 of 3 runs done" in run_apart(tmp_path, *words, code=1)  # what failed once still ends it
+    assert len(list_runs(tmp_path / "outputs")) == len(runs)
 
 
 def test_retry_takes_failed_runs_up_again(home: Path):

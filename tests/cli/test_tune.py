@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,9 @@ from command_line import run_apart
 from filelock import FileLock
 
 from memmlp.cli.bench.chaos import examine
-from memmlp.cli.tune import prepared
+from memmlp.cli.plan import digest
+from memmlp.cli.tune import _tasks, prepared
+from memmlp.runs import Run
 
 TINY = [*BASE, "optim.validate_every=3"]
 
@@ -62,6 +65,24 @@ def test_the_best_is_an_arm_of_table_5(home: Path):
     assert re.search(r"manual, searched .*1", shown)
 
 
+def test_a_trial_of_two_seeds_goes_on_from_a_search_of_one(home: Path, tmp_path: Path):
+    """The first trial's first run is the one that the search of a seed made; the others follow its seed."""
+    shutil.copytree(home / "outputs/runs", tmp_path / "outputs/runs")
+    shutil.copytree(home / "outputs/data", tmp_path / "outputs/data", copy_function=shutil.copy2)
+    words = ["search.n_trials=1", "search.seeds=2", "--workers", "2"]
+    said = run_apart(tmp_path, "tune", *TINY, *words)
+    assert "1 of 1 trials: 1 complete" in said
+    (before,) = list(csv.DictReader((folder_of(home) / "trials.csv").read_text().splitlines()))[:1]
+    (row,) = csv.DictReader((folder_of(tmp_path) / "trials.csv").read_text().splitlines())
+    first, second = row["run"].split()
+    assert first == before["run"]
+    assert Run.of(tmp_path / "outputs", second).config["seed"] == 1
+    assert row["MPJPE, run 1"] == before["MPJPE"]
+    assert float(row["MPJPE"]) == (float(row["MPJPE, run 1"]) + float(row["MPJPE, run 2"])) / 2
+    assert f"{float(row['MPJPE']):.3f} ± {float(row['MPJPE sd']):.3f}" in said
+    assert "1 complete" in command(tmp_path, "tune", *TINY, *words[:2], "--status")
+
+
 def test_a_second_owner_is_refused(home: Path):
     with FileLock(folder_of(home) / ".lock"):
         said = command(home, "tune", *TINY, "search.n_trials=4", code=2)
@@ -73,6 +94,7 @@ def test_a_second_owner_is_refused(home: Path):
     [
         ("search.n_trial=3", "n_trial"),
         ("search.n_trials=0", "search.n_trials=0: allowed is a whole number"),
+        ("search.seeds=0", "search.seeds=0: allowed is a whole number"),
         ("search=losses", "losses"),
         (
             "search.space.loss.rotation.low=-1",
@@ -108,8 +130,17 @@ def test_what_counts_gives_a_search_of_its_own(tmp_path: Path):
     others = [
         folder("search.seed=1"), folder("search.objectives=[Jitter]"), folder("optim.lr=2e-3"),
         folder("search.space.loss.hand.high=2.0"), folder("search.pruner=none"), folder("seed=3"),
+        folder("search.seeds=2"), folder("search.seeds=3"),
     ]  # fmt: skip
-    assert len({base, *others}) == 7
+    assert len({base, *others}) == 9
+    assert folder("search.seeds=1") == base
+
+
+def test_a_search_of_one_seed_is_the_one_that_came_before_the_key(tmp_path: Path):
+    setup = prepared(TINY, None, tmp_path)
+    first = _tasks(setup, setup.search.first())[0][-1].id
+    counted = {**asdict(setup.search), "n_trials": None, "storage": None}
+    assert setup.folder.name.endswith(digest([first, {k: v for k, v in counted.items() if k != "seeds"}])[:8])
 
 
 def test_a_folder_of_ones_own_searches(tmp_path: Path):
@@ -137,5 +168,5 @@ def test_the_judge_of_a_search_can_say_no(home: Path, tmp_path: Path):
     assert "trial 2: running" in said
     (folder / "trials.csv").write_text("\n".join([rows[0], re.sub(r",\d", ",9", rows[1], count=1), rows[2]]))
     said = "\n".join(examine(outputs, 2))
-    assert "trial 0: not the value of its run" in said
+    assert "trial 0: not the mean of its runs" in said
     assert "of no trial" in said

@@ -10,8 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from memmlp.data.bvh import Bvh, read_bvh
+from memmlp.body import PARENTS, builtin_rest_joints
+from memmlp.data.bvh import END, Bvh, EndSite, read_bvh
+from memmlp.data.clip import Clip
+from memmlp.data.retarget import fit
+from memmlp.data.skeleton import Z_UP, load_skeleton
 from memmlp.errors import InputError
 
 # Joint, parent, offset; a * before an end site's joint, which comes with the offset only.
@@ -61,6 +66,12 @@ class Sample:
             *[" ".join(map(repr, row)) for row in self.values.tolist()],
         ]
         return end.join(lines) + end
+
+    def hierarchy(self) -> Bvh:
+        """What a reader makes of it, without the motion."""
+        ends = tuple(EndSite(self.names[joint] + END, joint, np.array(offset)) for joint, offset in self.ends)
+        tree = (tuple(self.names), tuple(self.parents), np.array(self.offsets), tuple(self.channels), ends)
+        return Bvh(Path("sample.bvh"), *tree, 1 / 120, self.values)
 
     def _joint(self, joint: int) -> list[str]:
         lines = [f"{'JOINT' if joint else 'ROOT'} {self.names[joint]}", "{"]
@@ -163,3 +174,38 @@ def refuse(start: Path | str, *said: str) -> Iterator[None]:
     assert len(message.splitlines()) == 1
     for part in (*said, "; allowed: "):
         assert part in message
+
+
+def performed(skeleton: str, clip: Clip, seed: int = 3) -> Sample:
+    """A clip on the built-in body as a BVH file of a shipped skeleton, behind the zero pose.
+
+    What `retarget` makes of it is the clip, but for body joints without a joint in the file, which keep to
+    their parents.
+    """
+    sample, chosen, rest = (
+        person(skeleton, len(clip) + 1, seed),
+        load_skeleton(skeleton),
+        builtin_rest_joints(),
+    )
+    fitted, world = fit(sample.hierarchy(), chosen, rest), Z_UP @ chosen.upright
+    body = body_rotations(clip)
+    turned = {}
+    for joint, node in reversed(list(enumerate(fitted.nodes))):  # of joints that share a node the first
+        turned[int(node)] = world.T @ body[:, joint] @ fitted.corrections[joint].T @ chosen.upright
+    hips = clip.trans + rest[0] - body[:, 0] @ fitted.anchor
+    sample.values[1:, :3] = hips @ world / (fitted.scale * chosen.unit)
+    for joint, parent in enumerate(sample.parents):
+        above = turned[parent] if parent >= 0 else np.eye(3)
+        local = np.swapaxes(np.broadcast_to(above, body[:, 0].shape), 1, 2) @ turned.setdefault(joint, above)
+        order = "".join(channel[0] for channel in sample.channels[joint][-3:])
+        angles = Rotation.from_matrix(local).as_euler(order, degrees=True)
+        sample.values[1:, 3 + 3 * joint : 6 + 3 * joint] = angles
+    return sample
+
+
+def body_rotations(clip: Clip) -> np.ndarray:
+    """Global rotations (N, 22, 3, 3)."""
+    local = Rotation.from_rotvec(clip.poses.reshape(-1, 3)).as_matrix().reshape(len(clip), -1, 3, 3)
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        local[:, joint] = local[:, parent] @ local[:, joint]
+    return local

@@ -53,5 +53,5 @@ def test_every_kind_of_difference_is_found(tmp_path: Path):
 
 def test_a_run_that_was_begun_again_after_its_end_is_found(tmp_path: Path):
     run = finished(tmp_path, "a")
-    run.write_manifest({"attempts": [{"started": "2999-01-01T00:00:00+00:00"}]})
+    run.write_manifest({"attempts": [{"started": "2999-01-01T00:00:00+00:00", "stage": "training"}]})
     assert check(run.folder) == ["begun again after it was finished"]

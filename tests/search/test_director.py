@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from memmlp.identity import run_id
 from memmlp.runs import Run
 from memmlp.search import results
 from memmlp.search import study as study_module
+from memmlp.search.board import figures
 from memmlp.search.director import Director
 from memmlp.search.spec import Search, Value, parse_search
 from memmlp.search.study import Study, journal, mend
@@ -32,8 +35,8 @@ SPACE = {
 def search(**changes: Any) -> Search:
     content: dict[str, Any] = {
         "name": "mine", "base": ["loss=manual"], "space": {"loss": SPACE}, "objectives": ["MPJPE"],
-        "n_trials": 6, "sampler": "tpe", "startup": 3, "seed": 0, "pruner": "none", "prune_after": 2,
-        "storage": None,
+        "n_trials": 6, "seeds": 1, "sampler": "tpe", "startup": 3, "seed": 0, "pruner": "none",
+        "prune_after": 2, "storage": None,
     }  # fmt: skip
     return parse_search({**content, **changes})
 
@@ -42,9 +45,9 @@ def opened(folder: Path, **changes: Any) -> Study:
     return Study.own(search(**changes), "mine", folder)
 
 
-def compose(values: Mapping[str, Value]) -> list[Task]:
-    config = {"optim": {"steps": STEPS}, "values": dict(values)}
-    return [Task(run_id("memmlp", config, data="d", upstream=None), "memmlp", config)]
+def compose(values: Mapping[str, Value], seeds: int = 1) -> list[list[Task]]:
+    configs = [{"optim": {"steps": STEPS}, "values": dict(values), "seed": seed} for seed in range(seeds)]
+    return [[Task(run_id("memmlp", config, data="d", upstream=None), "memmlp", config)] for config in configs]
 
 
 def director(study: Study, folder: Path, composed: Callable = compose) -> Director:
@@ -52,9 +55,9 @@ def director(study: Study, folder: Path, composed: Callable = compose) -> Direct
 
 
 def error(config: Mapping[str, Any]) -> float:
-    """A bowl with its lowest point at weights of 2 and 0.2."""
+    """A bowl with its lowest point at weights of 2 and 0.2; each seed lies 0.3 above the one before."""
     values = config["values"]
-    return 5 + abs(values["loss.rotation"] - 2) + abs(values["loss.hand"] - 0.2)
+    return 5 + abs(values["loss.rotation"] - 2) + abs(values["loss.hand"] - 0.2) + 0.3 * config["seed"]
 
 
 def log(run: Run, step: int, value: float) -> None:
@@ -81,9 +84,9 @@ def test_a_search_has_the_trials_it_wants_and_the_papers_first(tmp_path: Path):
     to_the_end(study, tmp_path)
     assert [trial.state for trial in study.trials] == [TrialState.COMPLETE] * 6
     assert study.trials[0].params == {"loss.rotation": 1.0, "loss.hand": 0.1}
-    assert len({trial.user_attrs["run"] for trial in study.trials}) == 6
+    assert len({run for trial in study.trials for run in trial.user_attrs["runs"]}) == 6
     for trial in study.trials:
-        assert trial.value == pytest.approx(error({"values": trial.params}))
+        assert trial.value == pytest.approx(error({"values": trial.params, "seed": 0}))
     assert study.best()[0].value == min(trial.value for trial in study.trials)
 
 
@@ -126,7 +129,7 @@ def test_a_director_killed_while_it_asks_loses_and_repeats_nothing(
         calls += 1
         return whole(*arguments)
 
-    def composed(values: Mapping[str, Value]) -> list[Task]:
+    def composed(values: Mapping[str, Value]) -> list[list[Task]]:
         if moment == 2:
             raise KeyboardInterrupt
         return compose(values)
@@ -215,10 +218,11 @@ def test_a_trial_worse_than_the_median_is_pruned_and_its_run_cancelled(tmp_path:
     log(run, 10, 5.2)
     assert run.id in {task.id for task in one.look(1).tasks}  # better than the median of 5 and 6
     run.fail("not of interest here")
+    failed = run.id
     run = begun(one.look(1))
     log(run, 10, 7.0)
     plan = one.look(1)
-    assert plan.cancelled == (run.id,)
+    assert set(plan.cancelled) == {run.id, failed}
     assert run.id not in {task.id for task in plan.tasks}
     assert [trial.state for trial in study.trials[:4]] == [
         *[TrialState.COMPLETE] * 2,
@@ -227,7 +231,7 @@ def test_a_trial_worse_than_the_median_is_pruned_and_its_run_cancelled(tmp_path:
     ]
     assert study.trials[0].intermediate_values == {10: 5.0, 20: 5.0, 30: 5.0}
     resumed = director(opened(tmp_path, pruner="median", prune_after=2), tmp_path)
-    assert resumed.look(1).cancelled == (run.id,)
+    assert set(resumed.look(1).cancelled) == {run.id, failed}
 
 
 def test_no_trial_is_pruned_at_its_last_step_or_without_a_pruner(tmp_path: Path):
@@ -256,7 +260,7 @@ def test_a_failed_run_fails_its_trial_and_the_search_goes_on(tmp_path: Path):
 
 
 def test_values_that_make_no_sense_fail_their_trial_and_hopeless_searches_end(tmp_path: Path):
-    def refused(values: Mapping[str, Value]) -> list[Task]:
+    def refused(values: Mapping[str, Value]) -> list[list[Task]]:
         raise InputError("hand=position needs positions")
 
     study = opened(tmp_path, n_trials=20)
@@ -296,6 +300,119 @@ def test_a_pruned_trials_run_is_wanted_again_by_one_with_its_values(tmp_path: Pa
                 log(run, STEPS, 5.0)
                 run.finish([])
     assert all(trial.state.is_finished() for trial in study.trials[:-1])
+
+
+def seeded(study: Study, folder: Path) -> Director:
+    return director(study, folder, partial(compose, seeds=study.search.seeds))
+
+
+def test_a_trials_value_is_the_mean_of_its_seeds(tmp_path: Path):
+    study = opened(tmp_path, seeds=3, n_trials=2)
+    one = seeded(study, tmp_path)
+    while (plan := one.look(1)).tasks:
+        finish(plan)
+    for trial in study.trials:
+        first = error({"values": trial.params, "seed": 0})
+        assert trial.value == pytest.approx(first + 0.3)
+        assert [value for (value,) in trial.user_attrs["values"]] == pytest.approx(
+            [first, first + 0.3, first + 0.6]
+        )
+        assert figures(trial) == f"{trial.value:.3f} ± 0.300"
+        assert len(set(trial.user_attrs["runs"])) == 3
+
+
+def test_the_other_seeds_wait_for_the_first_ones_end_and_count_for_capacity(tmp_path: Path):
+    one = seeded(opened(tmp_path, seeds=3), tmp_path)
+    plan = one.look(2)
+    assert [(entry.label, entry.seed) for entry in plan.entries] == [("trial 0", 0), ("trial 1", 0)]
+    run = begun(replace(plan, tasks=plan.tasks[:1]))
+    log(run, STEPS, 5.0)
+    run.finish([])
+    plan = one.look(2)
+    assert [(entry.label, entry.seed) for entry in plan.entries] == [
+        ("trial 0", 0), ("trial 0", 1), ("trial 0", 2), ("trial 1", 0),
+    ]  # fmt: skip
+    assert len(plan.left()) == 3
+    assert one.look(4).entries[-1].label == "trial 2"
+
+
+def test_pruning_is_by_the_first_seed_alone(tmp_path: Path):
+    study = opened(tmp_path, seeds=2, pruner="median", prune_after=1)
+    one = seeded(study, tmp_path)
+    for level in (5.0, 6.0):
+        for _ in range(2):
+            run = begun(replace(plan := one.look(1), tasks=tuple(plan.left())))
+            for step in (10, 20, STEPS):
+                log(run, step, level)
+            run.finish([])
+    run = begun(one.look(1))
+    log(run, 10, 50.0)
+    run.finish([])  # before anyone looks: what is done is not pruned
+    second = begun(replace(plan := one.look(1), tasks=tuple(plan.left())))
+    log(second, 20, 50.0)  # a seed on which the trial is bad is part of its mean, and no reason to end it
+    assert second.id in {task.id for task in one.look(1).left()}
+    assert study.trials[2].intermediate_values == {10: 50.0}
+    second.fail("not of interest here")
+    run = begun(one.look(1))
+    log(run, 10, 50.0)
+    plan = one.look(1)
+    assert run.id in plan.cancelled
+    assert study.trials[-2].state == TrialState.PRUNED
+    assert study.trials[-2].user_attrs["runs"] == [run.id]
+
+
+def test_one_failed_seed_fails_the_trial_and_cancels_the_others(tmp_path: Path):
+    study = opened(tmp_path, seeds=3)
+    one = seeded(study, tmp_path)
+    finish(one.look(1))
+    plan = one.look(1)
+    bad, other = (begun(replace(plan, tasks=(task,))) for task in plan.left())
+    bad.fail("the loss is nan")
+    plan = one.look(1)
+    assert study.trials[0].state == TrialState.FAIL
+    assert study.trials[0].user_attrs["reason"] == "the loss is nan"
+    assert {bad.id, other.id} <= set(plan.cancelled)
+    assert other.id not in {task.id for task in plan.tasks}
+
+
+def test_a_director_killed_between_seeds_repeats_and_loses_none(tmp_path: Path):
+    (tmp_path / "calm").mkdir()
+    calm = opened(tmp_path / "calm", seeds=3, n_trials=3)
+    one = seeded(calm, tmp_path / "calm")
+    while (plan := one.look(1)).tasks:
+        finish(plan)
+    stopped = opened(tmp_path, seeds=3, n_trials=3)
+    made: list[str] = []
+    while tasks := (plan := seeded(stopped, tmp_path).look(1)).left():  # a director of its own for each run
+        made.append(tasks[0].id)
+        finish(replace(plan, tasks=tasks[:1]))
+        stopped = opened(tmp_path, seeds=3, n_trials=3)
+    assert len(made) == len(set(made)) == 9
+    assert [trial.values for trial in stopped.trials] == [trial.values for trial in calm.trials]
+    assert [trial.user_attrs["runs"] for trial in stopped.trials] == [
+        trial.user_attrs["runs"] for trial in calm.trials
+    ]
+
+
+def test_trials_of_several_seeds_as_csv(tmp_path: Path):
+    study = opened(tmp_path, seeds=2, n_trials=2, objectives=["MPJPE", "Jitter"])
+    one = seeded(study, tmp_path)
+    finish(one.look(1))
+    finish(one.look(1))
+    begun(one.look(1)).fail("the loss is nan")
+    one.look(1)
+    results.write_trials(study, tmp_path / "trials.csv")
+    with open(tmp_path / "trials.csv", newline="") as file:
+        row, failed = csv.DictReader(file)
+    first = error({"values": study.trials[0].params, "seed": 0})
+    assert float(row["MPJPE"]) == pytest.approx(first + 0.15)
+    assert float(row["MPJPE sd"]) == pytest.approx(0.3 / 2**0.5)
+    assert float(row["MPJPE, run 1"]) == pytest.approx(first)
+    assert float(row["Jitter, run 2"]) == pytest.approx(20 - first - 0.3)
+    assert len(row["run"].split()) == 2
+    assert (failed["state"], failed["MPJPE sd"], failed["reason"]) == ("fail", "", "the loss is nan")
+    (path,) = results.write_experiments(study, tmp_path, ["loss"])
+    assert row["run"] in path.read_text()
 
 
 def test_two_objectives_give_a_front(tmp_path: Path):

@@ -10,8 +10,11 @@ from pathlib import Path
 import pytest
 
 from memmlp.errors import InputError
+from memmlp.sweep import controller
+from memmlp.sweep.board import Board
 from memmlp.sweep.controller import PATIENCE, Fleet
 from memmlp.sweep.executors import Ray, Requeued, Submitit, sbatch
+from memmlp.sweep.plan import Plan, Task
 
 
 def touch(path: str) -> None:
@@ -113,6 +116,30 @@ def test_a_fleet_replaces_the_dead_and_is_no_larger_than_the_work(tmp_path: Path
     assert len(shelf.handles) == 4
     fleet.cancel()
     assert not any(handle.alive() for handle in shelf.handles)
+
+
+@pytest.mark.parametrize("fail_fast", [True, False])
+def test_the_first_failure_ends_the_workers_where_that_is_wanted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fail_fast: bool
+):
+    monkeypatch.setattr(controller, "LOOK", 0)
+    one, two = (Task(name * 16, "memmlp", {}) for name in "12")
+    plan = Plan("trial", tmp_path, (), (one, two), fail_fast=fail_fast)
+    shelf = Shelf(Living)
+
+    class Looks(Board):
+        """One run fails at the second look, the other one at the third."""
+
+        def update(self, plan: Plan) -> None:
+            looked.append(len(plan.left()))
+            for task in plan.tasks[: len(looked) - 1]:
+                plan.run_of(task).folder.mkdir(parents=True, exist_ok=True)
+                plan.run_of(task).fail("the loss is nan")
+
+    looked: list[int] = []
+    controller.oversee(plan, Fleet(shelf, lambda: None, 2, tmp_path), Looks())
+    assert len(looked) == (2 if fail_fast else 3)
+    assert [handle.cancelled for handle in shelf.handles] == [fail_fast] * 2
 
 
 def test_workers_that_never_live_end_the_sweep(tmp_path: Path):

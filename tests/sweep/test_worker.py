@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from memmlp.cli.work import check_wanted
 from memmlp.errors import InputError, TrainingDiverged
 from memmlp.runs import Run
 from memmlp.sweep import worker
@@ -56,6 +57,35 @@ def test_upstream_runs_come_first_and_each_task_once(tmp_path: Path):
     assert seen[0] == CODES.id
     work(saved(tmp_path, ONE, TWO, CODES, ALONE), perform)
     assert len(seen) == 4
+
+
+def test_an_upstream_run_stands_right_before_the_first_that_needs_it():
+    other = Task("d" * 16, "vqvae", {})
+    four = Task("4" * 16, "memmlp", {}, other.id)
+    assert unique([CODES, ONE, ALONE, other, four, CODES, TWO]) == (CODES, ONE, ALONE, other, four, TWO)
+    assert unique([ALONE, TWO, ONE, CODES]) == (ALONE, CODES, TWO, ONE)
+
+
+def test_a_plan_that_ends_with_its_first_failure(tmp_path: Path):
+    begun: list[str] = []
+
+    def perform(plan: Plan, task: Task) -> None:
+        begun.append(task.id)
+        if task == ONE:
+            raise InputError("a bad key")
+        finish(plan, task)
+
+    path = saved(tmp_path, CODES, ONE, TWO, ALONE, fail_fast=True)
+    assert len(Plan.load(path).left()) == 4
+    work(path, perform)
+    assert begun == [CODES.id, ONE.id]
+    assert Plan.load(path).stopped
+    assert Plan.load(path).left() == []
+    with pytest.raises(Cancelled, match=f"run {TWO.id} was cancelled at step 3"):
+        check_wanted(path, TWO.id, 3, {})
+    Plan.load(path).run_of(ONE).retry()
+    check_wanted(path, TWO.id, 3, {})
+    assert not plan(tmp_path, CODES, ONE, TWO, ALONE).stopped
 
 
 def test_a_failure_is_left_with_its_run_and_the_others_go_on(tmp_path: Path):

@@ -12,9 +12,10 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 
 import click
 import yaml
@@ -169,22 +170,24 @@ def examine(outputs: Path, trials: int) -> list[str]:
         rows = list(csv.DictReader(file))
     problems = [] if len(rows) == trials else [f"{len(rows)} trials, not {trials}"]
     problems += [f"trial {row['trial']}: {row['state']}" for row in rows if row["state"] not in ENDS]
-    ids = Counter(row["run"] for row in rows)
+    ids = Counter(name for row in rows for name in row["run"].split())
     problems += [f"run {name}: of {count} trials" for name, count in ids.items() if count > 1]
     runs = {run.id: run for run in list_runs(outputs) if run.manifest.get("kind") != "vqvae"}
     problems += [f"run {name}: of no trial" for name in runs.keys() - ids.keys()]
     for row in rows:
         if row["state"] == "complete":
-            problems += _examine(row, runs.get(row["run"]))
+            problems += _examine(row, runs)
     return problems
 
 
-def _examine(row: dict[str, str], run: Run | None) -> list[str]:
+def _examine(row: dict[str, str], runs: Mapping[str, Run]) -> list[str]:
     """What is wrong with a complete trial."""
-    if run is None:
-        return [f"trial {row['trial']}: its run {row['run']} is missing"]
-    problems = [f"run {run.id}: {problem}" for problem in check(run.folder)]
-    last = [entry for entry in run.metrics() if entry.phase == "val"][-1]
-    if float(row["MPJPE"]) != last.values["rotation MPJPE"]:
-        problems.append(f"trial {row['trial']}: not the value of its run")
+    names = row["run"].split()
+    if missing := [name for name in names if name not in runs]:
+        return [f"trial {row['trial']}: its run {name} is missing" for name in missing]
+    own = [runs[name] for name in names]
+    problems = [f"run {run.id}: {problem}" for run in own for problem in check(run.folder)]
+    last = [[entry for entry in run.metrics() if entry.phase == "val"][-1] for run in own]
+    if float(row["MPJPE"]) != fmean(entry.values["rotation MPJPE"] for entry in last):
+        problems.append(f"trial {row['trial']}: not the mean of its runs")
     return problems

@@ -49,7 +49,8 @@ def unknown_key(name: str, keys: Sequence[str]) -> str:
     own = re.split(r"[./@]", name)[-1]
     near = difflib.get_close_matches(own, keys, n=1)
     hint = f"did you mean {near[0]}? " if near else ""
-    listed = ", ".join(word for word in keys if not word.startswith("_")) or "none"
+    fixed = ("name",) if "_target_" in keys else ()  # what an option of a slot is, and is called
+    listed = ", ".join(word for word in keys if not word.startswith("_") and word not in fixed) or "none"
     return f"{name}: no such key; {hint}allowed here: {listed}"
 
 
@@ -76,6 +77,9 @@ def _check_combinations(cfg: DictConfig) -> None:
         _check_reference(cfg)
     else:
         _check_slots(cfg)
+    if (cfg.vqvae.epochs is None) == (cfg.vqvae.steps is None):
+        given = f"vqvae.epochs={cfg.vqvae.epochs}, vqvae.steps={cfg.vqvae.steps}"
+        raise InputError(f"{given}: allowed is one of them, and null for the other")
     split = cfg.data.split
     held_out = split.val + (split.test if isinstance(split.get("test"), float) else 0)
     if held_out >= 1:

@@ -5,7 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Optional
 
-from memmlp.cli.schema.rules import EachOf, Existing, Text, at_least, called, fraction, key, positive, target
+from memmlp.cli.schema.rules import (
+    EachOf,
+    Existing,
+    Text,
+    at_least,
+    called,
+    fraction,
+    key,
+    one_of,
+    positive,
+    target,
+)
 
 # OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
 # The fields' helpers make dataclass fields, not shared defaults.
@@ -55,6 +66,7 @@ class Data:
     body: str = key(Existing("file", ("builtin",)))
     min_frames: int = at_least(2)
     strict: bool = key()
+    weighting: str = one_of("frames", "clips")
 
 
 @dataclass

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Union
+from typing import Optional, Union
 
 from omegaconf import MISSING
 
@@ -22,7 +22,7 @@ from memmlp.cli.schema.rules import (
 
 # OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
 # The fields' helpers make dataclass fields, not shared defaults.
-# ruff: noqa: UP007, RUF009
+# ruff: noqa: UP007, UP045, RUF009
 
 
 @dataclass
@@ -173,7 +173,8 @@ class VQVAE:
     decay: float = key(Within(0, 1, strict=True))
     codebook: str = one_of("ema", "gradient")
     seed: int = key(Within(0, 2**63 - 1))
-    steps: int = at_least(1)
+    epochs: Optional[float] = positive()
+    steps: Optional[int] = at_least(1)
     batch: int = at_least(1)
     lr: float = positive()
     weight_decay: float = at_least(0)

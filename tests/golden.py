@@ -1,0 +1,399 @@
+"""The numbers that every component makes of fixed inputs, as tests/test_golden.py looks at them.
+
+`make golden` writes that file anew. It refuses where a component's numbers changed and its number in
+memmlp/recipes.py did not: raise that first, in the same commit.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import tiny
+import torch
+from torch import Tensor, nn
+
+from memmlp import evaluation, latency, metrics
+from memmlp.body import SPARSE_DIM
+from memmlp.data.dataset import Frames, WindowSampler
+from memmlp.export import export
+from memmlp.features import Frame, Heading, HeadRelative, World
+from memmlp.ik import LBFGS
+from memmlp.losses import (
+    AGRoLLoss,
+    AvatarPoserLoss,
+    Fixed,
+    HandFK,
+    HandPosition,
+    Loss,
+    Manual,
+    MotionLoss,
+    NoHand,
+    Terms,
+    Uncertainty,
+)
+from memmlp.memory import (
+    CodeMemory,
+    GRUMemory,
+    JointCodeMemory,
+    LSTMMemory,
+    NoCodesMemory,
+    NoMemory,
+    State,
+)
+from memmlp.model import WindowModel
+from memmlp.parity import streamed
+from memmlp.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
+from memmlp.quantization import quantise
+from memmlp.recipes import RECIPES
+from memmlp.rollout import OwnPredictions, PersistentStreams, Rollout, TeacherForcing
+from memmlp.session import OnnxStream
+from memmlp.streaming import streaming
+from memmlp.training import MotionTask, Optim, VQVAETask, seed_step, train_step
+from memmlp.vqvae import VQVAE
+
+PATH = Path(__file__).with_name("golden.json")
+BOTH = frozenset({"rotation", "position"})
+Numbers = dict[str, float]
+
+
+def summary(name: str, values: Tensor) -> Numbers:
+    """Four numbers of a tensor that hardly any change of it leaves as they were."""
+    flat = values.detach().double().flatten()
+    ramp = torch.linspace(-1, 1, len(flat), dtype=torch.double)
+    return {
+        f"{name} mean": float(flat.mean()),
+        f"{name} size": float(flat.abs().mean()),
+        f"{name} spread": float(flat.square().mean()),
+        f"{name} tilt": float((flat * ramp).mean()),
+    }
+
+
+def frames() -> Frames:
+    """Three clips, one shorter than most windows are not."""
+    return tiny.frames((60, 45, 80))
+
+
+def pair() -> tuple[Tensor, Tensor]:
+    """A prediction and the truth (B, T, 252), two windows of nine frames each."""
+    return tuple(torch.stack([tiny.clip(9, seed), tiny.clip(9, seed + 1)]) for seed in (1, 5))  # type: ignore[return-value]
+
+
+def features() -> Numbers:
+    """Motion -> inputs and targets, and normalised ones."""
+    clip = tiny.clip(12)
+    fitted = Frame.fit(World(), tiny.REST, clip)
+    return summary("frames", clip) | summary("encoded", fitted.encode(clip[None]))
+
+
+def coordinates(kind: type[World]) -> Numbers:
+    """There and back."""
+    frame, clip = tiny.frame(kind()), tiny.clip(12)[None]
+    place = frame.place(clip[..., :SPARSE_DIM])
+    encoded = frame.encode(clip)
+    motion = encoded[..., SPARSE_DIM:] + 0.1
+    return summary("encoded", encoded) | summary("decoded", frame.decode_motion(motion, place))
+
+
+def network(model: WindowModel) -> Numbers:
+    """A training call with its gradients, then two windows and three frames as live."""
+    clip = torch.stack([tiny.clip(80, seed) for seed in range(2)])
+    torch.manual_seed(7)
+    model.train()
+    past, new = clip[:, : model.length], clip[:, model.length : model.length + model.frames]
+    motion, _ = model.learn(new[..., :SPARSE_DIM], model.true_state(past), new)
+    terms = model.terms(new)
+    (motion.square().mean() + sum(terms.values(), torch.zeros(()))).backward()
+    slopes = torch.cat([p.grad.flatten() for p in model.parameters() if p.grad is not None])
+    found = summary("learned", motion) | summary("slopes", slopes)
+    found |= {name: float(term.detach()) for name, term in terms.items()}
+    return found | _used(model.eval(), clip)
+
+
+@torch.no_grad()
+def _used(model: WindowModel, clip: Tensor) -> Numbers:
+    state, size, found = model.initial_state(2), model.frames, {}
+    for start, stop in ((0, size), (size, 2 * size), *((2 * size + i, 2 * size + i + 1) for i in range(3))):
+        motion, state = model.advance(clip[:, start:stop, :SPARSE_DIM], state)
+        found |= summary(f"at {stop}", motion)
+    return found
+
+
+def vqvae(codebook: str = "ema") -> Numbers:
+    """Three steps of its training, and what it then makes of frames."""
+    torch.manual_seed(3)
+    model = VQVAE(codes=8, width=12, encoder_depth=2, codebook=codebook)
+    optim = Optim(steps=3, batch=16, lr=1e-3, schedule="milestones", decoupled=False)
+    task = VQVAETask(model, tiny.frame(), frames(), frames(), optim, seed=0)
+    return _trained(task, optim) | task.validate()
+
+
+def _trained(task: VQVAETask | MotionTask, optim: Optim) -> Numbers:
+    """The losses of three steps, and the weights after them."""
+    optimiser, found = optim.build(task.parameter_groups()), {}
+    for step in range(optim.steps):
+        seed_step(0, step)
+        result = train_step(task, optim, optimiser, step)
+        found |= {f"{name} {step}": float(term.detach()) for name, term in result.terms.items()}
+    weights = torch.cat([p.detach().flatten() for p in task.module.parameters()])
+    return found | summary("weights", weights)
+
+
+def sampler() -> Numbers:
+    """Draws by frames and by clips."""
+    found = {}
+    for weighting in ("frames", "clips"):
+        draws = WindowSampler(frames(), batch=32, window=50, seed=1, weighting=weighting)
+        for step in range(2):
+            for name, values in zip(("clip", "end"), draws.draw(step), strict=True):
+                found |= summary(f"{weighting} {name} {step}", values)
+    return found
+
+
+def schedule(name: str) -> Numbers:
+    """Its course."""
+    optim = Optim(steps=20, batch=1, lr=1e-2, final_lr=1e-4, schedule=name, drop_at=0.6)
+    return {str(step): optim.factor(step) for step in range(20)}
+
+
+class Line(WindowModel):
+    """A linear map of each frame: a network for the training loop alone."""
+
+    branches = BOTH
+
+    def __init__(self) -> None:
+        super().__init__(tiny.frame(World()), 7)
+        self.map = nn.Linear(SPARSE_DIM, 198)
+
+    def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
+        inputs, kept = self.taken_in(sparse, state)
+        return self.map(inputs[:, -(newest or self.frames) :]), kept
+
+    def terms(self, truth: Tensor) -> Terms:
+        return {"own": self.map.bias.square().sum()}
+
+
+class Squares(Loss):
+    """The mean square: a loss for the training loop alone."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weighting = Fixed({"square": 2.0})
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+        return {"square": (motion - truth).square().mean()}
+
+
+def training() -> Numbers:
+    """Three steps of the loop, with each optimiser, and clipped."""
+    found = {}
+    for name, changes in {"adamw": {}, "adam": {"decoupled": False}, "clipped": {"clip_norm": 0.1}}.items():
+        torch.manual_seed(2)
+        optim = Optim(steps=3, batch=4, lr=1e-2, final_lr=1e-3, weight_decay=0.1, **changes)
+        task = MotionTask(Line(), Squares(), TeacherForcing(), frames(), optim, 0, lambda network: {})
+        found |= {f"{name} {key}": value for key, value in _trained(task, optim).items()}
+    return found
+
+
+def rollout(make: Callable[[], Rollout]) -> Numbers:
+    """The calls of three steps, the network's own motion in them."""
+    model, slot, split = tiny.model(NoCodesMemory), make(), frames()
+    if isinstance(slot, PersistentStreams):
+        slot.build(model)
+    draws, found = WindowSampler(split, batch=2, window=7, seed=0), {}
+    for step in range(3):
+        seed_step(0, step)
+        call = slot.draw(model, split, draws, step)
+        slot.keep(model.advance(call.sparse, call.state)[1])
+        found |= summary(f"sparse {step}", call.sparse) | summary(f"truth {step}", call.truth)
+        found |= summary(f"history {step}", call.state["motion"])
+    return found
+
+
+def loss(make: Callable[[], Loss]) -> Numbers:
+    """Terms, sum and slope."""
+    predicted, true = pair()
+    motion = predicted[..., SPARSE_DIM:].clone().requires_grad_()
+    one = make()
+    total, terms = one(motion, true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], tiny.frame(Heading()))
+    total.backward()
+    groups = [len(group["params"]) for group in one.weighting.parameter_groups()]
+    found = {name: float(term.detach()) for name, term in terms.items()} | {"learned": float(sum(groups))}
+    return found | {"total": float(total.detach())} | summary("slope", motion.grad)
+
+
+def weighted(weighting: Callable[[], Manual | Uncertainty]) -> Numbers:
+    """A weighting of all of Mem-MLP's terms, after a step of what it learns."""
+    one = MotionLoss(weighting(), NoHand(), BOTH)
+    found = loss(lambda: one)
+    for parameter in one.parameters():
+        parameter.data -= 0.1 * torch.sign(parameter.grad)
+    return found | {f"weight {name}": value for name, value in one.weighting.weights().items()}
+
+
+def hand(term: NoHand | HandPosition | HandFK) -> Numbers:
+    """The hand term."""
+    predicted, true = pair()
+    terms = term(
+        predicted[..., SPARSE_DIM:], true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], tiny.frame(World())
+    )
+    return {name: float(value) for name, value in terms.items()} | {"terms": float(len(terms))}
+
+
+def measured() -> Numbers:
+    """A clip's report, of both branches, and joints by forward kinematics among it."""
+    predicted, true = tiny.clip(30, 1)[:, SPARSE_DIM:], tiny.clip(30, 5)
+    report = evaluation.clip_report(tiny.frame(World()), predicted, true)
+    found = {f"{branch} {name}": value for branch, of in report.items() for name, value in of.items()}
+    turned = evaluation.local_rotations(predicted)
+    return found | metrics.rotations_report(turned, evaluation.local_rotations(true[:, SPARSE_DIM:]))
+
+
+def mode(name: str) -> Numbers:
+    """What a mode makes of clips of unequal length, and the mean of their reports."""
+    model, split = tiny.model(NoCodesMemory), frames()
+    found = {}
+    for i, motion in enumerate(evaluation.MODES[name](model, split.clips())):
+        found |= summary(f"clip {i}", motion)
+    mean = evaluation.evaluate(model, split, [name], 2)["mean"][name]["rotation"]
+    return found | {key: mean[key] for key in ("MPJPE", "Jitter")}
+
+
+def ik() -> Numbers:
+    """A few frames brought to the position branch."""
+    predicted, true = tiny.clip(6, 1), tiny.clip(6, 5)
+    motion = torch.cat([predicted[:, SPARSE_DIM:][:, :132], true[:, SPARSE_DIM:][:, 132:]], 1)
+    (solved,) = LBFGS(4).solutions(tiny.frame(World()), motion, true[:, :SPARSE_DIM]).values()
+    return summary("solved", solved)
+
+
+def shipped(graph: str) -> Numbers:
+    """An exported stream on a clip, and what its sizes are."""
+    model = tiny.model()
+    step = {"graph.streaming": streaming, "graph.naive": lambda network: network}[graph](model)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "step.onnx"
+        export(step, path, "0" * 16)
+        motion = streamed(OnnxStream(path), tiny.clip(25))
+    return summary("motion", motion) | {"macs": float(latency.macs(step))}
+
+
+def int8() -> Numbers:
+    """An exported stream in int8."""
+    stream = streaming(tiny.model())
+    with tempfile.TemporaryDirectory() as folder:
+        exact, quantised = (Path(folder) / f"{name}.onnx" for name in ("exact", "quantised"))
+        export(stream, exact, "0" * 16)
+        quantise(exact, quantised, stream.ends, [tiny.clip(40)])
+        return summary("motion", streamed(OnnxStream(quantised), tiny.clip(25)))
+
+
+CASES: dict[str, Callable[[], Numbers]] = {
+    "features": features,
+    **{
+        f"coordinates.{name}": partial(coordinates, kind)
+        for name, kind in (("heading", Heading), ("head_relative", HeadRelative), ("world", World))
+    },
+    "model.mem_mlp": lambda: network(tiny.model(NoMemory, RotationOnly)),
+    **{
+        f"model.{name}": partial(lambda name: network(tiny.reference(name)), name)
+        for name in tiny.REFERENCES
+    },
+    **{
+        f"memory.{name}": partial(lambda kind: network(tiny.model(kind)), kind)
+        for name, kind in {
+            "vq": CodeMemory, "vq_joint": JointCodeMemory, "no_codes": NoCodesMemory, "lstm": LSTMMemory,
+            "gru": GRUMemory, "none": NoMemory,
+        }.items()
+    },
+    **{
+        f"predictor.{name}": partial(lambda kind: network(tiny.model(NoCodesMemory, kind)), kind)
+        for name, kind in {
+            "two_branch": TwoBranch, "two_branch_memory": TwoBranchMemory, "rotation_only": RotationOnly,
+            "rotation_only_memory": RotationOnlyMemory,
+        }.items()
+    },
+    "vqvae": vqvae,
+    **{f"codebook.{name}": partial(vqvae, name) for name in ("ema", "gradient")},
+    "sampler": sampler,
+    "training": training,
+    **{f"schedule.{name}": partial(schedule, name) for name in ("step", "cosine", "milestones")},
+    "rollout.teacher_forcing": partial(rollout, TeacherForcing),
+    "rollout.own_predictions": partial(rollout, partial(OwnPredictions, 2)),
+    "rollout.streams": partial(rollout, partial(PersistentStreams, 4)),
+    "loss.uncertainty": partial(weighted, partial(Uncertainty, 0.01)),
+    "loss.manual": partial(weighted, Manual),
+    "loss.agrol": lambda: {
+        f"{error} {name}": value
+        for error in ("norm", "square")
+        for name, value in loss(partial(AGRoLLoss, error)).items()
+    },
+    "loss.avatar_poser": lambda: {
+        f"{anchor} {name}": value
+        for anchor in ("pelvis", "head")
+        for name, value in loss(partial(AvatarPoserLoss, anchor=anchor)).items()
+    },
+    "hand.position": lambda: hand(HandPosition()),
+    "hand.fk": lambda: hand(HandFK()),
+    "hand.off": lambda: hand(NoHand()),
+    "metrics": measured,
+    "mode.stream": partial(mode, "stream"),
+    "mode.window": partial(mode, "window"),
+    "ik.lbfgs": ik,
+    "graph.streaming": partial(shipped, "graph.streaming"),
+    "graph.naive": partial(shipped, "graph.naive"),
+    "int8": int8,
+}  # fmt: skip
+UNSEEN = ("export", "latency")
+"""Components without numbers of their own: a file's form, and times."""
+
+
+def numbers(case: str) -> Numbers:
+    """A component's numbers now, on one thread."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return CASES[case]()
+    finally:
+        torch.set_num_threads(threads)
+
+
+def changed(now: Mapping[str, float], before: Mapping[str, float], tolerance: float) -> list[str]:
+    """The names of the numbers that are not what they were, beyond what processors differ by."""
+    close = {
+        name: np.isclose(now[name], before[name], rtol=tolerance, atol=1e-2 * tolerance)
+        for name in now.keys() & before.keys()
+    }
+    return sorted((now.keys() ^ before.keys()) | {name for name, same in close.items() if not same})
+
+
+def tolerance(case: str) -> float:
+    """How far processors' numbers may differ: int8 rounds, so that one step more or less is possible."""
+    return 2e-2 if case == "int8" else 2e-4
+
+
+def stored() -> dict[str, dict[str, object]]:
+    """What golden.json holds: a recipe number and numbers by component."""
+    return json.loads(PATH.read_text()) if PATH.exists() else {}
+
+
+def record() -> None:
+    """Write golden.json; exits with 1 where numbers changed and their recipe did not."""
+    before, now = stored(), {case: {"recipe": RECIPES[case], "numbers": numbers(case)} for case in CASES}
+    same = [case for case in CASES if case in before and before[case]["recipe"] == RECIPES[case]]
+    wrong = [case for case in same if changed(now[case]["numbers"], before[case]["numbers"], tolerance(case))]  # type: ignore[arg-type]
+    if wrong:
+        sys.exit(
+            f"raise the number of {', '.join(wrong)} in memmlp/recipes.py: what they compute has changed"
+        )
+    kept = {case: before[case] if case in same else now[case] for case in CASES}
+    PATH.write_text(json.dumps(kept, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    record()

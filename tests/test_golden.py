@@ -1,0 +1,37 @@
+"""What components compute is what their recipe numbers stand for (memmlp/recipes.py)."""
+
+from __future__ import annotations
+
+import golden
+import pytest
+
+from memmlp.recipes import RECIPES
+
+
+@pytest.mark.parametrize("case", golden.CASES)
+def test_a_component_computes_what_its_recipe_number_stands_for(case: str):
+    """Where this fails, numbers of finished runs and of new ones would be mixed under one identity."""
+    known = golden.stored()[case]
+    assert known["recipe"] == RECIPES[case], f"record the numbers of {case}: make golden"
+    now = golden.numbers(case)
+    wrong = golden.changed(now, known["numbers"], golden.tolerance(case))
+    assert not wrong, (
+        f"raise the number of {case} in memmlp/recipes.py: it computes other numbers ({wrong[:4]})"
+    )
+
+
+def test_every_component_has_numbers():
+    assert set(golden.CASES) | set(golden.UNSEEN) == set(RECIPES)
+
+
+def test_numbers_are_recorded_only_under_another_recipe(monkeypatch, tmp_path):
+    monkeypatch.setattr(golden, "PATH", tmp_path / "golden.json")
+    monkeypatch.setattr(golden, "CASES", {"hand.off": lambda: {"a": 1.0}})
+    golden.record()
+    monkeypatch.setattr(golden, "CASES", {"hand.off": lambda: {"a": 1.001}})
+    with pytest.raises(SystemExit, match=r"raise the number of hand\.off"):
+        golden.record()
+    assert golden.stored()["hand.off"]["numbers"] == {"a": 1.0}
+    monkeypatch.setitem(RECIPES, "hand.off", 99)
+    golden.record()
+    assert golden.stored()["hand.off"] == {"recipe": 99, "numbers": {"a": 1.001}}
