@@ -26,7 +26,7 @@ from memmlp.statistics import (
     spending,
     verdict,
 )
-from memmlp.statistics.crossed import error
+from memmlp.statistics.crossed import error, skewed
 
 TABLE = 24  # comparisons
 SHARES = {  # of the mean's variance: seeds, clips' groups, clips, exponential clips, noise
@@ -190,6 +190,17 @@ def test_equivalence_is_the_interval_within_the_margin():
     assert 0.1 < within.mean() < 0.9
     assert equivalence_p(d + 10, 4.0).min() == 1
     np.testing.assert_array_equal(equivalence_p(d, np.full(len(d), 4.0)), p)
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 10, 40])
+def test_means_of_few_skewed_values_have_the_tails_they_are_given(count: int):
+    x = np.random.default_rng(count).exponential(size=(200_000, count)) - 1
+    t = np.abs(x.mean(1)) / (x.std(1, ddof=1) / np.sqrt(count))
+    for level in (0.05, 0.05 / TABLE):
+        missed = np.mean(t > stats.t.isf(level / 2, skewed(count - 1)))
+        assert 0.6 * level < missed < 1.5 * level
+        if count > 2:
+            assert np.mean(t > stats.t.isf(level / 2, count - 1)) > 1.5 * level
 
 
 # The promises, on a part of `memmlp bench calibration`'s grid

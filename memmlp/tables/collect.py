@@ -267,7 +267,7 @@ def _tested(differences: Mapping[Key, np.ndarray]) -> dict[Key, Effect]:
         groups[matrix.shape].append(key)
     effects: dict[Key, Effect] = {}
     for (seeds, clips), keys in groups.items():
-        numbers = np.stack(paired_effects(np.stack([differences[key] for key in keys])))
+        numbers = np.stack(paired_effects(np.stack([differences[key] for key in keys]))[:4])
         for key, (mean, low, high, p) in zip(keys, numbers.T, strict=True):
             effects[key] = Effect(float(mean), _known(low), _known(high), _known(p), None, seeds, clips)
     corrected = holm(np.array([np.nan if effect.p is None else effect.p for effect in effects.values()]))

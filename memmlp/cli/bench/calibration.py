@@ -168,7 +168,7 @@ def spent(sample: Sample) -> Iterator[tuple[int, float]]:
 
 def _any(claims: np.ndarray) -> np.ndarray:
     """Whether a table has any, (T,)."""
-    return claims.reshape(-1, TABLE).any(1)
+    return np.any(claims.reshape(-1, TABLE), axis=1)
 
 
 def summary(counts: Sequence[Counts]) -> dict[str, float]:
