@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize.elementwise import find_root
 from scipy.special import stdtr, stdtrit
 
 Groups = np.ndarray | Sequence[object] | None
@@ -65,6 +64,8 @@ class Error:
 
     def level(self, distance: np.ndarray) -> np.ndarray:
         """The level (K,) at which `half` is this distance (K,); 1 for 0 and below."""
+        from scipy.optimize.elementwise import find_root  # slow to import
+
         # The wider side alone, at its lightest, is too narrow; twice its square, at its heaviest, too wide.
         levels = np.where(distance > 0, self._wider(distance, self.groups), 1.0)
         most = self._wider(distance / 1.42, skewed(self.groups))

@@ -28,7 +28,7 @@ ERROR, LEAST, MOST = 0.06, 0.93, 0.995
 
 MARGIN, EFFECT = 8.0, 16.0
 """Where half of the arms differ: the smallest effect of interest and theirs, in standard errors."""
-CAMPAIGNS = 1000  # tables with effects, a cell
+CAMPAIGNS = 200  # tables with effects, a cell
 
 
 class Shares(NamedTuple):
