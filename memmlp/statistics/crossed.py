@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize.elementwise import find_root
 from scipy.special import stdtr, stdtrit
 
 Groups = np.ndarray | Sequence[object] | None
@@ -65,14 +64,18 @@ class Error:
 
     def level(self, distance: np.ndarray) -> np.ndarray:
         """The level (K,) at which `half` is this distance (K,); 1 for 0 and below."""
+        from scipy.optimize.elementwise import find_root  # slow to import
+
         # The wider side alone, at its lightest, is too narrow; twice its square, at its heaviest, too wide.
         levels = np.where(distance > 0, self._wider(distance, self.groups), 1.0)
-        most = self._wider(distance / np.sqrt(2), skewed(self.groups))
-        between = np.flatnonzero((distance > 0) & (levels > 0) & (self.half(levels) > distance * (1 + 1e-9)))
-        if between.size:
-            bracket = np.log(levels[between]), np.log(most[between])
-            args = (distance[between], *self.variances[:, between])
-            levels[between] = np.exp(find_root(self._excess, bracket, args=args).x)
+        most = self._wider(distance / 1.42, skewed(self.groups))
+        unsure = np.flatnonzero((distance > 0) & (levels > 0))
+        args = (distance[unsure], *self.variances[:, unsure])
+        wider = self._excess(np.log(levels[unsure]), *args) > 1e-9
+        if wider.any():
+            unsure, args = unsure[wider], tuple(part[wider] for part in args)
+            bracket = np.log(levels[unsure]), np.log(most[unsure])
+            levels[unsure] = np.exp(find_root(self._excess, bracket, args=args).x)
         return levels
 
     def _wider(self, distance: np.ndarray, groups: float) -> np.ndarray:

@@ -7,7 +7,6 @@ import functools
 
 import numpy as np
 from scipy.special import chdtri, ndtri
-from scipy.stats import qmc
 
 from memmlp.statistics.crossed import Error, Groups, error
 from memmlp.statistics.effects import LEVEL
@@ -79,6 +78,8 @@ def found(parts: np.ndarray, seeds: int, groups: float, level: float, power: flo
 @functools.cache
 def _draws(seeds: int, groups: float) -> tuple[np.ndarray, np.ndarray]:
     """Standard normal errors (DRAWS,), and A, B and E over their expectations (3, DRAWS)."""
+    from scipy.stats import qmc  # slow to import, as is all of scipy.stats
+
     uniform = qmc.Sobol(4, seed=0).random(DRAWS).T
     freedoms = np.array([[seeds - 1], [groups], [(seeds - 1) * groups]])
     return ndtri(uniform[0]), chdtri(freedoms, uniform[1:]) / freedoms

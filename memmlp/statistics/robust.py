@@ -4,7 +4,6 @@ learning at the edge of the statistical precipice"), for errors (S, C) of seeds 
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import trim_mean
 
 
 def probability_of_improvement(ours: np.ndarray, theirs: np.ndarray) -> float:
@@ -18,6 +17,8 @@ def probability_of_improvement(ours: np.ndarray, theirs: np.ndarray) -> float:
 
 def interquartile_mean(errors: np.ndarray) -> float:
     """The mean of the middle half of all errors (S, C)."""
+    from scipy.stats import trim_mean  # slow to import
+
     return float(trim_mean(errors, 0.25, axis=None))
 
 
