@@ -537,10 +537,10 @@ def test_collect_reads_each_run_once(sweep: Sweep, tmp_path: Path):
 
 
 def test_tables_need_no_torch():
-    """Nor matplotlib: together seconds to import, more than two thousand runs take."""
+    """Nor scipy.stats or matplotlib: together seconds to import, more than two thousand runs take."""
     code = "import sys, memmlp.cli.table, memmlp.tables.render as r; print(*sys.modules)"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not {"torch", "matplotlib", "hydra"} & set(ran.stdout.split())
+    assert not {"torch", "scipy.stats", "matplotlib", "hydra"} & set(ran.stdout.split())
 
 
 def test_without_runs_the_papers_values_and_the_reason_are_shown():
