@@ -321,6 +321,7 @@ def train_run(
 ) -> None:
     """Train one network, and mark its run as done."""
     begin(experiment, run, motion_identity(experiment, manifest.digest), experiment.config)
+    run.write_manifest({"body": manifest.body})
     started = time.monotonic()
     model = trained(experiment, run, cache, manifest, upstream, watch)
     checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})

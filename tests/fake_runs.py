@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +12,22 @@ import numpy as np
 
 from memmlp.runs import Run, write_report
 from memmlp.sweep.spec import Arm, Sweep
-from memmlp.tables.collect import Find
+from memmlp.tables.collect import MODES, collect, finished
+from memmlp.tables.effects import Runs
+from memmlp.tables.measured import Measured, load
+from memmlp.tables.table import Table
 
+Find = Callable[[Arm, int], Run | None]
 BASE = {
     "MPJRE": 4.15, "geodesic": 6.9, "MPJPE": 6.5, "Hand PE": 2.1, "Upper PE": 3.3, "Lower PE": 9.6,
     "Root PE": 5.0, "MPJVE": 38.0, "Jitter": 11.0, "GT Jitter": 7.1,
 }  # fmt: skip
 NO_POSITIONS = ("MPJRE", "geodesic")
-CLIPS = ("salsa/02", "salsa/09", "salsa/17", "kicks/24")
+CLIPS = (*(f"salsa/{number:02}" for number in range(1, 11)), "kicks/01", "kicks/02")
 ORIGIN = {
     "version": "0.3.0", "git": {"commit": "0123456789abcdef", "dirty": False}, "data": "d" * 64,
-    "cpu": "A processor", "cores": 2, "host": "h" * 12,
+    "cpu": "A processor", "cores": 2, "host": "h" * 12, "packages": {"torch": "2.0.0"}, "device": "cpu",
+    "threads": 1, "precision": "fp32", "recipes": {"memory": 1}, "body": "builtin",
 }  # fmt: skip
 
 
@@ -36,11 +41,14 @@ def fake_run(
     origin: Mapping[str, Any] | None = None,
     config: Mapping[str, Any] | None = None,
     log: bool = False,
+    groups: Mapping[str, str] | None = None,
 ) -> Run:
     """A finished run whose errors are `factor` times the usual ones, with effects of seed, clip and both."""
     run = Run.of(outputs, hashlib.sha256(f"{name} {seed}".encode()).hexdigest()[:16])
     run.folder.mkdir(parents=True, exist_ok=True)
     rows = [_clip(clip, seed, factor, run.id, branches) for clip in clips]
+    for row in rows if groups else ():
+        row["group"] = (groups or {})[row["name"]]
     latency = {
         "median_ms": 0.8 * factor, "p95_ms": 1.1 * factor, "ratio_to_reference": 0.6, "parameters": 356_798,
         "macs": 13_000_000, "flops": 26_000_000, "onnx_bytes": 1_900_000,
@@ -57,11 +65,12 @@ def fake_run(
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(content))
     for mode in ("window", "stream"):
-        clips_of_mode = [{"name": row["name"], "frames": row["frames"], **row[mode]} for row in rows]
+        clips_of_mode = [
+            {key: row[key] for key in ("name", "frames", "group") if key in row} | row[mode] for row in rows
+        ]
         mean = _means([row[mode] for row in rows])
-        write_report(
-            run.evaluation(f"{mode}-0"), {"mode": mode, "settings": {}, "mean": mean, "clips": clips_of_mode}
-        )
+        report = {"mode": mode, "settings": {}, "mean": mean, "clips": clips_of_mode}
+        write_report(run.evaluation(f"{mode}-0"), report)
     if log:
         _log(run, factor)
     return run
@@ -88,6 +97,30 @@ def fake_sweep(
         return runs.get((arm.label, seed))
 
     return find
+
+
+def runs_of(sweep: Sweep, find: Find, read: Callable[[Path], Measured] = load) -> dict[str, Runs]:
+    """The finished ones of the runs that are found."""
+
+    def measured(arm: Arm, seed: int) -> Measured | None:
+        run = find(arm, seed)
+        return read(run.folder) if run is not None and run.done else None
+
+    return finished(sweep, measured)
+
+
+def table_of(sweep: Sweep, find: Find, command: str | None = None, modes: Sequence[str] = MODES) -> Table:
+    """The table of the runs that are found."""
+
+    def state(arm: Arm, seed: int) -> str | None:
+        run = find(arm, seed)
+        return None if run is None or run.done else run.status
+
+    return collect(sweep, runs_of(sweep, find), modes, command, state)
+
+
+def nothing(arm: Arm, seed: int) -> None:
+    """Finds no run."""
 
 
 def _draw(*words: object) -> np.random.Generator:

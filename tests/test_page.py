@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import functools
 import html
 import re
 import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import Memmlp, one_line
-from fake_runs import fake_sweep
+from fake_runs import CLIPS, fake_sweep, nothing, runs_of, table_of
 
 from memmlp.errors import InputError
 from memmlp.report import figures
 from memmlp.report.page import Chapter, page, published
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.spec import Sweep, load_sweep
-from memmlp.tables.collect import collect, finished, nothing, without_runs
+from memmlp.tables.collect import without_runs
+from memmlp.tables.distributions import distributions
 from memmlp.tables.grid import caption
-from memmlp.tables.measured import load
 
 SHIPPED = Path(__file__).parent.parent / "sweeps"
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -29,9 +29,9 @@ NAMES = ("table01", "table04", "table06", "table14", "table17")
 
 def measured(outputs: Path, name: str) -> Chapter:
     """A chapter whose runs are all there."""
-    sweep, read = load_sweep(SHIPPED / f"{name}.yaml"), functools.cache(load)
+    sweep = load_sweep(SHIPPED / f"{name}.yaml")
     find = fake_sweep(outputs, sweep, {"2": 1.1, "no Multi-Head, no Memory-Block": 1.2}, log=True)
-    return Chapter(sweep, collect(sweep, find, read=read), finished(sweep, find, read))
+    return Chapter(sweep, table_of(sweep, find), runs_of(sweep, find))
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def chapters(tmp_path_factory: pytest.TempPathFactory) -> list[Chapter]:
     sweep = load_sweep(SHIPPED / "table01.yaml")
     table = without_runs(sweep, ("stream", "window"), "nothing measured: data.root")
     outputs = tmp_path_factory.mktemp("outputs")
-    return [Chapter(sweep, table, finished(sweep, nothing, load)), *(measured(outputs, n) for n in NAMES[1:])]
+    return [Chapter(sweep, table, runs_of(sweep, nothing)), *(measured(outputs, n) for n in NAMES[1:])]
 
 
 @pytest.fixture(scope="module")
@@ -81,12 +81,14 @@ def test_page_has_every_table_and_figure(chapters: list[Chapter], text: str):
         assert (
             f'<a href="#{chapter.sweep.name}">{html.escape(caption(chapter.table), quote=True)}</a>' in text
         )
-    assert text.count("<figure>") == text.count("</svg>") == 3 + 1 + 4  # effects, accuracy, training
-    runs = {run.run.id for chapter in chapters for found in chapter.runs.values() for run in found.values()}
+    assert (
+        text.count("<figure>") == text.count("</svg>") == 3 + 3 + 1 + 4
+    )  # effects, profiles, accuracy, training
+    runs = {run.id for chapter in chapters for found in chapter.runs.values() for run in found.values()}
     assert len(runs) == 15 + 9 + 12 + 5
     for run in runs:
         assert text.count(f"<code>{run}</code>") == 2  # latency and runs
-    assert "Generated today, code 0123456, 38 finished runs" in text
+    assert "Generated today, code 0123456, 41 finished runs" in text
     assert "nothing measured: data.root" in text
 
 
@@ -95,6 +97,28 @@ def test_ids_are_unique_and_links_lead_somewhere(text: str):
     of_page = [name for name in ids if not re.fullmatch(r"[mp][0-9a-f]{10}", name)]
     assert len(set(of_page)) == len(of_page)
     assert set(re.findall(r'<a href="#([^"]+)"', text)) <= set(of_page)
+
+
+def test_distributions_by_hand(tmp_path: Path):
+    """Interquartile means and probabilities of improvement of one metric, and the profile's fractions."""
+    sweep = load_sweep(SHIPPED / "table14.yaml")
+    find = fake_sweep(tmp_path, sweep, {"2": 1.02})
+    found = {one.label: one for one in distributions(sweep, runs_of(sweep, find), "stream")["MPJPE"]}
+    ours, theirs = found["2"], found["2, 4, 6, 8"]
+    assert theirs.improvement is None
+    assert ours.errors.shape == (3, len(CLIPS))
+    wins = [
+        (a > b) + (a == b) / 2
+        for clip in range(len(CLIPS))
+        for a in theirs.errors[:, clip]
+        for b in ours.errors[:, clip]
+    ]
+    assert ours.improvement == pytest.approx(np.mean(wins))
+    assert ours.improvement < 0.5
+    middle = np.sort(ours.errors.ravel())[9:27]
+    assert ours.middle == pytest.approx(middle.mean())
+    text = page([Chapter(sweep, table_of(sweep, find), runs_of(sweep, find))], [], "now", "0")
+    assert f"<td>{ours.middle:.2f}</td><td>{ours.improvement:.2f}</td>" in text
 
 
 def test_colours_are_the_pages(text: str):
@@ -116,7 +140,7 @@ def test_labels_are_escaped(tmp_path: Path):
     (tmp_path / "bad.yaml").write_text(content)
     sweep = load_sweep(tmp_path / "bad.yaml")
     find = fake_sweep(tmp_path, sweep, {"& <b>": 1.1}, log=True)
-    text = page([Chapter(sweep, collect(sweep, find), finished(sweep, find, load))], [], "now", "0")
+    text = page([Chapter(sweep, table_of(sweep, find), runs_of(sweep, find))], [], "now", "0")
     assert "<script" not in text
     assert "<b>" not in text
     assert "<i>" not in text
@@ -125,7 +149,7 @@ def test_labels_are_escaped(tmp_path: Path):
 
 def test_nothing_measured_is_said():
     sweep = load_sweep(SHIPPED / "table14.yaml")
-    text = page([Chapter(sweep, collect(sweep, nothing), finished(sweep, nothing, load))], [], "now", "0")
+    text = page([Chapter(sweep, table_of(sweep, nothing), runs_of(sweep, nothing))], [], "now", "0")
     assert "Nothing measured yet." in text
     assert "fill with: memmlp sweep table14" in text
     assert "<svg" not in text
@@ -164,7 +188,7 @@ def test_browser_shows_the_page(tmp_path: Path, text: str, chapters: list[Chapte
         ran = browser(tmp_path, f"--window-size={width},900", "--dump-dom", path.as_uri())
         assert console(ran) == []
         assert f'data-report="{width} 0 0"' in ran.stdout
-        assert ran.stdout.count("<svg") == 8
+        assert ran.stdout.count("<svg") == 11
         assert all(f'id="{chapter.sweep.name}"' in ran.stdout for chapter in chapters)
 
 

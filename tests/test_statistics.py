@@ -1,79 +1,163 @@
-"""Paired differences with their intervals and p-values, and Holm's correction."""
+"""Effects of paired differences: intervals, p-values, what may be claimed of many, and what could be seen."""
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy import stats
 
-from memmlp.statistics import holm, paired_effects, percentiles, standard_error
+from memmlp.statistics import (
+    Effects,
+    Verdict,
+    detectable,
+    equivalence_p,
+    holm,
+    interquartile_mean,
+    looks,
+    paired_effects,
+    performance_profile,
+    probability_of_improvement,
+    seeds_needed,
+    sequential,
+    spending,
+    verdict,
+)
+from memmlp.statistics.crossed import error, skewed
 
-SHARES = {"equal": (1, 1, 1), "noise": (0, 0, 1), "seeds": (1, 0, 0.1), "clips": (0, 1, 0.1)}
+TABLE = 24  # comparisons
+SHARES = {  # of the mean's variance: seeds, clips' groups, clips, exponential clips, noise
+    "equal": (1, 0, 1, 0, 1),
+    "values": (40 / 3, 0, 1, 0, 1 / 3),  # equal for single values, of 3 seeds on 40 clips
+    "seeds": (1, 0, 0, 0, 0),
+    "groups": (0, 1, 0, 0, 0),
+    "noise": (0, 0, 0, 0, 1),
+    "skewed": (0, 0, 0, 1, 0),
+    "skewed, little noise": (0, 0, 0, 20, 1),
+    "seeds, skewed": (1, 0, 0, 1, 0),
+}
+GRID = [(3, 4, 1), (3, 40, 1), (5, 10, 2), (10, 4, 1), (5, 40, 10)]
 
 
-def differences(seeds: int, clips: int, shares: tuple[float, float, float], sets: int, seed: int = 0):
-    """Sets of differences (sets, S, C) around 0: effects of seeds and clips and noise in these shares."""
-    rng = np.random.default_rng(seed)
-    a, b, e = np.sqrt([shares[0] * seeds, shares[1] * clips, shares[2] * seeds * clips])
-    noise = e * rng.normal(size=(sets, seeds, clips))
-    return a * rng.normal(size=(sets, seeds, 1)) + b * rng.normal(size=(sets, 1, clips)) + noise
+def differences(seeds: int, clips: int, size: int, shares: tuple[float, ...], tables: int) -> np.ndarray:
+    """True nulls (tables * TABLE, S, C), whose means have a variance of 1."""
+    rng = np.random.default_rng([seeds, clips, size])
+    group = np.arange(clips) // size
+    weights = np.bincount(group) / clips
+    a, g, b, x, e = np.sqrt(np.array(shares) / sum(shares))
+    k = tables * TABLE
+    by_clip = b * rng.normal(size=(k, 1, clips)) + x * (rng.exponential(size=(k, 1, clips)) - 1)
+    by_group = rng.normal(size=(k, 1, len(weights)))[:, :, group] / np.sqrt(weights @ weights)
+    by_seed = np.sqrt(seeds) * rng.normal(size=(k, seeds, 1))
+    noise = np.sqrt(seeds * clips) * rng.normal(size=(k, seeds, clips))
+    return a * by_seed + g * by_group + np.sqrt(clips) * by_clip + e * noise
 
 
-def test_standard_error_by_hand():
-    # means 2, 4 over clips and over seeds: variances 2, so 2/2 + 2/2 with 2^2 / (1 + 1) degrees of freedom
-    error, freedom = standard_error(np.array([[[1.0, 3.0], [3.0, 5.0]]]))
-    assert error[0] ** 2 == pytest.approx(2)
-    assert freedom[0] == pytest.approx(2)
+def groups(clips: int, size: int) -> np.ndarray:
+    return np.arange(clips) // size
+
+
+def starred(p: np.ndarray) -> float:
+    """The share of tables of true nulls with a star."""
+    return float(np.mean([(holm(row) <= 0.05).any() for row in p.reshape(-1, TABLE)]))
+
+
+def satterthwaite(d: np.ndarray) -> np.ndarray:
+    """P-values as they were: one t of both variances, with Welch and Satterthwaite's degrees of freedom."""
+    a, b = (side.var(1, ddof=1) / side.shape[1] for side in (d.mean(2), d.mean(1)))
+    freedom = (a + b) ** 2 / (a**2 / (d.shape[1] - 1) + b**2 / (d.shape[2] - 1))
+    return 2 * stats.t.sf(np.abs(d.mean((1, 2))) / np.sqrt(a + b), freedom)
+
+
+# By hand
+
+
+def test_two_by_two_by_hand():
+    # Seeds' means 2, 4 and clips' means 2, 4: A = B = 2 / 2; nothing is left, so E = 0.
+    known = error(np.array([[[1.0, 3.0], [3.0, 5.0]]]))
+    np.testing.assert_allclose(known.variances[:, 0], [1, 1, 0], atol=1e-12)
+    # 0.9 degrees of freedom for clips, which may be skewed
+    half = np.hypot(stats.t.ppf(0.975, 1), stats.t.ppf(0.975, 0.9))
     effects = paired_effects(np.array([[[1.0, 3.0], [3.0, 5.0]]]))
     assert effects.mean[0] == 3
-    assert effects.p[0] == pytest.approx(2 * stats.t.sf(3 / np.sqrt(2), 2))
+    assert effects.high[0] == pytest.approx(3 + half)
+    assert effects.low[0] == pytest.approx(3 - half)
 
 
-@pytest.mark.parametrize("axis", [1, 2])
-def test_one_seed_or_one_clip_is_students_test(axis: int):
-    sample = np.random.default_rng(2).normal(1, 1, 12)
-    effects = paired_effects(np.expand_dims(sample, (0, axis)))
+def test_noise_by_hand():
+    # No seed and no clip differs from another: all is noise, of squares 4 with one degree of freedom.
+    known = error(np.array([[[1.0, -1.0], [-1.0, 1.0]]]))
+    np.testing.assert_allclose(known.variances[:, 0], [0, 0, 1])
+
+
+def test_clips_that_do_not_differ_leave_students_test_of_the_seeds():
+    sample = np.random.default_rng(2).normal(1, 1, 6)
+    effects = paired_effects(np.repeat(sample[None, :, None], 9, 2))
     expected = stats.ttest_1samp(sample, 0)
-    interval = expected.confidence_interval()
-    width = interval.high - interval.low
-    assert effects.p[0] == pytest.approx(expected.pvalue)
-    assert effects.low[0] == pytest.approx(interval.low, abs=0.1 * width)
-    assert effects.high[0] == pytest.approx(interval.high, abs=0.1 * width)
+    assert effects.p[0] == pytest.approx(expected.pvalue, rel=1e-9)
+    assert effects.low[0] == pytest.approx(expected.confidence_interval().low)
 
 
-@pytest.mark.parametrize("name", SHARES)
-@pytest.mark.parametrize("shape", [(3, 4), (3, 10), (5, 4)])
-def test_coverage(shape: tuple[int, int], name: str):
-    effects = paired_effects(differences(*shape, SHARES[name], sets=2000))
-    covered = np.mean((effects.low <= 0) & (effects.high >= 0))
-    assert 0.925 <= covered <= 0.997
-    assert np.mean(effects.p < 0.05) == pytest.approx(1 - covered, abs=0.02)
+def test_seeds_that_do_not_differ_leave_students_test_of_clips_with_fewer_degrees_of_freedom():
+    sample = np.random.default_rng(2).normal(1, 1, 12)
+    effects = paired_effects(np.repeat(sample[None, None], 3, 1))
+    t = sample.mean() / stats.sem(sample)
+    assert effects.p[0] == pytest.approx(2 * stats.t.sf(t, 0.9 * 11**0.6), rel=1e-6)
 
 
-def test_percentiles_alone_cover_too_little():
-    sets = differences(3, 4, SHARES["seeds"], sets=2000)
-    mean = sets.mean((1, 2))
-    _, low, high = percentiles(sets - mean[:, None, None], 0.025)
-    assert np.mean((mean + low <= 0) & (mean + high >= 0)) < 0.87
+def test_noise_is_counted_once():
+    # A = B = E, as of noise alone: no wider than the wider of the two sides alone
+    known = error(np.random.default_rng(0).normal(size=(1, 8, 8)))
+    known.variances[:] = 1.0
+    assert known.half(0.001)[0] == pytest.approx(stats.t.isf(0.0005, 0.9 * 7**0.6), rel=0.01)
 
 
-def test_interval_leans_where_the_bootstrap_does():
-    clips = np.r_[np.zeros(18), 5.0, 6.0]
-    effects = paired_effects(clips[None, None])
-    assert effects.high[0] - effects.mean[0] > 1.1 * (effects.mean[0] - effects.low[0])
+def test_equal_groups_are_the_analysis_of_their_means():
+    d = np.random.default_rng(3).normal(size=(5, 3, 12))
+    labels = np.array(list("aabbccddeeff"))
+    order = np.random.default_rng(4).permutation(12)
+    grouped = paired_effects(d[:, :, order], labels[order])
+    for ours, theirs in zip(grouped[:4], paired_effects(d.reshape(5, 3, 6, 2).mean(3))[:4], strict=True):
+        np.testing.assert_allclose(ours, theirs)
 
 
-def test_many_comparisons_are_each_by_itself(monkeypatch: pytest.MonkeyPatch):
-    sets = differences(3, 4, SHARES["equal"], sets=7)
-    together = paired_effects(sets)
-    monkeypatch.setattr("memmlp.statistics.CHUNK", 1)
-    for i, one in enumerate(sets):
-        np.testing.assert_allclose(np.ravel(paired_effects(one[None])), [field[i] for field in together])
+def test_unequal_groups_weigh_as_their_clips():
+    # groups' means 0 and 4 with weights 1/4 and 3/4: mean 3, B = 8 (1/16 + 9/16)
+    d = np.array([[[0.0, 4.0, 5.0, 3.0], [0.0, 4.0, 3.0, 5.0]]])
+    effects, known = paired_effects(d, [7, 1, 1, 1]), error(d, [7, 1, 1, 1])
+    assert effects.mean[0] == 3
+    np.testing.assert_allclose(known.variances[:, 0], [0, 5, 0], atol=1e-12)
+
+
+# One of a kind, none that differ
+
+
+@pytest.mark.parametrize(
+    ("shape", "labels", "conditional"),
+    [((1, 5), None, "seeds"), ((5, 1), None, "clips"), ((5, 4), [2, 2, 2, 2], "clips")],
+)
+def test_one_seed_or_one_group_has_an_interval_of_the_other_alone(shape, labels, conditional: str):
+    d = np.random.default_rng(1).normal(3, 0.1, (2, *shape))
+    effects = paired_effects(d, labels)
+    assert effects.conditional == conditional
+    assert np.isnan(effects.p).all()
+    assert (effects.low < effects.mean).all()
+    assert (effects.mean < effects.high).all()
+    assert np.isnan(equivalence_p(d, 100, labels)).all()
+    assert np.isnan(detectable(d, 1, labels)).all()
+    assert seeds_needed(d[0], 100, 1, labels) is None
+    if conditional == "clips":
+        sample = d.mean(2)[0]
+        assert effects.high[0] == pytest.approx(stats.ttest_1samp(sample, 0).confidence_interval().high)
 
 
 def test_no_interval_from_one_value():
     effects = paired_effects(np.full((1, 1, 1), 0.3))
     assert effects.mean[0] == 0.3
+    assert effects.conditional == "seeds and clips"
     assert np.isnan([effects.low[0], effects.high[0], effects.p[0]]).all()
 
 
@@ -82,6 +166,163 @@ def test_differences_that_are_all_the_same():
     np.testing.assert_array_equal(effects.low, [0, 2])
     np.testing.assert_array_equal(effects.high, [0, 2])
     np.testing.assert_array_equal(effects.p, [1, 0])
+    np.testing.assert_array_equal(equivalence_p(np.full((1, 3, 4), 2.0), 3), [0])
+
+
+# Interval and p-value are one thing
+
+
+@pytest.mark.parametrize("shares", SHARES.values())
+def test_zero_is_outside_exactly_where_p_is_small(shares: tuple[float, ...]):
+    d = differences(4, 6, 1, shares, tables=40) + np.linspace(-8, 8, 40 * TABLE)[:, None, None]
+    effects = paired_effects(d)
+    inside = (effects.low < 0) & (effects.high > 0)
+    np.testing.assert_array_equal(inside, effects.p > 0.05)
+    assert 0.2 < inside.mean() < 0.8
+    np.testing.assert_allclose(error(d).half(effects.p), np.abs(effects.mean), rtol=1e-6)
+
+
+def test_equivalence_is_the_interval_within_the_margin():
+    d = differences(6, 40, 1, SHARES["equal"], tables=20)
+    effects, p = paired_effects(d), equivalence_p(d, 4.0)
+    within = (effects.low > -4) & (effects.high < 4)
+    np.testing.assert_array_equal(within, p < 0.05)
+    assert 0.1 < within.mean() < 0.9
+    assert equivalence_p(d + 10, 4.0).min() == 1
+    np.testing.assert_array_equal(equivalence_p(d, np.full(len(d), 4.0)), p)
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 10, 40])
+def test_means_of_few_skewed_values_have_the_tails_they_are_given(count: int):
+    x = np.random.default_rng(count).exponential(size=(200_000, count)) - 1
+    t = np.abs(x.mean(1)) / (x.std(1, ddof=1) / np.sqrt(count))
+    for level in (0.05, 0.05 / TABLE):
+        missed = np.mean(t > stats.t.isf(level / 2, skewed(count - 1)))
+        assert 0.45 * level < missed < 1.45 * level
+        assert np.mean(t > stats.t.isf(level / 2, count - 1)) > 1.3 * level
+
+
+# The promises, on a part of `memmlp bench calibration`'s grid
+
+
+@pytest.mark.parametrize(("shape", "name"), [*itertools.product(GRID, SHARES)])
+def test_promises(shape: tuple[int, int, int], name: str):
+    d = differences(*shape, SHARES[name], tables=300)
+    effects = paired_effects(d, groups(*shape[1:]))
+    covered = np.mean((effects.low <= 0) & (effects.high >= 0))
+    assert covered >= 0.93
+    if shape[0] >= 3 and shape[1] / shape[2] >= 5:
+        assert covered <= 0.995
+    # of a family-wise error of 5 %, the standard error is 1.3 %
+    assert starred(effects.p) <= 0.08
+
+
+@pytest.mark.parametrize("shape", [(3, 40), (5, 40)])
+def test_satterthwaites_degrees_of_freedom_would_break_them(shape: tuple[int, int]):
+    d = differences(*shape, 1, SHARES["values"], tables=500)
+    assert starred(satterthwaite(d)) > 0.1
+    assert starred(paired_effects(d).p) < 0.05
+
+
+def test_clips_for_their_own_replicates_would_break_them():
+    d = differences(5, 40, 10, SHARES["groups"], tables=300)
+    assert starred(paired_effects(d).p) > 0.1
+    assert starred(paired_effects(d, groups(40, 10)).p) < 0.06
+
+
+def test_unequal_groups_keep_the_promises():
+    labels = np.repeat(np.arange(5), [9, 4, 1, 1, 1])
+    rng = np.random.default_rng(1)
+    for by_clip, by_group in ((1, 0), (0, 1), (1, 1)):
+        effects_of_groups = by_group * rng.normal(size=(9600, 1, 5))[:, :, labels]
+        d = (
+            by_clip * rng.normal(size=(9600, 1, 16))
+            + effects_of_groups
+            + 1e-3 * rng.normal(size=(9600, 3, 16))
+        )
+        effects = paired_effects(d, labels)
+        assert np.mean((effects.low <= 0) & (effects.high >= 0)) >= 0.95
+        assert starred(effects.p) <= 0.05
+
+
+# What must not matter
+
+
+sizes = st.tuples(st.integers(2, 4), st.integers(2, 6), st.integers(0, 1000))
+
+
+def assert_same(one: Effects, other: Effects) -> None:
+    for a, b in zip(one[:4], other[:4], strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-9)
+
+
+@settings(max_examples=30, deadline=None)
+@given(sizes)
+def test_order_and_names_do_not_matter(size: tuple[int, int, int]):
+    seeds, clips, number = size
+    rng = np.random.default_rng(number)
+    d, labels = rng.normal(0.5, 1, (3, seeds, clips)), rng.integers(0, 3, clips)
+    effects = paired_effects(d, labels)
+    order = rng.permutation(clips)
+    assert_same(effects, paired_effects(d[:, rng.permutation(seeds)][:, :, order], labels[order]))
+    assert_same(effects, paired_effects(d, np.array(["z", "a", "m"])[labels]))
+    assert_same(paired_effects(d), paired_effects(d, np.arange(clips)))
+    alone = [paired_effects(one[None], labels) for one in d]
+    assert_same(effects, Effects(*(np.concatenate([e[i] for e in alone]) for i in range(4)), ""))
+
+
+@settings(max_examples=30, deadline=None)
+@given(sizes, st.floats(0.01, 100))
+def test_units_and_signs_do_not_matter(size: tuple[int, int, int], scale: float):
+    seeds, clips, number = size
+    d = np.random.default_rng(number).normal(0.5, 1, (3, seeds, clips))
+    e, scaled, turned = paired_effects(d), paired_effects(scale * d), paired_effects(-d)
+    assert_same(scaled, Effects(scale * e.mean, scale * e.low, scale * e.high, e.p, ""))
+    assert_same(turned, Effects(-e.mean, -e.high, -e.low, e.p, ""))
+    np.testing.assert_allclose(detectable(scale * d, 5), scale * detectable(d, 5))
+
+
+# What could have been seen
+
+
+@pytest.mark.parametrize("comparisons", [1, 24])
+@pytest.mark.parametrize("shape", [(5, 12), (12, 40)])
+def test_detectable_is_found_with_its_power(shape: tuple[int, int], comparisons: int):
+    # Differences whose measured shares are what the repetitions are drawn from; these have normal effects.
+    d = differences(*shape, 1, SHARES["equal"], tables=1)[:1]
+    a, b, e = error(d).variances[:, 0]
+    rng = np.random.default_rng(5)
+    again = (
+        np.sqrt(shape[0] * max(a - e, 0)) * rng.normal(size=(4000, shape[0], 1))
+        + np.sqrt(shape[1] * max(b - e, 0)) * rng.normal(size=(4000, 1, shape[1]))
+        + np.sqrt(shape[0] * shape[1] * e) * rng.normal(size=(4000, *shape))
+    )
+    for power in (0.5, 0.8):
+        effect = detectable(d, comparisons, power=power)[0]
+        found = np.mean(paired_effects(again + effect).p <= 0.05 / comparisons)
+        assert found == pytest.approx(power, abs=0.03)
+
+
+def test_seeds_needed_are_the_first_that_suffice():
+    d = differences(4, 20, 1, (1, 0, 0.02, 0, 1), tables=1)[0]
+    few, many = seeds_needed(d, 12.0, TABLE), seeds_needed(d, 6.0, TABLE)
+    assert few is not None
+    assert many is not None
+    assert 2 <= few < many
+    assert seeds_needed(d[None], -6.0, TABLE) == many
+    assert seeds_needed(d, 6.0, TABLE, most=many) == many
+    assert seeds_needed(d, 6.0, TABLE, most=many - 1) is None
+    measured = detectable(d[None], TABLE)[0]
+    assert seeds_needed(d, 1.0001 * measured, TABLE) == 4
+    assert seeds_needed(d, 0.9999 * measured, TABLE) == 5
+
+
+def test_no_number_of_seeds_makes_up_for_few_clips():
+    d = differences(4, 4, 1, (1, 0, 10, 0, 0.1), tables=1)[0]
+    assert seeds_needed(d, 3.0, TABLE) is None
+
+
+# Many comparisons
 
 
 def test_holm_known_examples():
@@ -93,3 +334,73 @@ def test_holm_known_examples():
 def test_holm_stays_below_one_and_leaves_nan_out():
     np.testing.assert_allclose(holm(np.array([0.7, np.nan, 0.02, 0.6])), [1, np.nan, 0.06, 1])
     assert holm(np.array([])).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("difference", "equivalence", "mean", "paper", "expected"),
+    [
+        (0.01, 1.0, -0.3, -2.0, Verdict.HOLDS),
+        (0.01, 1.0, 0.3, -2.0, Verdict.OPPOSITE),
+        (0.01, 1.0, 0.3, None, Verdict.HIGHER),
+        (0.01, 1.0, -0.3, 0.0, Verdict.LOWER),
+        (0.05, 0.06, 0.3, 2.0, Verdict.HOLDS),
+        (0.01, 0.05, 0.3, 2.0, Verdict.EQUIVALENT),
+        (0.06, 0.06, 0.3, 2.0, Verdict.OPEN),
+        (np.nan, np.nan, 0.3, 2.0, Verdict.OPEN),
+    ],
+)
+def test_verdicts(difference: float, equivalence: float, mean: float, paper: float | None, expected: Verdict):
+    assert verdict(difference, equivalence, mean, paper) is expected
+
+
+def test_a_look_has_its_own_level():
+    assert verdict(0.03, 1.0, 1.0, 1.0, level=0.02) is Verdict.OPEN
+    assert verdict(0.03, 1.0, 1.0, 1.0, level=0.03) is Verdict.HOLDS
+
+
+def test_looks_and_what_they_spend():
+    assert looks(13) == (3, 5, 8, 13)
+    assert looks(10) == (3, 5, 8, 10)
+    assert looks(2) == (2,)
+    assert spending(1) == (0.05,)
+    assert spending(2) == pytest.approx((0.05 / 3, 0.1 / 3))
+    assert sum(spending(5)) == pytest.approx(0.05)
+
+
+def test_claims_leave_the_correction_and_other_decisions_stay_in_it():
+    p = np.array([0.5, 0.01, 0.001, 0.02, np.nan])
+    claimed = np.array([True, False, False, False, False])
+    closed = np.array([False, False, True, False, False])
+    # of four, one is claimed and one can't be: 0.01 is corrected for the three that are left
+    np.testing.assert_allclose(sequential(p, claimed, closed), [0, 0.03, 1, 0.04, np.nan])
+
+
+def test_looks_keep_the_error_where_one_level_for_all_would_not():
+    d = differences(13, 8, 1, SHARES["seeds"], tables=600)
+    rounds = looks(13)
+    kept, wasted = np.zeros((2, 600), bool)
+    for seeds, level in zip(rounds, spending(len(rounds)), strict=True):
+        p = paired_effects(d[:, :seeds]).p.reshape(600, TABLE)
+        least = np.array([holm(row).min() for row in p])
+        kept |= least <= level
+        wasted |= least <= 0.05
+    assert kept.mean() <= 0.06 < 0.09 < wasted.mean()
+
+
+# Descriptions
+
+
+def test_probability_of_improvement_by_hand():
+    ours, theirs = np.array([[1.0, 5.0], [2.0, 5.0]]), np.array([[2.0, 4.0]])
+    # clip 1: smaller, equal; clip 2: never
+    assert probability_of_improvement(ours, theirs) == pytest.approx((0.75 + 0) / 2)
+    assert probability_of_improvement(theirs, ours) == pytest.approx(1 - 0.375)
+
+
+def test_interquartile_mean_by_hand():
+    assert interquartile_mean(np.array([[0.0, 1.0, 2.0, 3.0], [4.0, 5.0, 6.0, 1000.0]])) == 3.5
+
+
+def test_performance_profile_by_hand():
+    errors = np.array([[1.0, 2.0], [3.0, 4.0]])
+    np.testing.assert_array_equal(performance_profile(errors, np.array([0.5, 2.0, 3.5])), [0, 0.5, 0.75])

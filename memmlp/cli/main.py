@@ -31,6 +31,7 @@ COMMANDS = {
     "sweep": Command("sweep", "sweep", "Run what is missing of a table or of a sweep of your own."),
     "tune": Command("tune", "tune", "Search loss weights, or other keys, by the errors on validation."),
     "table": Command("table", "table", "The paper's tables beside measured numbers."),
+    "results": Command("results", "results", "Keep runs' results with the code; make pages of them."),
     "report": Command("page", "page", "All tables and figures as one HTML page."),
     "runs": Command("runs", "runs", "List, show and compare runs."),
     "track": Command("track", "track", "Show run folders in MLflow."),

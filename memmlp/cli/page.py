@@ -15,7 +15,7 @@ from memmlp.cli.options import outputs_option
 if TYPE_CHECKING:
     from memmlp.report.page import Chapter
 
-EVERY = ("all", "memory_control")
+EVERY = ["all", "memory_control"]
 
 
 @click.command("report")
@@ -37,10 +37,7 @@ def page(words: tuple[str, ...], out: Path | None, outputs: Path) -> None:
     from memmlp.report.page import published
     from memmlp.sweep.spec import load_sweep
 
-    names = [word for word in words if "=" not in word and not word.startswith("~")] or [
-        "all",
-        "memory_control",
-    ]
+    names = [word for word in words if "=" not in word and not word.startswith("~")] or EVERY
     chapters = chapters_of(names, [word for word in words if word not in names], outputs)
     folder = shipped("sweeps")
     systems = published(load_sweep(folder / "table01.yaml"), load_sweep(folder / "table17.yaml"))
@@ -54,9 +51,7 @@ def chapters_of(names: Sequence[str], overrides: Sequence[str], outputs: Path) -
     """The tables of some names with the finished runs behind them, each run read once."""
     from memmlp.cli.table import MODES, gathered
     from memmlp.report.page import Chapter
-    from memmlp.tables.collect import finished
     from memmlp.tables.measured import load
 
-    read = functools.cache(load)
-    found = gathered(names, overrides, outputs, MODES["both"], read)
-    return [Chapter(sweep, table, finished(sweep, find, read)) for sweep, find, table in found]
+    found = gathered(names, overrides, outputs, MODES["both"], functools.cache(load))
+    return [Chapter(sweep, table, runs) for sweep, runs, table in found]

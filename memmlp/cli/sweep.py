@@ -206,14 +206,13 @@ def _seconds(plan: Plan, kind: str) -> list[float]:
 def report(chosen: Sweep, plan: Plan, words: Sequence[str]) -> None:
     """The table, what is done, what failed, and the next command. Exits with 1 where something failed."""
     from memmlp.cli.plan import orphans
-    from memmlp.cli.table import MODES, finder_in, on_screen
-    from memmlp.tables.collect import collect
+    from memmlp.cli.table import MODES, of_plan, on_screen
     from memmlp.tables.measured import load
 
     states = plan.states()
     failed = [task for task in plan.tasks if states[task.key] in ("failed", "blocked")]
     command = " ".join(["memmlp sweep", *words])
-    on_screen([collect(chosen, finder_in(plan), MODES["both"], command, load)])
+    on_screen([of_plan(chosen, plan, MODES["both"], command, load).table])
     click.echo(f"{sum(state == 'done' for state in states.values())} of {len(states)} runs done")
     for entry in orphans(chosen, plan):
         click.echo(f"orphan: run {entry.id} was '{entry.label}' seed {entry.seed} in an earlier version")

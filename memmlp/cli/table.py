@@ -13,15 +13,19 @@ import click
 
 from memmlp.cli.options import outputs_option
 from memmlp.errors import InputError
+from memmlp.sweep.spec import BRANCHES
 
 if TYPE_CHECKING:
-    from memmlp.runs import Run
     from memmlp.sweep.plan import Plan
     from memmlp.sweep.spec import Arm, Sweep
-    from memmlp.tables.collect import Find, Table
+    from memmlp.tables.collect import Find
+    from memmlp.tables.effects import Runs
+    from memmlp.tables.flags import Say
     from memmlp.tables.measured import Measured
+    from memmlp.tables.planning import Need
+    from memmlp.tables.table import Table
 
-    Read = Callable[[Path], Measured]
+    Read = Callable[[Path, tuple[str, ...]], Measured]
 MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", "window")}
 
 
@@ -37,9 +41,18 @@ MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", "windo
 @click.option(
     "--mode", type=click.Choice(list(MODES)), default="both", show_default=True, help="Of evaluation."
 )
+@click.option("--branch", type=click.Choice(BRANCHES), help="In place of the paper's for this table.")
+@click.option("--plan", is_flag=True, help="Show how many seeds the paper's effects would need here.")
 @outputs_option
 def table(
-    name: str, overrides: tuple[str, ...], form: str | None, out: Path | None, mode: str, outputs: Path
+    name: str,
+    overrides: tuple[str, ...],
+    form: str | None,
+    out: Path | None,
+    mode: str,
+    branch: str | None,
+    plan: bool,
+    outputs: Path,
 ) -> None:
     """The table of a sweep: NAME is a file's path, a shipped sweep, a table's number, or `all`.
 
@@ -47,8 +60,13 @@ def table(
     """
     from memmlp.tables.measured import load
 
+    if plan and (form or out):
+        raise InputError("--plan: goes to the screen alone, without --format and --out")
     with _uncollected():
-        found = gathered([name], overrides, outputs, MODES[mode], functools.cache(load))
+        found = gathered([name], overrides, outputs, MODES[mode], functools.cache(load), branch)
+    if plan:
+        plans_on_screen(found, MODES[mode])
+        return
     tables = [one.table for one in found]
     if form is None and out is None:
         on_screen(tables)
@@ -71,35 +89,49 @@ def _uncollected() -> Iterator[None]:
 
 
 class Found(NamedTuple):
-    """A sweep with what finds its runs, and its table."""
+    """A sweep, the finished runs of its arms by seed, and its table."""
 
     sweep: Sweep
-    find: Find
+    runs: dict[str, Runs]
     table: Table
 
 
 def gathered(
-    names: Sequence[str], overrides: Sequence[str], outputs: Path, modes: Sequence[str], read: Read
+    names: Sequence[str],
+    overrides: Sequence[str],
+    outputs: Path,
+    modes: Sequence[str],
+    read: Read,
+    branch: str | None = None,
 ) -> list[Found]:
-    """The tables that some names stand for.
+    """The tables that some names stand for; of another branch than theirs where one is given.
 
     A table of the paper whose config lacks something (where AMASS lies) shows the paper's values and says so.
     Raises InputError where none can be composed with the command line's overrides.
     """
-    from memmlp.tables.collect import collect, nothing, without_runs
+    from memmlp.cli.plan import planned
+    from memmlp.tables.collect import without_runs
 
     found, failures = [], []
     for sweep, command in chosen(names, overrides):
+        sweep = sweep.with_branch(branch) if branch else sweep
         try:
-            find = finder(sweep, outputs)
-            found.append(Found(sweep, find, collect(sweep, find, modes, command, read)))
+            found.append(of_plan(sweep, planned(sweep, outputs.absolute()), modes, command, read))
         except InputError as error:
             failures.append(error)
             table = without_runs(sweep, modes, f"nothing measured: {error}")
-            found.append(Found(sweep, nothing, table))
+            found.append(Found(sweep, {arm.label: {} for arm in sweep.runnable()}, table))
     if failures and (overrides or found[0].sweep.table is None) and len(failures) == len(found):
         raise failures[0]
     return found
+
+
+def of_plan(sweep: Sweep, plan: Plan, modes: Sequence[str], command: str, read: Read) -> Found:
+    """A planned sweep's finished runs and table."""
+    from memmlp.tables.collect import collect, finished
+
+    runs = finished(sweep, finder(plan, read))
+    return Found(sweep, runs, collect(sweep, runs, modes, command, states(plan)))
 
 
 def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
@@ -115,21 +147,30 @@ def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, 
     ]
 
 
-def finder(sweep: Sweep, outputs: Path) -> Find:
-    """What finds the sweep's runs. Raises InputError where its config is wrong."""
-    from memmlp.cli.plan import planned
+def finder(plan: Plan, read: Read) -> Find:
+    """What finds the results of a planned sweep's finished runs."""
 
-    return finder_in(planned(sweep, outputs.absolute()))
+    entries = {(entry.label, entry.seed): entry for entry in plan.entries}
 
-
-def finder_in(plan: Plan) -> Find:
-    """What finds the runs of a planned sweep."""
-    runs = {(entry.label, entry.seed): plan.run_of(entry) for entry in plan.entries}
-
-    def find(arm: Arm, seed: int) -> Run | None:
-        return runs.get((arm.label, seed))
+    def find(arm: Arm, seed: int) -> Measured | None:
+        entry = entries.get((arm.label, seed))
+        complete = entry is not None and plan.complete(entry)
+        return read(plan.run_of(entry).folder, entry.stages) if entry and complete else None
 
     return find
+
+
+def states(plan: Plan) -> Say:
+    """What tells how far a planned sweep's unfinished runs are, where they began."""
+
+    entries = {(entry.label, entry.seed): entry for entry in plan.entries}
+
+    def state(arm: Arm, seed: int) -> str | None:
+        entry = entries.get((arm.label, seed))
+        word = plan.run_of(entry).state(plan.complete(entry)) if entry else "new"
+        return word if word not in ("new", "done") else None
+
+    return state
 
 
 def on_screen(tables: Sequence[Table]) -> None:
@@ -141,6 +182,43 @@ def on_screen(tables: Sequence[Table]) -> None:
     console = Console(highlight=False, markup=False)
     for one in tables:
         show(one, console)
+
+
+def plans_on_screen(found: Sequence[Found], modes: Sequence[str]) -> None:
+    """Show how many seeds the paper's effects need, sweep by sweep."""
+    from memmlp.tables.grid import caption
+    from memmlp.tables.planning import needs
+
+    for one in found:
+        wanted = needs(one.sweep, one.runs, modes)
+        click.echo(caption(one.table))
+        if wanted:
+            click.echo(_needed(wanted))
+        else:
+            click.echo("no arm with an effect that the paper prints has two seeds and two groups of clips")
+        click.echo()
+
+
+def _needed(wanted: Sequence[Need]) -> str:
+    """A line for each comparison, and how to read it."""
+    rows = [("arm", "mode", "metric", "paper", "here", "seeds", "needed")]
+    for need in wanted:
+        differences = (f"{need.paper:+.2f}", f"{need.measured:+.2f}")
+        number = "no number" if need.seeds is None else str(need.seeds)
+        rows.append((need.label, need.mode, need.metric, *differences, str(need.have), number))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [
+        "  ".join(
+            word.ljust(width) if i < 3 else word.rjust(width)
+            for i, (word, width) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in rows
+    ]
+    note = (
+        "needed: seeds for an effect of the paper's size to be significant with 80 % power, after Holm's "
+        "correction over this table, with these test clips; no number: the clips alone leave too much open"
+    )
+    return "\n".join([*lines, note])
 
 
 def _formatted(tables: Sequence[Table], form: str, alone: bool) -> str:

@@ -9,13 +9,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter, ScalarFormatter
 
+from memmlp.statistics import performance_profile
 from memmlp.sweep.spec import COSTS
-from memmlp.tables.collect import Cell, Table
+from memmlp.tables.distributions import Distribution
 from memmlp.tables.grid import heading
+from memmlp.tables.table import Cell, Table
 
 INK, FAINT = "#010203", "#010204"
 SERIES = tuple(f"#0102{number:02x}" for number in range(0x10, 0x18))
@@ -63,6 +66,9 @@ def forest(table: Table) -> str | None:
     figure, axes = _panels(len(metrics), deep * (0.9 + 0.42 * len(rows)))
     for column, (axis, metric) in enumerate(zip(axes, metrics, strict=True)):
         axis.axvline(0, color=FAINT, zorder=0)
+        if metric in table.smallest:
+            least = table.smallest[metric]
+            axis.axvspan(-least, least, color=FAINT, alpha=0.35, linewidth=0, zorder=0)
         for place, row in enumerate(rows):
             for number, mode in enumerate(table.modes):
                 shift = 0.14 * (2 * number - len(table.modes) + 1)
@@ -79,6 +85,25 @@ def forest(table: Table) -> str | None:
         axis.spines["left"].set_visible(False)
     _legend(figure, [*table.modes, "paper"], ["o"] * len(table.modes) + ["D"])
     return _svg(figure, f"forest-{table.name}", f"differences from {table.reference}")
+
+
+@mpl.rc_context(STYLE)
+def profiles(name: str, found: Mapping[str, Sequence[Distribution]]) -> str:
+    """Performance profiles: a panel a metric, a curve an arm."""
+    figure, axes = _panels(len(found), 2.8 * -(-len(found) // PANELS))
+    for axis, (metric, arms) in zip(axes, found.items(), strict=True):
+        every = np.concatenate([arm.errors for arm in arms if arm.errors.size])
+        thresholds = np.linspace(every.min(), every.max(), 101)
+        for number, arm in enumerate(arms):
+            if arm.errors.size:
+                fractions = performance_profile(arm.errors, thresholds)
+                axis.plot(thresholds, fractions, color=SERIES[number % len(SERIES)])
+        axis.set(xlabel=heading(metric), ylim=(-0.02, 1.02))
+        axis.xaxis.set_major_locator(MaxNLocator(4))
+        axis.grid(alpha=0.6)
+    labels = [arm.label for arm in next(iter(found.values()))]
+    _legend(figure, labels, ["-"] * len(labels))
+    return _svg(figure, f"profiles-{name}", "performance profiles")
 
 
 @mpl.rc_context(STYLE)

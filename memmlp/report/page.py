@@ -15,10 +15,12 @@ from memmlp.report import figures
 from memmlp.report.figures import Curve, Point
 from memmlp.runs import Metrics
 from memmlp.sweep.spec import COSTS, Sweep
-from memmlp.tables.collect import Runs, Table
+from memmlp.tables.distributions import Distribution, distributions
+from memmlp.tables.effects import Runs
 from memmlp.tables.grid import caption
 from memmlp.tables.measured import Measured
 from memmlp.tables.render import as_html
+from memmlp.tables.table import Table
 
 ERROR = "MPJRE"  # of Fig. 1, as Sec. 4.3 has it
 MOST_POINTS = 200  # of a curve
@@ -48,7 +50,7 @@ class Entry:
     @cached_property
     def config(self) -> dict[str, Any]:
         """The dotted keys of its config that can change a result."""
-        return trained_by(self.measured.run.config)
+        return trained_by(self.measured.run.config) if self.measured.run else {}
 
 
 def page(chapters: Sequence[Chapter], published: Sequence[Point], generated: str, commit: str) -> str:
@@ -62,6 +64,7 @@ def page(chapters: Sequence[Chapter], published: Sequence[Point], generated: str
     sections = [
         ("tables", "Tables", [as_html(chapter.table) for chapter in chapters]),
         ("effects", "Effects", _effects(chapters)),
+        ("distributions", "Beyond the mean", _distributions(chapters)),
         ("accuracy", "Accuracy and latency", _accuracy(chapters, published)),
         ("training", "Training curves", _training(chapters)),
         ("latency", "Latency", [_latency(entries)]),
@@ -97,7 +100,7 @@ def _entries(chapters: Sequence[Chapter]) -> list[Entry]:
     for chapter in chapters:
         for label, runs in chapter.runs.items():
             for seed, measured in runs.items():
-                entry = entries.setdefault(measured.run.id, Entry(measured))
+                entry = entries.setdefault(measured.id, Entry(measured))
                 entry.places.append(f"{chapter.sweep.name}: {label}, seed {seed}")
     return list(entries.values())
 
@@ -124,11 +127,47 @@ def _effects(chapters: Iterable[Chapter]) -> list[str]:
         svg = figures.forest(chapter.table)
         if svg:
             note = (
-                f"Difference from '{chapter.table.reference}' with its 95 % interval; filled where it is "
-                "significant after Holm's correction; the diamond is the paper's difference. Left is better."
+                f"Difference from '{chapter.table.reference}', or from the arm's own control, with its 95 % "
+                "interval; filled where it is significant after Holm's correction; the shaded band is the "
+                "smallest effect of interest, the diamond the paper's difference. Left is better."
             )
             parts.append(_figure(chapter.title, svg, note))
     return parts
+
+
+def _distributions(chapters: Iterable[Chapter]) -> list[str]:
+    """Performance profiles, and what a few clips cannot carry away."""
+    parts = []
+    for chapter in chapters:
+        found = distributions(chapter.sweep, chapter.runs, chapter.table.modes[0])
+        if found:
+            svg = figures.profiles(chapter.sweep.name, found)
+            note = (
+                f"{chapter.table.modes[0].capitalize()} mode: the fraction of all runs' test clips whose "
+                "error is at most this; further up and left is better."
+            )
+            parts += [_figure(chapter.title, svg, note), _robust(found)]
+    return parts
+
+
+def _robust(found: Mapping[str, Sequence[Distribution]]) -> str:
+    """Interquartile means and probabilities of improvement, an arm a row."""
+    metrics = list(found)
+    head = ["arm", *(f"{metric}: {what}" for metric in metrics for what in ("IQM", "P(better)"))]
+    rows = [
+        [one.label, *(word for metric in metrics for word in _robust_words(found[metric][place]))]
+        for place, one in enumerate(found[metrics[0]])
+    ]
+    note = (
+        "IQM: the mean of the middle half of all seeds and clips. P(better): how often a run of the arm has "
+        "a smaller error than one of its control on the same clip. Neither is a test."
+    )
+    return _rows(head, rows, note)
+
+
+def _robust_words(one: Distribution) -> tuple[str, str]:
+    better = "-" if one.improvement is None else f"{one.improvement:.2f}"
+    return ("-" if one.middle is None else f"{one.middle:.2f}"), better
 
 
 def _accuracy(chapters: Iterable[Chapter], paper: Sequence[Point]) -> list[str]:
@@ -176,7 +215,10 @@ def _curves(chapter: Chapter) -> dict[str, dict[str, list[Curve]]]:
     names = [f"rotation {metric}" for metric in chapter.table.metrics if metric not in COSTS]
     wanted = {("train", "loss"): "training loss"}
     wanted |= {("val", name): f"validation: {name}" for name in names}
-    logs = {label: [m.run.metrics() for m in runs.values()] for label, runs in chapter.runs.items()}
+    logs = {
+        label: [measured.run.metrics() for measured in runs.values() if measured.run]
+        for label, runs in chapter.runs.items()
+    }
     panels: dict[str, dict[str, list[Curve]]] = {}
     for (phase, name), title in wanted.items():
         arms = {label: [_curve(log, phase, name) for log in found] for label, found in logs.items()}
@@ -213,7 +255,7 @@ def _latency(entries: Sequence[Entry]) -> str:
     )
     rows = []
     for entry in entries:
-        values = entry.measured.run.results.get("latency", {})
+        values = entry.measured.latency
         numbers = [
             _number(values, key, scale, form)
             for key, scale, form in (
@@ -221,9 +263,7 @@ def _latency(entries: Sequence[Entry]) -> str:
                 ("parameters", 1, ",.0f"), ("macs", 1e6, ".1f"), ("onnx_bytes", 1e6, ".2f"),
             )
         ]  # fmt: skip
-        rows.append(
-            [entry.measured.run.id, *numbers, entry.measured.origin.hardware, "; ".join(entry.places)]
-        )
+        rows.append([entry.measured.id, *numbers, entry.measured.origin.hardware, "; ".join(entry.places)])
     return _rows(
         head, rows, "One streaming step on one CPU core; the reference is a fixed stack of matrix products."
     )
@@ -240,14 +280,15 @@ def _runs(entries: Sequence[Entry]) -> str:
     common = _common([entry.config for entry in entries])
     rows = []
     for entry in entries:
-        manifest, origin = entry.measured.run.manifest, entry.measured.origin
+        run, origin = entry.measured.run, entry.measured.origin
+        manifest = run.manifest if run else {}
         seconds = manifest.get("seconds")
         minutes = f"{sum(seconds.values()) / 60:.1f}" if isinstance(seconds, dict) else "-"
         keys = sorted({*entry.config, *common})
         differing = [f"{k}={entry.config.get(k, '-')}" for k in keys if entry.config.get(k) != common.get(k)]
         code = origin.code + (" + changes" if origin.changed else "")
         when = str(manifest.get("started", "-"))[:16].replace("T", " ")
-        row = [entry.measured.run.id, when, minutes, code, origin.data, "; ".join(differing) or "-"]
+        row = [entry.measured.id, when, minutes, code, origin.data, "; ".join(differing) or "-"]
         rows.append([*row, "; ".join(entry.places)])
     head = (
         "run",

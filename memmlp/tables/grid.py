@@ -6,8 +6,9 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from memmlp.statistics import Verdict
 from memmlp.sweep.spec import COSTS
-from memmlp.tables.collect import Cell, Row, Table
+from memmlp.tables.table import Cell, Row, Table
 from memmlp.units import UNITS
 
 COST_UNITS = {"FLOPs": "G", "MACs": "G", "parameters": "M", "size": "MB", "ms": "", "ratio": "", "FPS": ""}
@@ -54,10 +55,13 @@ def grids(table: Table) -> list[Grid]:
 
 def heading(metric: str) -> str:
     """A metric with its unit and the direction that is better."""
-    unit = UNITS.get(metric, COST_UNITS.get(metric, "")).replace("10^2", "10²").replace("s^3", "s³")
-    return " ".join(
-        word for word in (metric, f"[{unit}]" if unit else "", "↑" if metric == "FPS" else "↓") if word
-    )
+    words = (metric, f"[{unit(metric)}]" if unit(metric) else "", "↑" if metric == "FPS" else "↓")
+    return " ".join(word for word in words if word)
+
+
+def unit(metric: str) -> str:
+    """A metric's unit; empty where it has none."""
+    return UNITS.get(metric, COST_UNITS.get(metric, "")).replace("10^2", "10²").replace("s^3", "s³")
 
 
 def caption(table: Table) -> str:
@@ -66,43 +70,99 @@ def caption(table: Table) -> str:
 
 
 def legend(table: Table) -> list[str]:
-    """How to read the lines, where there is something measured."""
+    """How to read the lines, where there is something measured; and whose errors they are."""
+    lines = [_branch(table)] if table.measured_metrics else []
     if not any(row.found for row in table.rows):
-        return []
-    timeless = set(table.metrics) <= set(COSTS)
-    lines = [] if timeless else ["mean ± sd over seeds of the means over test clips"]
-    if table.comparisons:
-        lines.append(
-            f"difference from '{table.reference}' [95 % interval, bootstrap paired by seed and test clip]; "
-            f"* p < 0.05 by Holm's correction over the table's {table.comparisons} comparisons"
-        )
-    agreeing, known, surely, sure = table.signs
-    if known:
-        among = f", {surely} of {sure} of the significant ones" if sure else ""
-        lines.append(
-            "paper's value (its difference; ✓ ours has the same sign, ✗ the opposite): "
-            f"{agreeing} of {known} signs as in the paper{among}"
-        )
+        return lines
+    if table.measured_metrics:
+        lines.append("mean ± sd over seeds of the means over test clips")
+    if any(True for mode in table.modes for _ in table.effects(mode)):
+        lines += [_differences(table), _meanings(table), *_power(table)]
+    if any(cell.agrees is not None for row in table.rows for c in row.cells.values() for cell in c.values()):
+        lines.append(_agreement(table))
     return lines
+
+
+def _branch(table: Table) -> str:
+    """The branch that the rows show, and how it is known that the paper's values are of it."""
+    rows = {branch: [row for row in table.rows if row.branch == branch] for branch in _branches(table)}
+    if len(rows) == 1:
+        words = next(iter(rows))
+    else:
+        most = max(rows, key=lambda branch: len(rows[branch]))
+        others = [f"'{row.label}' {row.branch}" for row in table.rows if row.branch != most]
+        words = f"{most}; {', '.join(others)}"
+    source = f" ({table.branch_source})" if table.branch_source else ""
+    return f"errors of the branch: {words}{source}"
+
+
+def _branches(table: Table) -> list[str]:
+    return list(dict.fromkeys(row.branch for row in table.rows if not row.paper_only))
+
+
+def _differences(table: Table) -> str:
+    """What a line of differences has, and of which arms it is."""
+    own = [row for row in table.rows if row.against not in (None, table.reference)]
+    others = "".join(f", of '{row.label}' from '{row.against}'" for row in own)
+    star = f"; * p < 0.05 by Holm's correction over the table's {table.comparisons} comparisons"
+    return (
+        f"diff.: from '{table.reference}'{others} [95 % interval, paired by seed and test clip]"
+        f"{star if table.comparisons else ''}"
+    )
+
+
+def _meanings(table: Table) -> str:
+    """What the verdicts mean, and the smallest effects of interest."""
+    margins = [
+        f"{metric} {number_words(table.smallest[metric])} {unit(metric)}"
+        for metric in table.measured_metrics
+        if metric in table.smallest
+    ]
+    return (
+        "verdicts: holds (significant, with the paper's sign), opposite (significant, with the other sign), "
+        "higher or lower (significant, where the paper prints no difference), equivalent (nearer to 0 than "
+        f"the smallest effect of interest: {', '.join(margins)}), open (none of these)"
+    )
+
+
+def _power(table: Table) -> list[str]:
+    """What this table could have seen, a line a metric."""
+    lines = []
+    for metric in table.measured_metrics:
+        seen = [(table.detectable(mode, metric), mode) for mode in table.modes]
+        words = [f"{number_words(least)} ({mode})" for least, mode in seen if least is not None]
+        if words:
+            lines.append(f"{metric}: could have seen {' or '.join(words)} {unit(metric)} with 80 % power")
+    return lines
+
+
+def _agreement(table: Table) -> str:
+    """The paper's line, and how many of its effects came to which verdict."""
+    mode, costs = table.modes[0], set(table.metrics) & set(COSTS)
+    found = table.verdicts(mode)
+    counts = ", ".join(f"{found[verdict]} {verdict}" for verdict in Verdict if found[verdict])
+    said = f"; of {sum(found.values())} effects in {mode} mode: {counts}" if found else ""
+    signs = "; of a cost by its sign" if costs else ""
+    return f"paper: value (difference; ✓ it holds here, ✗ the opposite does{signs}){said}"
 
 
 def _lines(table: Table, row: Row, mode: str) -> Iterable[Line]:
     """An arm's lines: measured, its difference, the paper's; of the paper's own rows that alone."""
     cells = [(row.cells[mode][metric], metric) for metric in table.metrics]
-    paper = tuple((_paper(cell, metric),) for cell, metric in cells)
+    paper = tuple((paper_words(cell, metric),) for cell, metric in cells)
     if row.paper_only:
         yield Line("paper", (row.label, "paper"), paper)
         return
     seeds = f"{len(row.found)}/{len(row.wanted)}"
-    yield Line("measured", (row.label, seeds), tuple((_value(cell, metric),) for cell, metric in cells))
+    yield Line("measured", (row.label, seeds), tuple((value_words(cell, metric),) for cell, metric in cells))
     if any(cell.effect for cell, _ in cells):
-        effects = tuple(_effect(cell, metric) for cell, metric in cells)
+        effects = tuple(effect_words(cell, metric) for cell, metric in cells)
         yield Line("difference", ("", "diff."), effects)
     if any(cell.paper is not None for cell, _ in cells):
         yield Line("paper", ("", "paper"), paper)
 
 
-def _value(cell: Cell, metric: str) -> str:
+def value_words(cell: Cell, metric: str) -> str:
     """Mean ± sd."""
     if cell.mean is None:
         return MISSING
@@ -112,8 +172,8 @@ def _value(cell: Cell, metric: str) -> str:
     return f"{cell.mean:.2f}{sd}"
 
 
-def _effect(cell: Cell, metric: str) -> tuple[str, ...]:
-    """The difference, starred where it is significant, and its interval; of a cost the ratio."""
+def effect_words(cell: Cell, metric: str) -> tuple[str, ...]:
+    """The difference, starred where it is significant, its interval and verdict; of a cost the ratio."""
     effect = cell.effect
     if effect is None:
         return (MISSING,)
@@ -124,7 +184,13 @@ def _effect(cell: Cell, metric: str) -> tuple[str, ...]:
     places = _places(effect.high - effect.low)
     low, high = (_signed(number, f".{places}f") for number in (effect.low, effect.high))
     star = "*" if effect.significant else ""
-    return _signed(effect.mean, f"+.{places}f") + star, f"[{low}, {high}]"
+    verdict = () if effect.verdict is None else (str(effect.verdict),)
+    return _signed(effect.mean, f"+.{places}f") + star, f"[{low}, {high}]", *verdict
+
+
+def number_words(value: float) -> str:
+    """A number of two digits."""
+    return f"{value:.2g}" if value < 100 else f"{value:.0f}"
 
 
 def _ratio(value: float | None, difference: float) -> tuple[str, ...]:
@@ -144,7 +210,7 @@ def _places(width: float) -> int:
     return min(max(1 - math.floor(math.log10(width / 2)), 2), 3) if width > 0 else 2
 
 
-def _paper(cell: Cell, metric: str) -> str:
+def paper_words(cell: Cell, metric: str) -> str:
     """The paper's value, its difference from the reference, and whether ours has its sign."""
     if cell.paper is None:
         return MISSING

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,9 @@ from memmlp.files import read_json
 from memmlp.runs import Run, intact
 
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # mode -> branch -> metric -> value
+UNKNOWN = "?"
+SHARED = "MPJPE"  # a metric that both branches have
+SAME = 1e-4  # relative difference of errors up to which they are of the same joints: float32, six digits kept
 
 
 @dataclass(frozen=True)
@@ -22,13 +26,25 @@ class Origin:
 
     Attributes:
         code: commit, or the version where there is no checkout. changed: whether it had uncommitted changes.
-        data: digest of the prepared data. hardware: the processor.
+        data: digest of the prepared data. body: whose rest joints the motion is on, "builtin" or a body
+            model's file.
+        hardware: the processor. device: "cpu" or "cuda"; gpu: its name. threads: of torch on the processor.
+        torch: its version. precision: of training.
+        recipes: number of the recipe by component. vqvae: id of the VQ-VAE's run, where there is one.
     """
 
     code: str
     changed: bool
     data: str
     hardware: str
+    device: str = UNKNOWN
+    gpu: str = UNKNOWN
+    threads: str = UNKNOWN
+    torch: str = UNKNOWN
+    precision: str = UNKNOWN
+    body: str = UNKNOWN
+    recipes: Mapping[str, int] = field(default_factory=dict)
+    vqvae: str | None = None
 
 
 @dataclass(frozen=True)
@@ -36,18 +52,24 @@ class Measured:
     """The results of a finished run.
 
     Attributes:
-        run: where they lie.
+        id: of the run.
         means: the metrics' means over the test clips. clips: those of each clip by its name.
+        groups: the group (take, subject) of each clip; a clip that is not named is a group of its own.
         costs: GFLOP, GMAC and ms of a streaming step, its time over the reference network's in the same
             minute, millions of parameters, MB of ONNX, frames a second.
         origin: what the run was made from.
+        latency: all that was measured of its streaming step.
+        run: the folder where it lies; None where it was read from results that were kept without one.
     """
 
-    run: Run
+    id: str
     means: Errors
     clips: Mapping[str, Errors]
+    groups: Mapping[str, str]
     costs: Mapping[str, float]
     origin: Origin
+    latency: Mapping[str, Any] = field(default_factory=dict)
+    run: Run | None = None
 
     def value(self, mode: str, branch: str, metric: str) -> float | None:
         """A metric's mean over clips, or a cost; None where the run has none."""
@@ -55,10 +77,28 @@ class Measured:
             return self.costs[metric]
         return _number(self.means, mode, branch, metric)
 
-    def by_clip(self, names: list[str], mode: str, branch: str, metric: str) -> np.ndarray:
+    def by_clip(self, names: Sequence[str], mode: str, branch: str, metric: str) -> np.ndarray:
         """A metric of these clips (C,); NaN where the run has none."""
         numbers = [_number(self.clips[name], mode, branch, metric) for name in names]
         return np.array([np.nan if number is None else number for number in numbers])
+
+    def group(self, clip: str) -> str:
+        """The group of a clip."""
+        return self.groups.get(clip, clip)
+
+    def has(self, branch: str) -> bool:
+        """Whether the network was evaluated in that branch."""
+        return any(branch in branches for branches in self.means.values())
+
+    @property
+    def one_head(self) -> bool:
+        """Whether the network has rotations alone: its positions are theirs by forward kinematics."""
+        pairs = [
+            [_number(self.means, mode, branch, SHARED) for branch in ("rotation", "position")]
+            for mode in self.means
+        ]
+        known = [(one, other) for one, other in pairs if one is not None and other is not None]
+        return all(math.isclose(one, other, rel_tol=SAME) for one, other in known)
 
 
 def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
@@ -68,14 +108,17 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     """
     run = Run(folder)
     manifest = _read(run.manifest_path)
-    reports = [_read(path) for path in _evaluations(run, stages)]
-    means = {report["mode"]: report["mean"] for report in reports}
+    means: dict[str, dict[str, Any]] = {}
     clips: dict[str, dict[str, Any]] = {}
-    for report in reports:
+    groups: dict[str, str] = {}
+    for report in sorted(map(_read, _evaluations(run, stages)), key=lambda report: report["made"]):
+        means.setdefault(report["mode"], {}).update(report["mean"])
         for clip in report["clips"]:
-            clips.setdefault(clip["name"], {})[report["mode"]] = clip
+            clips.setdefault(clip["name"], {}).setdefault(report["mode"], {}).update(clip)
+            groups |= {clip["name"]: clip["group"]} if clip.get("group") else {}
     deployed = [run.deployment(name) for name in stages or () if run.deployment(name).done] or [run.shipped]
-    return Measured(run, means, clips, _costs(read_json(deployed[-1].latency)), _origin(manifest))
+    latency = read_json(deployed[-1].latency)
+    return Measured(run.id, means, clips, groups, _costs(latency), _origin(manifest), latency, run)
 
 
 def _evaluations(run: Run, stages: Sequence[str] | None) -> list[Path]:
@@ -110,10 +153,24 @@ def _costs(latency: Mapping[str, float]) -> dict[str, float]:
 
 
 def _origin(manifest: Mapping[str, Any]) -> Origin:
+    def of(key: str) -> str:
+        return str(manifest.get(key) or UNKNOWN)
+
     git = manifest.get("git") or {}
-    code = git["commit"][:7] if git else f"version {manifest.get('version', '?')}"
-    data, hardware = str(manifest.get("data", "?"))[:8], str(manifest.get("cpu", "?"))
-    return Origin(code, bool(git.get("dirty")), data, hardware)
+    return Origin(
+        code=git["commit"][:7] if git else f"version {of('version')}",
+        changed=bool(git.get("dirty")),
+        data=of("data")[:8],
+        hardware=of("cpu"),
+        device=of("device"),
+        gpu=of("gpu"),
+        threads=of("threads"),
+        torch=str((manifest.get("packages") or {}).get("torch") or UNKNOWN),
+        precision=of("precision"),
+        body=of("body"),
+        recipes=manifest.get("recipes") or {},
+        vqvae=manifest.get("upstream"),
+    )
 
 
 def _number(errors: Errors, mode: str, branch: str, metric: str) -> float | None:

@@ -14,8 +14,9 @@ from typing import Any
 from rich.console import Console
 
 from memmlp.files import plain
-from memmlp.tables.collect import Table
+from memmlp.statistics import Verdict
 from memmlp.tables.grid import MINUS, Grid, Line, caption, grids, legend
+from memmlp.tables.table import Table
 
 GAP = "  "  # between columns
 LABEL = 18  # characters of the arms' column on a terminal, at most
@@ -29,14 +30,19 @@ TEX = {
 
 def markdown(table: Table) -> str:
     """GitHub's Markdown."""
-    parts = [f"### {_md(caption(table))}"]
+    parts = [f"### {escaped(caption(table))}"]
     for grid in grids(table):
-        rows = [list(map(_md, grid.header)), ["---", ":---:", *["---:"] * len(table.metrics)]]
-        rows += [[_md(word) for word in (*line.head, *map(" ".join, line.cells))] for line in _all(grid)]
+        rows = [list(map(escaped, grid.header)), ["---", ":---:", *["---:"] * len(table.metrics)]]
+        rows += [[escaped(word) for word in (*line.head, *map(" ".join, line.cells))] for line in _all(grid)]
         text = "\n".join(f"| {' | '.join(row)} |" for row in rows)
         parts.append(f"**{grid.mode}**\n\n{text}" if grid.mode else text)
-    remarks = "\n".join(f"- {_md(line)}" for line in _remarks(table))
+    remarks = "\n".join(f"- {escaped(line)}" for line in _remarks(table))
     return "\n\n".join([*parts, remarks] if remarks else parts) + "\n"
+
+
+def escaped(text: str) -> str:
+    """A text that Markdown shows as it is."""
+    return re.sub(r"([\\`*_|<>\[\]#])", r"\\\1", text)
 
 
 def latex(table: Table) -> str:
@@ -100,10 +106,6 @@ def _remarks(table: Table) -> list[str]:
     return [*legend(table), *table.flags, *table.notes]
 
 
-def _md(text: str) -> str:
-    return re.sub(r"([\\`*_|<>\[\]#])", r"\\\1", text)
-
-
 def _tex(text: str) -> str:
     return "".join(TEX.get(letter, letter) for letter in text)
 
@@ -140,7 +142,9 @@ def _html_line(line: Line) -> str:
 
 
 def _html_mark(text: str) -> str:
-    """A part of a cell, its sign of agreement or significance set off."""
+    """A part of a cell, its sign of agreement or significance set off; a verdict in a class of its name."""
+    if text in set(Verdict):
+        return f'<span class="verdict {text}">{text}</span>'
     marks = {"✓": "same", "✗": "opposite", "*": "significant"}
     escaped = _html(text)
     for mark, name in marks.items():

@@ -40,6 +40,21 @@ def test_command_prints_a_table(memmlp: Memmlp, planned: None, monkeypatch: pyte
     assert memmlp("table", "13", "--mode", "window").out.count("3/3") == 3
 
 
+def test_command_shows_another_branch(memmlp: Memmlp, planned: None):
+    out = " ".join(memmlp("table", "14", "--branch", "position").out.split())
+    assert "errors of the branch: position" in out
+    assert out.count("± ") < " ".join(memmlp("table", "14").out.split()).count("± ")  # no rotations, no MPJRE
+
+
+def test_command_plans_seeds(memmlp: Memmlp, planned: None):
+    out = memmlp("table", "14", "--plan", "--mode", "stream").out
+    rows = [line.split() for line in out.splitlines() if " stream " in line]
+    assert len(rows) == 3 * 4
+    assert all(row[-2] == "3" or row[-3] == "3" for row in rows)
+    assert "needed: seeds for an effect of the paper's size" in out
+    assert "no arm with an effect" in memmlp("table", "1", "--plan").out
+
+
 def test_command_writes_the_format_of_the_ending(memmlp: Memmlp, planned: None, tmp_path: Path):
     for ending, word in (("md", "| arm |"), ("tex", r"\toprule"), ("json", '"rows"'), ("html", "<table>")):
         ran = memmlp("table", "5", "--out", f"out/t.{ending}")
@@ -67,6 +82,8 @@ def test_all_as_json_is_one_list(memmlp: Memmlp, planned: None):
         (["14", "--out", "table.pdf"], ("--out table.pdf", "md, tex, json, html")),
         (["14", "--out", "/proc/nothing/t.md"], ("--out /proc/nothing/t.md",)),
         (["14", "--mode", "both modes"], ("--mode",)),
+        (["14", "--branch", "head"], ("--branch", "rotation", "combined")),
+        (["14", "--plan", "--format", "md"], ("--plan",)),
     ],
 )
 def test_bad_input_is_one_line(memmlp: Memmlp, planned: None, arguments: list[str], words: tuple[str, ...]):

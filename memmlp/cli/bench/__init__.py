@@ -1,10 +1,11 @@
-"""`memmlp bench`: claims about speed, and about sweeps and searches under kills, measured on this machine."""
+"""`memmlp bench`: claims about speed, sweeps under kills and verdicts, measured on this machine."""
 
 from __future__ import annotations
 
 import click
 
 from memmlp.cli.bench.avatar import avatar, soak
+from memmlp.cli.bench.calibration import calibration
 from memmlp.cli.bench.chaos import chaos, chaos_tune
 from memmlp.cli.bench.evaluation import prepare, stream
 from memmlp.cli.bench.latency import latency
@@ -15,5 +16,5 @@ def bench() -> None:
     """Measure speed on this machine, as rates and as ratios within one run."""
 
 
-for command in (prepare, stream, latency, avatar, soak, chaos, chaos_tune):
+for command in (prepare, stream, latency, avatar, soak, chaos, chaos_tune, calibration):
     bench.add_command(command)

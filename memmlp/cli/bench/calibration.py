@@ -1,0 +1,375 @@
+"""`memmlp bench calibration`: do the verdicts' intervals and p-values keep their promises? In simulations."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import click
+import numpy as np
+
+from memmlp.statistics import holm, looks, sequential, spending
+from memmlp.statistics.crossed import Error, by_group
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+SEEDS, CLIPS, SIZES = (2, 3, 5, 10), (4, 10, 40, 536), (1, 2, 10)
+QUICK = 40  # clips at most with --quick
+ARMS, METRICS = 6, 4
+TABLE = ARMS * METRICS  # comparisons
+LEVEL = 0.05
+CHUNK = 4_000_000  # numbers simulated at once
+
+ERROR, LEAST, MOST = 0.06, 0.93, 0.995
+"""The promises: family-wise error at most, coverage at least, and at most from 3 seeds and 5 groups on."""
+
+MARGIN, EFFECT = 8.0, 16.0
+"""Where half of the arms differ: the smallest effect of interest and theirs, in standard errors."""
+CAMPAIGNS = 200  # tables with effects, a cell
+
+
+class Shares(NamedTuple):
+    """Of the variance of a mean over seeds and clips, what each brings."""
+
+    seeds: float = 0
+    groups: float = 0
+    clips: float = 0
+    skewed: float = 0  # clips whose effects are exponential
+    noise: float = 0
+
+
+SHARES = {
+    "seeds": Shares(seeds=1),
+    "groups": Shares(groups=1),
+    "clips": Shares(clips=1),
+    "noise": Shares(noise=1),
+    "seeds+groups": Shares(seeds=1, groups=1),
+    "seeds+clips": Shares(seeds=1, clips=1),
+    "seeds+noise": Shares(seeds=1, noise=1),
+    "groups+clips": Shares(groups=1, clips=1),
+    "groups+noise": Shares(groups=1, noise=1),
+    "clips+noise": Shares(clips=1, noise=1),
+    "equal": Shares(seeds=1, groups=1, clips=1, noise=1),
+    "skewed": Shares(skewed=1),
+    "seeds+skewed": Shares(seeds=1, skewed=1),
+    "groups+skewed": Shares(groups=1, skewed=1),
+    "skewed+noise": Shares(skewed=1, noise=1),
+    "skewed+noise/20": Shares(skewed=20, noise=1),
+    "seeds/20+noise": Shares(seeds=1, noise=20),
+    "equal, skewed": Shares(seeds=1, groups=1, skewed=1, noise=1),
+}
+
+
+def choices(cell: Cell) -> dict[str, Shares]:
+    """The shares that are simulated; "values" has them equal for a single value, not for the mean."""
+    seeds, clips, size = cell
+    values = Shares(seeds=1 / seeds, groups=size / clips, clips=1 / clips, noise=1 / seeds / clips)
+    return SHARES | {"values": values}
+
+
+class Cell(NamedTuple):
+    """A row of the grid."""
+
+    seeds: int
+    clips: int
+    size: int  # clips of a group
+
+    @property
+    def groups(self) -> np.ndarray:
+        """The group of each clip (C,)."""
+        return np.arange(self.clips) // self.size
+
+    @property
+    def capped(self) -> bool:
+        """Whether intervals may not be too wide."""
+        return self.seeds >= 3 and self.groups[-1] >= 4
+
+
+class Look(NamedTuple):
+    """Of K comparisons' first seeds; every kind of effect gives the mean of all seeds a variance of 1."""
+
+    noise: np.ndarray  # the seeds' means (K, S) of it
+    variance: np.ndarray  # E of it (K,)
+    covariances: np.ndarray  # of the means of groups: groups, clips, skewed, noise (K, 4, 4)
+
+
+class Sample:
+    """Simulated differences of K comparisons, kept as what a mixture of their effects in any shares needs."""
+
+    def __init__(self, rng: np.random.Generator, cell: Cell, comparisons: int):
+        """Draw the effects of all seeds, groups, clips and cells."""
+        self.seeds = np.sqrt(cell.seeds) * rng.normal(size=(comparisons, cell.seeds))
+        fixed, noise, self.weights = draw(rng, cell, comparisons)
+        self.means = fixed @ self.weights  # (K, 3)
+        variances = noise.var(2, ddof=1)
+        self.looks = {n: self._look(fixed, noise[:, :n], variances[:, :n]) for n in looks(cell.seeds)}
+
+    def _look(self, fixed: np.ndarray, noise: np.ndarray, variances: np.ndarray) -> Look:
+        effects = np.concatenate([fixed, noise.mean(1, keepdims=True)], 1)
+        effects -= effects.mean(2, keepdims=True)
+        covariances = effects @ effects.transpose(0, 2, 1) / (len(self.weights) - 1)
+        rest = variances.mean(1) - covariances[:, 3, 3]  # that of all cells less that of their groups
+        e = rest * (self.weights @ self.weights) / (noise.shape[1] - 1)
+        return Look(noise @ self.weights, e, covariances)
+
+    def mixed(self, shares: Shares, seeds: int) -> tuple[Error, np.ndarray]:
+        """Error and mean (K,) by the first so many seeds; the mean's variance is 1 with all of them."""
+        weights = np.sqrt(np.array(shares) / sum(shares))
+        look = self.looks[seeds]
+        by_seed = weights[0] * self.seeds[:, :seeds] + weights[4] * look.noise
+        a = by_seed.var(1, ddof=1) / seeds
+        b = (look.covariances @ weights[1:]) @ weights[1:] * (self.weights @ self.weights)
+        known = Error(np.stack([a, b, weights[4] ** 2 * look.variance]), seeds - 1, len(self.weights) - 1)
+        return known, by_seed.mean(1) + self.means @ weights[1:4]
+
+
+def draw(rng: np.random.Generator, cell: Cell, comparisons: int) -> tuple[np.ndarray, ...]:
+    """Effects of groups, clips and skewed clips as means by group (K, 3, G), noise too (K, S, G); weights."""
+    seeds, clips, _ = cell
+    by_clip = np.sqrt(clips) * np.stack(
+        [rng.normal(size=(comparisons, clips)), rng.exponential(size=(comparisons, clips)) - 1], 1
+    )
+    by_clip, weights = by_group(by_clip, cell.groups)
+    of_groups = rng.normal(size=(comparisons, 1, len(weights))) / np.sqrt(weights @ weights)
+    noise = np.sqrt(seeds * clips) * rng.normal(size=(comparisons, seeds, clips))
+    if cell.size > 1:
+        noise, _ = by_group(noise, cell.groups)
+    return np.concatenate([of_groups, by_clip], 1), noise, weights
+
+
+class Counts(NamedTuple):
+    """Of true nulls: whether intervals cover (K,), tables have a star (T,), at once or at any look; half the
+    width at Holm's first step less the mean (K,), which is the smallest effect that would have been found."""
+
+    covered: np.ndarray
+    starred: np.ndarray
+    in_looks: np.ndarray
+    found: np.ndarray
+
+
+def count(sample: Sample, shares: Shares) -> Counts:
+    """Count over one sample. Of true nulls alone, Holm calls one significant where its first step does."""
+    in_looks = np.zeros(len(sample.seeds), bool)
+    for seeds, level in spent(sample):
+        known, mean = sample.mixed(shares, seeds)
+        in_looks |= np.abs(mean) > known.half(level / TABLE)
+    half = known.half(LEVEL / TABLE)
+    covered = np.abs(mean) <= known.half(LEVEL)
+    return Counts(covered, _any(np.abs(mean) > half), _any(in_looks), half - mean)
+
+
+def spent(sample: Sample) -> Iterator[tuple[int, float]]:
+    """The seeds of each look, and its level."""
+    return zip(sample.looks, spending(len(sample.looks)), strict=True)
+
+
+def _any(claims: np.ndarray) -> np.ndarray:
+    """Whether a table has any, (T,)."""
+    return np.any(claims.reshape(-1, TABLE), axis=1)
+
+
+def summary(counts: Sequence[Counts]) -> dict[str, float]:
+    """Rates, and the power where an oracle, who knows the variances, finds the effect in 80 % of tables."""
+    from scipy.special import ndtri
+
+    covered, starred, in_looks, found = map(np.concatenate, zip(*counts, strict=True))
+    oracle = ndtri(1 - LEVEL / TABLE / 2) + ndtri(0.8)
+    return {
+        "coverage": float(covered.mean()),
+        "error": float(starred.mean()),
+        "sequential_error": float(in_looks.mean()),
+        "power": float((found < oracle).mean()),
+        "effect_ratio": float(np.quantile(found, 0.8) / oracle),
+    }
+
+
+class Campaign(NamedTuple):
+    """Of tables that spend seeds until all is decided: seeds of each arm (T, ARMS), whether comparisons are
+    decided (T, TABLE), whether with all seeds at once (T, TABLE), and whether a claim is false (T,)."""
+
+    seeds: np.ndarray
+    decided: np.ndarray
+    at_once: np.ndarray
+    false: np.ndarray
+
+
+def campaign(sample: Sample, shares: Shares) -> Campaign:
+    """Whole sequential tables. Half of the arms differ; an arm stops when all its comparisons are decided."""
+    tables = len(sample.seeds) // TABLE
+    truth = np.repeat(np.arange(ARMS) % 2 * EFFECT, METRICS)
+    differ, same = np.zeros((2, tables, TABLE), bool)
+    seeds = np.zeros((tables, ARMS), int)
+    for number, level in spent(sample):
+        seeds[~(differ | same).reshape(tables, ARMS, METRICS).all(2)] = number
+        known, mean = sample.mixed(shares, number)
+        means = mean.reshape(tables, TABLE) + truth
+        p, q = (known.level(d.ravel()).reshape(means.shape) for d in (np.abs(means), MARGIN - np.abs(means)))
+        now_same = _claimed(q, same, differ, level)
+        differ = _claimed(p, differ, now_same, level)
+        same = now_same
+    at_once = np.array([(holm(x) <= LEVEL) | (holm(y) <= LEVEL) for x, y in zip(p, q, strict=True)])
+    false = (differ & (truth == 0) | same & (truth > 0)).any(1)
+    return Campaign(seeds, differ | same, at_once, false)
+
+
+def _claimed(p: np.ndarray, before: np.ndarray, closed: np.ndarray, level: float) -> np.ndarray:
+    """What a family claims after a look (T, TABLE)."""
+    rows = zip(p, before, closed & ~before, strict=True)
+    return np.array([sequential(*row) <= level for row in rows])
+
+
+def simulate(cell: Cell, tables: int, seed: int) -> dict[str, Any]:
+    """All that is reported of a cell."""
+    rng = np.random.default_rng([seed, *cell])
+    size = max(1, CHUNK // (TABLE * cell.seeds * cell.clips))
+    every = choices(cell)
+    counts: dict[str, list[Counts]] = {name: [] for name in every}
+    campaigns: list[Campaign] = []
+    for start in range(0, tables, size):
+        sample = Sample(rng, cell, TABLE * min(size, tables - start))
+        for name, shares in every.items():
+            counts[name].append(count(sample, shares))
+        if start < CAMPAIGNS:
+            campaigns.append(campaign(sample, SHARES["equal"]))
+    return {
+        **cell._asdict(),
+        "groups": int(cell.groups[-1]) + 1,
+        "tables": tables,
+        "shares": {name: summary(parts) for name, parts in counts.items()},
+        "campaign": told(campaigns),
+    }
+
+
+def told(campaigns: Sequence[Campaign]) -> dict[str, float]:
+    """Means over tables that spend seeds until all is decided."""
+    names = ("seeds", "decided", "decided_at_once", "error")
+    return {
+        name: float(np.concatenate(part).mean())
+        for name, part in zip(names, zip(*campaigns, strict=True), strict=True)
+    }
+
+
+def extreme(row: dict[str, Any], what: str, pick: Any) -> tuple[float, str]:
+    """The least or largest of a row's rates, and the shares that it is of."""
+    return pick((rates[what], name) for name, rates in row["shares"].items())
+
+
+def broken(row: dict[str, Any], capped: bool) -> list[str]:
+    """The promises that a cell breaks, by more than two standard errors of the simulation."""
+    tables = row["tables"]
+    limits = [
+        ("coverage", min, LEAST, -1, TABLE),
+        ("error", max, ERROR, 1, 1),
+        ("sequential_error", max, ERROR, 1, 1),
+    ]
+    limits += [("coverage", max, MOST, 1, TABLE)] if capped else []
+    return [
+        f"{what} {100 * value:.2f} % ({name})"
+        for what, pick, limit, sign, each in limits
+        for value, name in [extreme(row, what, pick)]
+        if sign * (value - limit) > 2 * np.sqrt(limit * (1 - limit) / tables / each)
+    ]
+
+
+HEADER = (
+    "design", "coverage", "star", "of", "looks", "power", "effect", "seeds", "decided",
+)  # fmt: skip
+
+
+def columns(row: dict[str, Any]) -> list[str]:
+    """A row of the table."""
+    least, most = (100 * extreme(row, "coverage", pick)[0] for pick in (min, max))
+    error, worst = extreme(row, "error", max)
+    equal, spent = row["shares"]["equal"], row["campaign"]
+    return [
+        f"{row['seeds']} x {row['clips']} / {row['size']}",
+        f"{least:.1f}-{most:.1f}",
+        f"{100 * error:.1f}",
+        worst,
+        f"{100 * extreme(row, 'sequential_error', max)[0]:.1f}",
+        f"{100 * equal['power']:.0f}",
+        f"{equal['effect_ratio']:.3g}",
+        f"{spent['seeds']:.1f}",
+        f"{100 * spent['decided']:.0f}/{100 * spent['decided_at_once']:.0f}",
+    ]
+
+
+def remarks(rows: Sequence[dict[str, Any]], seed: int) -> list[str]:
+    """What the columns say."""
+    tables = rows[0]["tables"]
+    star, covered = (100 * np.sqrt(LEVEL * (1 - LEVEL) / number) for number in (tables, tables * TABLE))
+    return [
+        f"design: seeds x clips / clips of a group; {tables} tables of {TABLE} true nulls for each, and for "
+        f"each of {len(rows[0]['shares'])} choices of shares of variance; seed {seed}",
+        f"coverage: of the 95 % interval, least and most over shares, in % (standard error {covered:.2f})",
+        f"star: tables with any after Holm, in % (standard error {star:.2f}), and the shares with the most; "
+        "looks: the same, where seeds are added in looks; the worst of many cells is above its true rate",
+        "power: in %, of an effect that an oracle, who knows the variances, finds in 80 %; effect: found in "
+        "80 %, over the oracle's; both with equal shares, at Holm's first step",
+        f"seeds: of an arm, in looks, with equal shares, where every other arm differs by {EFFECT:.0f} "
+        f"standard errors and {MARGIN:.0f} are of interest; decided: comparisons, in %, so / at once",
+    ]
+
+
+def table(rows: Sequence[dict[str, Any]]) -> Table:
+    """For a terminal."""
+    from rich import box
+    from rich.table import Table
+
+    shown = Table(box=box.SIMPLE_HEAD, padding=0)
+    for name in HEADER:
+        shown.add_column(name, justify="left" if name == "of" else "right", no_wrap=True)
+    for row, after in itertools.zip_longest(rows, rows[1:]):
+        shown.add_row(*columns(row), end_section=bool(after) and after["seeds"] != row["seeds"])
+    return shown
+
+
+def markdown(rows: Sequence[dict[str, Any]], seed: int) -> str:
+    """For the documentation."""
+    lines = [HEADER, ["---" if name == "of" else "---:" for name in HEADER], *map(columns, rows)]
+    text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return "\n".join([text, "", *(f"- {line}" for line in remarks(rows, seed))]) + "\n"
+
+
+@click.command("calibration")
+@click.option("--tables", default=5000, show_default=True, type=click.IntRange(1), help="Tables a cell.")
+@click.option("--quick", is_flag=True, help=f"At most {QUICK} clips.")
+@click.option("--seed", default=0, show_default=True, help="Of the random numbers.")
+@click.option("--json", "file", type=click.Path(path_type=Path), help="Write all rates to this file.")
+@click.option("--markdown", "as_markdown", is_flag=True, help="Print the table as Markdown.")
+def calibration(tables: int, quick: bool, seed: int, file: Path | None, as_markdown: bool) -> None:
+    """How often the verdicts' claims are false, over a grid of seeds, clips, groups and shares of variance.
+
+    Exits with 1 where a cell breaks a promise by more than two standard errors of the simulation.
+    """
+    from rich.console import Console
+
+    from memmlp.errors import InputError
+    from memmlp.files import write_json
+    from memmlp.progress import track
+
+    if file and not file.absolute().parent.is_dir():
+        raise InputError(f"--json {file}: there is no folder {file.parent}")
+    cells = [cell for cell in grid() if not quick or cell.clips <= QUICK]
+    rows = [simulate(cell, tables, seed) for cell in track(cells, "simulating")]
+    if file:
+        write_json(file, {"seed": seed, "level": LEVEL, "comparisons": TABLE, "cells": rows})
+    if as_markdown:
+        click.echo(markdown(rows, seed))
+    else:
+        Console().print(table(rows), *remarks(rows, seed), sep="\n")
+    failures = {cell: broken(row, cell.capped) for cell, row in zip(cells, rows, strict=True)}
+    for cell, problems in failures.items():
+        for problem in problems:
+            click.echo(f"broken at {cell.seeds} seeds x {cell.clips} clips, {cell.size} a group: {problem}")
+    if any(failures.values()):
+        raise SystemExit(1)
+
+
+def grid() -> list[Cell]:
+    """All cells that have two groups at least."""
+    cells = itertools.starmap(Cell, itertools.product(SEEDS, CLIPS, SIZES))
+    return [cell for cell in cells if cell.groups[-1] > 0]

@@ -1,0 +1,149 @@
+"""`memmlp results`: runs' results kept with the code, and the pages that are made of them."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from memmlp.cli.options import outputs_option
+from memmlp.errors import InputError
+
+if TYPE_CHECKING:
+    from memmlp.results.pages import Source
+    from memmlp.results.store import Kept
+
+FOLDER = Path("docs/results")
+PROSE = Path("README.md")
+
+
+@click.group("results")
+def results() -> None:
+    """Keep the results of runs with the code, and make pages of them."""
+
+
+@results.command("save")
+@click.argument("name", metavar="SWEEP")
+@click.argument("overrides", nargs=-1)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=FOLDER / "data",
+    show_default=True,
+    help="Folder of the files.",
+)
+@click.option("--name", "stem", help="Of the file, in place of the sweep's.")
+@outputs_option
+def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | None, outputs: Path) -> None:
+    """Keep the per-clip results of a sweep's finished runs in one small file.
+
+    SWEEP and OVERRIDES are those of `memmlp sweep`. What the file has of other arms and seeds stays.
+    """
+    from memmlp.cli.plan import find_sweep, planned
+    from memmlp.cli.table import finder
+    from memmlp.results.store import Kept, load_kept, save, without_paths
+    from memmlp.tables.collect import finished
+    from memmlp.tables.measured import load
+
+    sweep = find_sweep(name).with_overrides(overrides)
+    found = finished(sweep, finder(planned(sweep, outputs.absolute()), functools.cache(load)))
+    words = tuple(word for word in overrides if not word.startswith("seed="))
+    kept = Kept(name if "/" in name else sweep.name, without_paths(words), found)
+    if not kept.every:
+        raise InputError(f"sweep {name}: no finished run to keep; make them with: {kept.command}")
+    path = out / f"{stem or sweep.name}.json"
+    merged = _merged(path, load_kept(path), kept) if path.exists() else kept
+    save(path, merged)
+    click.echo(f"{path}: {len(merged.every)} runs, {len(kept.every)} of them from here")
+
+
+@results.command("docs")
+@click.option(
+    "--folder",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=FOLDER,
+    show_default=True,
+    help="Where the pages lie, data/ and templates/ below it.",
+)
+@click.option("--check", is_flag=True, help="Write nothing; exit with 1 where a page differs.")
+def docs(folder: Path, check: bool) -> None:
+    """Make all pages of results again from what is kept, without a training.
+
+    Every file of data/ gives a table's page; the templates are pages whose sentences take their numbers and
+    verdicts from the tables. Prose that claims an effect by hand is refused, there and in README.md.
+    """
+    from memmlp.results.pages import check_claims, pages
+
+    made = pages(sources(folder), _templates(folder))
+    if PROSE.exists():
+        check_claims(str(PROSE), PROSE.read_text(encoding="utf-8"))
+    differing = [name for name, text in made.items() if _text(folder / name) != text]
+    stale = _stale(folder, made)
+    if check:
+        for name in [*differing, *stale]:
+            click.echo(f"differs: {folder / name}; make it again with: memmlp results docs", err=True)
+        if differing or stale:
+            raise SystemExit(1)
+    else:
+        _write(folder, made, stale)
+    click.echo(f"{len(made)} pages, {len(differing)} {'differ' if check else 'written'}")
+
+
+def sources(folder: Path) -> dict[str, Source]:
+    """The tables of all results that are kept below a folder, by the files' names."""
+    from memmlp.results.pages import Source
+    from memmlp.results.store import load_kept
+
+    found = {}
+    for path in sorted((folder / "data").glob("*.json")):
+        kept = load_kept(path)
+        found[path.stem] = Source(kept, _table(kept))
+    return found
+
+
+def _table(kept: Kept):
+    """The table that kept results come to, of the seeds that any of them has."""
+    from memmlp.cli.plan import find_sweep
+    from memmlp.tables.collect import collect
+
+    seeds = sorted({seed for runs in kept.runs.values() for seed in runs})
+    sweep = find_sweep(kept.sweep).with_overrides([f"seed={','.join(map(str, seeds))}"])
+    return collect(sweep, kept.of(sweep), command=kept.command)
+
+
+def _merged(path: Path, before: Kept, kept: Kept) -> Kept:
+    try:
+        return before.merged(kept)
+    except InputError as error:
+        raise InputError(f"{path}: {error}; allowed is another --name") from None
+
+
+def _templates(folder: Path) -> dict[str, str]:
+    paths = sorted((folder / "templates").glob("*.md"))
+    return {path.name: path.read_text(encoding="utf-8") for path in paths}
+
+
+def _text(path: Path) -> str | None:
+    """A file's text, None where there is none."""
+    return path.read_bytes().decode("utf-8", "replace") if path.exists() else None
+
+
+def _stale(folder: Path, made: Mapping[str, str]) -> list[str]:
+    """Pages of earlier times, whose data or template is gone."""
+    from memmlp.results.pages import MARK
+
+    every = {path.name for path in folder.glob("*.md") if (_text(path) or "").startswith(MARK)}
+    return sorted(every - made.keys())
+
+
+def _write(folder: Path, made: Mapping[str, str], stale: list[str]) -> None:
+    from memmlp.files import atomic_write
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in made.items():
+        atomic_write(folder / name, text)
+    for name in stale:
+        (folder / name).unlink()

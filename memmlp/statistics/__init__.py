@@ -1,0 +1,35 @@
+"""Differences between two arms of a table that were run with the same seeds and tested on the same clips.
+
+`differences` are everywhere (K, S, C): of K comparisons, one arm's error less the other's, of seed s on
+clip c. `crossed` estimates what seeds and groups of clips add to the error of their mean, `effects` makes
+intervals and p-values of it, `power` says what could have been seen, `verdicts` what may be claimed of many,
+in one look or in several, and `robust` describes without testing. docs/statistics.md says how, and how well.
+"""
+
+from __future__ import annotations
+
+from memmlp.statistics.effects import Effects, equivalence_p, paired_effects
+from memmlp.statistics.power import detectable, seeds_needed
+from memmlp.statistics.robust import (
+    interquartile_mean,
+    performance_profile,
+    probability_of_improvement,
+)
+from memmlp.statistics.verdicts import Verdict, holm, looks, sequential, spending, verdict
+
+__all__ = [
+    "Effects",
+    "Verdict",
+    "detectable",
+    "equivalence_p",
+    "holm",
+    "interquartile_mean",
+    "looks",
+    "paired_effects",
+    "performance_profile",
+    "probability_of_improvement",
+    "seeds_needed",
+    "sequential",
+    "spending",
+    "verdict",
+]

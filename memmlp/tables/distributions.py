@@ -1,0 +1,60 @@
+"""The errors behind a table's means, as distributions over seeds and clips."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from memmlp.statistics import interquartile_mean, probability_of_improvement
+from memmlp.sweep.spec import COSTS, Arm, Sweep
+from memmlp.tables.collect import with_existing_branches
+from memmlp.tables.effects import Runs, control
+
+
+class Distribution(NamedTuple):
+    """An arm's errors in one metric.
+
+    Attributes:
+        label: of the arm. errors: (S, C) by seed and clip; empty where there are none.
+        middle: their interquartile mean. improvement: the probability that a run of the arm has a smaller
+            error than one of its control on the same clip. None where there is none.
+    """
+
+    label: str
+    errors: np.ndarray
+    middle: float | None
+    improvement: float | None
+
+
+def distributions(sweep: Sweep, runs: Mapping[str, Runs], mode: str) -> dict[str, list[Distribution]]:
+    """Those of every arm by metric, of the clips that all runs have; metrics that no run has are left out."""
+    seen = with_existing_branches(sweep, runs)
+    every = [run for found in runs.values() for run in found.values()]
+    clips = [clip for clip in every[0].clips if all(clip in run.clips for run in every)] if every else []
+    metrics = [metric for metric in sweep.metrics if metric not in COSTS]
+    found = {metric: _of_metric(seen, runs, clips, mode, metric) for metric in metrics}
+    return {metric: arms for metric, arms in found.items() if any(arm.errors.size for arm in arms)}
+
+
+def _of_metric(
+    sweep: Sweep, runs: Mapping[str, Runs], clips: list[str], mode: str, metric: str
+) -> list[Distribution]:
+    arms = [arm for arm in sweep.runnable() if runs[arm.label]]
+    errors = {arm.label: _errors(runs[arm.label], clips, mode, arm, metric) for arm in arms}
+    return [_distribution(arm.label, errors, control(sweep, arm)) for arm in arms]
+
+
+def _errors(runs: Runs, clips: list[str], mode: str, arm: Arm, metric: str) -> np.ndarray:
+    """Errors (S, C), less the clips of which a run has none."""
+    errors = np.array([run.by_clip(clips, mode, arm.branch, metric) for run in runs.values()])
+    return errors[:, ~np.isnan(errors).any(0)]
+
+
+def _distribution(label: str, errors: Mapping[str, np.ndarray], other: Arm | None) -> Distribution:
+    ours, theirs = errors[label], errors.get(other.label) if other else None
+    middle = interquartile_mean(ours) if ours.size else None
+    if theirs is None or not ours.size or theirs.shape[1:] != ours.shape[1:]:
+        return Distribution(label, ours, middle, None)
+    return Distribution(label, ours, middle, probability_of_improvement(ours, theirs))

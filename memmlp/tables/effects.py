@@ -1,0 +1,166 @@
+"""Differences of a table's arms from their controls, with intervals and verdicts."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from memmlp.statistics import detectable, equivalence_p, holm, paired_effects, verdict
+from memmlp.sweep.spec import COSTS, Arm, Sweep
+from memmlp.tables.measured import Measured
+from memmlp.tables.table import Effect, Key
+
+Runs = Mapping[int, Measured]  # by seed
+
+
+class Paired(NamedTuple):
+    """An arm's errors less its control's, (S, C) by seed and clip, and the clips' groups as numbers (C,)."""
+
+    matrix: np.ndarray
+    groups: np.ndarray
+
+
+def control(sweep: Sweep, arm: Arm) -> Arm | None:
+    """The arm that another is compared with; None for the reference, and for rows of the paper alone."""
+    label = sweep.control(arm) if arm.overrides is not None else None
+    return next((other for other in sweep.arms if other.label == label), None)
+
+
+def paper_effect(sweep: Sweep, arm: Arm, metric: str) -> float | None:
+    """The paper's difference from the control, as printed; None where there is none."""
+    other = control(sweep, arm)
+    ours = (arm.paper or {}).get(metric)
+    theirs = (other.paper or {}).get(metric) if other else None
+    return None if ours is None or theirs is None else round(ours - theirs, 6)
+
+
+def paired(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dict[Key, Paired]:
+    """The differences of all arms in all metrics that are no costs, where there are any."""
+    found = {}
+    for arm, other in _compared(sweep):
+        ours, theirs = runs[arm.label], runs[other.label]
+        shared = _shared(ours, theirs)
+        for mode, metric in itertools.product(modes, sweep.metrics):
+            if metric not in COSTS:
+                branches = (arm.branch, other.branch)
+                found[Key(arm.label, mode, metric)] = _paired(ours, theirs, shared, branches, mode, metric)
+    return {key: pair for key, pair in found.items() if pair.matrix.size}
+
+
+def effects(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dict[Key, Effect]:
+    """The effects of all arms, their p-values corrected over all of them; of costs the bare differences."""
+    printed = {
+        Key(arm.label, mode, metric): paper_effect(sweep, arm, metric)
+        for arm, mode, metric in itertools.product(sweep.runnable(), modes, sweep.metrics)
+    }
+    return _costs(sweep, runs, modes) | _judged(
+        _tested(paired(sweep, runs, modes), sweep.smallest), sweep.smallest, printed
+    )
+
+
+def _compared(sweep: Sweep) -> Iterator[tuple[Arm, Arm]]:
+    """Each arm that has a control, with it."""
+    for arm in sweep.runnable():
+        other = control(sweep, arm)
+        if other is not None:
+            yield arm, other
+
+
+def _paired(
+    ours: Runs,
+    theirs: Runs,
+    shared: tuple[list[int], list[str]],
+    branches: tuple[str, str],
+    mode: str,
+    metric: str,
+) -> Paired:
+    """Ours less theirs over the shared seeds and clips that all runs have a number of."""
+    seeds, clips = shared
+    sides = [
+        np.array([runs[seed].by_clip(clips, mode, branch, metric) for seed in seeds])
+        for runs, branch in zip((ours, theirs), branches, strict=True)
+    ]
+    matrix = (sides[0] - sides[1]).reshape(len(seeds), len(clips))
+    known = ~np.isnan(matrix).any(0)
+    names = [ours[seeds[0]].group(clip) for clip in clips] if seeds else []
+    groups = np.unique(np.array(names, dtype=str), return_inverse=True)[1]
+    return Paired(matrix[:, known], groups[known])
+
+
+def _shared(ours: Runs, theirs: Runs) -> tuple[list[int], list[str]]:
+    """The seeds that both have, and the clips that all their runs have."""
+    seeds = [seed for seed in ours if seed in theirs]
+    names = [runs[seed].clips for runs in (ours, theirs) for seed in seeds]
+    return seeds, [name for name in names[0] if all(name in other for other in names)] if names else []
+
+
+def alike(pairs: Mapping[Key, Paired]) -> Iterator[tuple[list[Key], np.ndarray, np.ndarray]]:
+    """Comparisons of the same seeds and groups together: keys, differences (K, S, C), groups (C,)."""
+    batches: dict[tuple[int, bytes], list[Key]] = defaultdict(list)
+    for key, pair in pairs.items():
+        batches[len(pair.matrix), pair.groups.tobytes()].append(key)
+    for keys in batches.values():
+        yield keys, np.stack([pairs[key].matrix for key in keys]), pairs[keys[0]].groups
+
+
+def _tested(pairs: Mapping[Key, Paired], smallest: Mapping[str, float]) -> dict[Key, Effect]:
+    """The effects with their own p-values, in the pairs' order."""
+    found: dict[Key, Effect] = {}
+    for keys, differences, groups in alike(pairs):
+        size = {"seeds": differences.shape[1], "clips": differences.shape[2], "groups": len(set(groups))}
+        margins = np.array([smallest.get(key.metric, np.nan) for key in keys])
+        same = equivalence_p(differences, margins, groups)
+        seen = detectable(differences, len(pairs), groups)
+        numbers = paired_effects(differences, groups)
+        columns = zip(keys, numbers.mean, numbers.low, numbers.high, numbers.p, same, seen, strict=True)
+        for key, mean, low, high, p, equal, least in columns:
+            words = {"low": low, "high": high, "p": p, "equal": equal, "detectable": least}
+            known: dict[str, Any] = {name: _known(number) for name, number in words.items()}
+            found[key] = Effect(float(mean), **known, **size)
+    return {key: found[key] for key in pairs}
+
+
+def _judged(
+    tested: Mapping[Key, Effect], smallest: Mapping[str, float], printed: Mapping[Key, float | None]
+) -> dict[Key, Effect]:
+    """The effects with corrected p-values, differences by one Holm and equivalences by another; verdicts."""
+    keys = list(tested)
+    different = holm(np.array([_bare(tested[key].p) for key in keys]))
+    equal = holm(np.array([_bare(tested[key].equal) for key in keys]))
+    judged = {}
+    for key, p, q in zip(keys, different, equal, strict=True):
+        said = verdict(float(p), float(q), tested[key].mean, printed.get(key))
+        judged[key] = replace(tested[key], holm=_known(p), equal=_known(q), verdict=said)
+    return judged
+
+
+def _costs(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dict[Key, Effect]:
+    """The differences of mean costs, which have no interval: they are exact, or this machine's."""
+    found = {}
+    for arm, other in _compared(sweep):
+        for mode, metric in itertools.product(modes, set(sweep.metrics) & set(COSTS)):
+            sides = [_mean_cost(runs[one.label], metric) for one in (arm, other)]
+            if not any(math.isnan(side) for side in sides):
+                found[Key(arm.label, mode, metric)] = Effect(sides[0] - sides[1])
+    return found
+
+
+def _mean_cost(runs: Runs, metric: str) -> float:
+    costs = [run.costs[metric] for run in runs.values() if metric in run.costs]
+    return float(np.mean(costs)) if costs else math.nan
+
+
+def _known(number: float) -> float | None:
+    """The number; None for NaN."""
+    return None if math.isnan(number) else float(number)
+
+
+def _bare(number: float | None) -> float:
+    """The number; NaN for None."""
+    return math.nan if number is None else number

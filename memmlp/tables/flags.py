@@ -1,0 +1,163 @@
+"""What a reader has to know of the runs behind a table, a line each."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from memmlp.sweep.spec import COSTS, Arm, Sweep
+from memmlp.tables.effects import Runs, control
+from memmlp.tables.measured import Measured
+
+Say = Callable[[Arm, int], str | None]
+BUILT_IN = "builtin"
+SMPLH = (1, 2, 3)  # the paper's tables on AMASS, whose rest joints are each subject's SMPL-H body's
+ORIGIN = {
+    "code": "code", "data": "data", "hardware": "hardware", "device": "device", "gpu": "GPU",
+    "threads": "threads", "torch": "torch", "precision": "precision",
+}  # fmt: skip
+
+
+def silent(arm: Arm, seed: int) -> None:
+    """Has nothing to say of a cell."""
+
+
+def flags(
+    sweep: Sweep, asked: Sweep, runs: Mapping[str, Runs], command: str, state: Say, older: Say
+) -> Iterable[str]:
+    """The lines.
+
+    Args:
+        sweep: as shown. asked: as it was before arms without the branch fell back to another.
+        command: what fills the missing arms. state: how far an unfinished run is, in a word.
+        older: the run of an earlier recipe that a missing cell has.
+    """
+    every = [(arm.label, run) for arm in sweep.runnable() for run in runs[arm.label].values()]
+    yield from _missing(sweep, runs, command, state)
+    yield from _older(sweep, runs, older)
+    yield from _branches(sweep, asked, runs, command)
+    yield from _unequal_clips(sweep, runs)
+    for attribute, what in ORIGIN.items():
+        yield from _differing(what, [(getattr(run.origin, attribute), label) for label, run in every])
+    yield from _recipes(every)
+    changed = [label for label, run in every if run.origin.changed]
+    if changed:
+        yield f"made by code with uncommitted changes: {_quoted(changed)}"
+    if set(sweep.metrics) - set(COSTS):
+        yield from _replicates(sweep, runs)
+        yield from _body(sweep, every)
+
+
+def _missing(sweep: Sweep, runs: Mapping[str, Runs], command: str, state: Say) -> Iterable[str]:
+    gaps = []
+    for arm in sweep.runnable():
+        seeds = _gaps(sweep, arm, runs)
+        if seeds:
+            states = _unique(word for seed in seeds if (word := state(arm, seed)))
+            words = f" ({', '.join(states)})" if states else ""
+            gaps.append(f"'{arm.label}' seed {', '.join(map(str, seeds))}{words}")
+    if gaps:
+        yield f"missing: {_listed(gaps)}; fill with: {command}"
+
+
+def _older(sweep: Sweep, runs: Mapping[str, Runs], older: Say) -> Iterable[str]:
+    """The missing cells that a run of an earlier recipe would fill."""
+    found = [
+        f"'{arm.label}' seed {seed} ({run})"
+        for arm in sweep.runnable()
+        for seed in _gaps(sweep, arm, runs)
+        if (run := older(arm, seed))
+    ]
+    if found:
+        yield f"made by an earlier recipe, left out and made again by the sweep: {_listed(found)}"
+
+
+def _gaps(sweep: Sweep, arm: Arm, runs: Mapping[str, Runs]) -> list[int]:
+    return [seed for seed in sweep.seeds if seed not in runs[arm.label]]
+
+
+def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, Runs], command: str) -> Iterable[str]:
+    """Rows that show another branch than the table's, and rows that have not been evaluated in theirs."""
+    wanted = {arm.label: arm.branch for arm in asked.arms}
+    fallen = [arm for arm in sweep.runnable() if arm.branch != wanted[arm.label]]
+    if fallen:
+        labels, branches = _quoted(arm.label for arm in fallen), _listed(_unique(a.branch for a in fallen))
+        yield f"the network has no other branch, so the row shows {branches}: {labels}"
+    lacking = [a for a in sweep.runnable() if any(not run.has(a.branch) for run in runs[a.label].values())]
+    if lacking:
+        branches, labels = _listed(_unique(a.branch for a in lacking)), _quoted(a.label for a in lacking)
+        yield f"not evaluated in the branch {branches}: {labels}; do so with: {command}"
+
+
+def _unequal_clips(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+    for arm in sweep.runnable():
+        other = control(sweep, arm)
+        if other is None:
+            continue
+        sides = [run.clips.keys() for one in (arm, other) for run in runs[one.label].values()]
+        every: set[str] = set().union(*sides)
+        shared = every.intersection(*sides)
+        if len(shared) < len(every) and runs[arm.label] and runs[other.label]:
+            yield (
+                f"unequal test clips: '{arm.label}' and '{other.label}' share {len(shared)} of "
+                f"{len(every)}; only those are compared, the means are over all"
+            )
+
+
+def _differing(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:
+    """A line where arms differ in something, naming which have what."""
+    groups: dict[str, list[str]] = defaultdict(list)
+    for value, label in found:
+        groups[value].append(label)
+    if len(groups) > 1:
+        parts = [f"{value} of {_quoted(labels)}" for value, labels in groups.items()]
+        yield f"{what} differs: {'; '.join(parts)}"
+
+
+def _recipes(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
+    """Components that arms share but have in different recipes."""
+    for name in sorted({name for _, run in every for name in run.origin.recipes}):
+        having = [(run, label) for label, run in every if name in run.origin.recipes]
+        yield from _differing(
+            f"recipe of {name}", [(str(r.origin.recipes[name]), label) for r, label in having]
+        )
+
+
+def _replicates(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+    """What the intervals do not speak of: seeds, groups of clips or VQ-VAEs of which there is one."""
+    measured = {label: list(found.values()) for label, found in runs.items() if found}
+    if len(measured) < 2:
+        return
+    if max(map(len, measured.values())) == 1:
+        yield "one seed an arm: the intervals speak of other clips, not of other seeds; nothing is starred"
+    groups = [len({run.group(clip) for clip in run.clips}) for found in measured.values() for run in found]
+    if max(groups) == 1:
+        yield "one group of test clips: the intervals speak of other seeds, not of other takes or people"
+    shared = [label for label, found in measured.items() if _one_vqvae(found)]
+    if shared:
+        yield f"all seeds share one VQ-VAE, which they so do not replicate: {_quoted(shared)}"
+
+
+def _one_vqvae(found: Sequence[Measured]) -> bool:
+    above = {run.origin.vqvae for run in found}
+    return len(found) > 1 and len(above) == 1 and None not in above
+
+
+def _body(sweep: Sweep, every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
+    """Runs on the built-in skeleton beside the paper's numbers on SMPL-H bodies."""
+    bare = [label for label, run in every if run.origin.body == BUILT_IN]
+    if sweep.table in SMPLH and bare:
+        yield f"on the built-in skeleton, the paper's are on SMPL-H bodies (data.body=FILE): {_quoted(bare)}"
+
+
+def _unique(words: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(words))
+
+
+def _quoted(labels: Iterable[str]) -> str:
+    return _listed([f"'{label}'" for label in _unique(labels)])
+
+
+def _listed(words: Sequence[str], most: int = 12) -> str:
+    """Words with commas or, of many, the first ones and how many more."""
+    return ", ".join(words[:most]) + (f", and {len(words) - most} more" if len(words) > most else "")

@@ -1,0 +1,45 @@
+"""How many seeds the paper's printed effects would need here, from the runs that are there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from memmlp.statistics import seeds_needed
+from memmlp.sweep.spec import Sweep
+from memmlp.tables.collect import MODES, with_existing_branches
+from memmlp.tables.effects import Runs, paired, paper_effect
+
+
+class Need(NamedTuple):
+    """What a comparison would need for the paper's effect to be seen with 80 % power.
+
+    Attributes:
+        label, mode, metric: of the cell. paper, measured: the differences.
+        have: seeds. seeds: needed; None where no number of seeds would do with these clips.
+    """
+
+    label: str
+    mode: str
+    metric: str
+    paper: float
+    measured: float
+    have: int
+    seeds: int | None
+
+
+def needs(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str] = MODES) -> list[Need]:
+    """Of every arm and metric whose effect the paper prints, in the table's order.
+
+    The correction is over the comparisons that the runs allow today. Under two seeds or two groups of clips
+    there is nothing to learn the spread from, and the arm is left out.
+    """
+    seen = with_existing_branches(sweep, runs)
+    pairs, arms = paired(seen, runs, modes), {arm.label: arm for arm in seen.arms}
+    found = []
+    for key, pair in pairs.items():
+        effect = paper_effect(seen, arms[key.label], key.metric)
+        if effect and len(pair.matrix) > 1 and len(set(pair.groups)) > 1:
+            number = seeds_needed(pair.matrix, effect, len(pairs), pair.groups)
+            found.append(Need(*key, effect, float(pair.matrix.mean()), len(pair.matrix), number))
+    return found

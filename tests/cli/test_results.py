@@ -1,0 +1,92 @@
+"""`memmlp results`: what it keeps, makes and refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from conftest import Memmlp, one_line
+from fake_runs import fake_sweep
+
+from memmlp.sweep.plan import Entry, Plan
+from memmlp.sweep.spec import Sweep
+
+
+@pytest.fixture
+def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Stands in for composing: the runs of seed 0 alone where `half=1` is said."""
+
+    def plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
+        find = fake_sweep(tmp_path / sweep.name, sweep)
+        entries = [(arm, seed) for arm in sweep.runnable() for seed in sweep.seeds]
+        found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
+        return Plan(sweep.name, tmp_path / sweep.name, () if sweep.name == "table10" else tuple(found), ())
+
+    monkeypatch.setattr("memmlp.cli.plan.planned", plan)
+
+
+def test_kept_results_become_pages(memmlp: Memmlp, planned: None):
+    assert "table14.json: 4 runs, 4 of them from here" in memmlp("results", "save", "14", "seed=0").out
+    assert "table14.json: 12 runs, 8 of them from here" in memmlp("results", "save", "14", "seed=1,2").out
+    templates = Path("docs/results/templates")
+    templates.mkdir()
+    (templates / "README.md").write_text('{{ effect("table14", "2", "stream", "MPJPE") }}\n')
+    assert memmlp("results", "docs", "--check").code == 1
+    assert memmlp("results", "docs").out == "2 pages, 2 written\n"
+    assert memmlp("results", "docs", "--check").out == "2 pages, 0 differ\n"
+    page = Path("docs/results/table14.md")
+    assert page.read_text().count("| 3/3 |") == 8
+    assert ", open" in Path("docs/results/README.md").read_text()
+
+
+def test_check_names_the_page_that_differs(memmlp: Memmlp, planned: None):
+    memmlp("results", "save", "14")
+    memmlp("results", "docs")
+    page = Path("docs/results/table14.md")
+    text = page.read_text()
+    page.write_text(text.replace("open", "holds", 1))
+    ran = memmlp("results", "docs", "--check")
+    assert ran.code == 1
+    assert "differs: docs/results/table14.md" in ran.err
+    memmlp("results", "docs")
+    assert page.read_text() == text
+
+
+def test_pages_without_data_go(memmlp: Memmlp, planned: None):
+    """And what is no page of the command's stays."""
+    memmlp("results", "save", "14", "--name", "small")
+    memmlp("results", "docs")
+    Path("docs/results/notes.md").write_text("by hand\n")
+    Path("docs/results/data/small.json").unlink()
+    assert "small.md" in memmlp("results", "docs", "--check").err
+    memmlp("results", "docs")
+    assert [path.name for path in Path("docs/results").glob("*.md")] == ["notes.md"]
+
+
+def test_prose_with_a_claim_is_refused(memmlp: Memmlp, planned: None):
+    memmlp("results", "save", "14")
+    Path("README.md").write_text("# Title\n\nThe memory lowers Jitter.\n")
+    assert one_line(memmlp("results", "docs"), "README.md, line 3", "'lowers' beside 'Jitter'")
+
+
+def test_results_of_a_file_elsewhere_keep_its_path(memmlp: Memmlp, planned: None):
+    Path("mine.yaml").write_text("arms: {a: [b=1], c: [b=2]}\nseeds: [0, 1]\n")
+    memmlp("results", "save", "./mine.yaml", "x=/data/here")
+    content = json.loads(Path("docs/results/data/mine.json").read_text())
+    assert (content["sweep"], content["overrides"]) == ("./mine.yaml", ["x=.../here"])
+    assert memmlp("results", "docs").code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["save", "99"], ("no such sweep",)),
+        (["save", "10"], ("no finished run", "memmlp sweep table10")),
+        (["save", "14", "optim.lr=1"], ("table14.json", "memmlp sweep table14 optim.lr=1", "--name")),
+        (["save", "14", "--out", "/proc/no"], ("/proc/no",)),
+    ],
+)
+def test_bad_input_is_one_line(memmlp: Memmlp, planned: None, arguments: list[str], words: tuple[str, ...]):
+    memmlp("results", "save", "14")
+    assert one_line(memmlp("results", *arguments), *words)
