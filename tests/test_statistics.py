@@ -125,11 +125,11 @@ def test_equal_groups_are_the_analysis_of_their_means():
 
 
 def test_unequal_groups_weigh_as_their_clips():
-    # groups' means 0 and 4 with weights 1/4 and 3/4: mean 3, B = 8 (1/16 + 9/16)
-    d = np.array([[[0.0, 4.0, 5.0, 3.0], [0.0, 4.0, 3.0, 5.0]]])
-    effects, known = paired_effects(d, [7, 1, 1, 1]), error(d, [7, 1, 1, 1])
-    assert effects.mean[0] == 3
-    np.testing.assert_allclose(known.variances[:, 0], [0, 5, 0], atol=1e-12)
+    # weights 1/4 and 3/4; seeds' means by group 0, 4 and 2, 4, over both 3 and 3.5; groups' means 1 and 4
+    d = np.array([[[0.0, 4.0, 5.0, 3.0], [2.0, 4.0, 3.0, 5.0]]])
+    assert paired_effects(d, [7, 1, 1, 1]).mean[0] == 3.25
+    # 0.125 / 2; 4.5 x 10/16; what is left is -1, 0 and 1, 0: (0.5 + 0.5) x 10/16 / 2
+    np.testing.assert_allclose(error(d, [7, 1, 1, 1]).variances[:, 0], [0.0625, 2.8125, 0.3125])
 
 
 # One of a kind, none that differ
@@ -315,6 +315,15 @@ def test_seeds_needed_are_the_first_that_suffice():
     measured = detectable(d[None], TABLE)[0]
     assert seeds_needed(d, 1.0001 * measured, TABLE) == 4
     assert seeds_needed(d, 0.9999 * measured, TABLE) == 5
+
+
+def test_noise_goes_away_with_seeds():
+    noise = np.outer([1.0, -1.0, 1.0, -1.0], [1.0, -1.0] * 10)
+    half = detectable(noise[None], TABLE)[0] / 2
+    assert error(noise[None]).variances[:2].max() < 1e-12
+    needed = seeds_needed(noise, half, TABLE)
+    assert needed is not None
+    assert 4 < needed <= 16
 
 
 def test_no_number_of_seeds_makes_up_for_few_clips():
