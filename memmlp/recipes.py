@@ -8,6 +8,8 @@ Moving or renaming code changes no number.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 RECIPES: dict[str, int] = {
     # what the network sees, and how its space lies in the world (memmlp.features)
     "features": 1,
@@ -60,6 +62,12 @@ RECIPES: dict[str, int] = {
     "int8": 1,
     "latency": 1,
 }
+
+
+def outdated(known: Mapping[str, int]) -> list[str]:
+    """The components among some, by name and number, whose numbers are others now, as words."""
+    now = recipes(list(known))
+    return [f"{name} {number} -> {now[name]}" for name, number in known.items() if now[name] != number]
 
 
 def recipes(components: list[str]) -> dict[str, int]:

@@ -119,7 +119,7 @@ def tasks_of(experiment: Experiment, data: str) -> list[Task]:
     own = motion_identity(experiment, data)
     above = own.upstream.id if own.upstream else None
     upstream = [Task(above, "vqvae", experiment.config)] if above else []
-    return [*upstream, Task(own.id, "memmlp", experiment.config, above, experiment.stages)]
+    return [*upstream, Task(own.id, "memmlp", experiment.config, above, experiment.stages, own.what)]
 
 
 def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[str, Any]]) -> str | None:

@@ -16,6 +16,7 @@ from memmlp.errors import InputError
 from memmlp.sweep.spec import BRANCHES
 
 if TYPE_CHECKING:
+    from memmlp.runs import Run
     from memmlp.sweep.plan import Plan
     from memmlp.sweep.spec import Arm, Sweep
     from memmlp.tables.collect import Find
@@ -131,7 +132,7 @@ def of_plan(sweep: Sweep, plan: Plan, modes: Sequence[str], command: str, read: 
     from memmlp.tables.collect import collect, finished
 
     runs = finished(sweep, finder(plan, read))
-    return Found(sweep, runs, collect(sweep, runs, modes, command, states(plan)))
+    return Found(sweep, runs, collect(sweep, runs, modes, command, states(plan), older(plan)))
 
 
 def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
@@ -171,6 +172,29 @@ def states(plan: Plan) -> Say:
         return word if word not in ("new", "done") else None
 
     return state
+
+
+def older(plan: Plan) -> Say:
+    """What finds runs that differ from those of a planned sweep in recipe numbers alone, by cell."""
+    from memmlp.recipes import outdated
+    from memmlp.runs import list_runs
+
+    whats = {task.key: task.what for task in plan.tasks}
+    entries = {(entry.label, entry.seed): entry for entry in plan.entries}
+
+    @functools.cache
+    def known() -> dict[str, Run]:
+        return {run.manifest.get("what", ""): run for run in list_runs(plan.outputs) if run.done}
+
+    def say(arm: Arm, seed: int) -> str | None:
+        entry = entries.get((arm.label, seed))
+        run = known().get(whats.get(entry.key, "?")) if entry else None
+        if entry is None or run is None or run.id == entry.id:
+            return None
+        changed = ", ".join(outdated(run.manifest.get("recipes", {}))) or "its VQ-VAE's"
+        return f"run {run.id}: {changed}"
+
+    return say
 
 
 def on_screen(tables: Sequence[Table]) -> None:

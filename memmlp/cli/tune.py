@@ -103,7 +103,7 @@ def _search_config(words: Sequence[str], config_dir: Path | None) -> dict[str, A
 
 
 def _check_space(setup: Setup) -> str:
-    """Refuse a range with a value that the config refuses; the id of the first trial's run."""
+    """Refuse a range with a value that the config refuses; the first trial's run, and when it is validated."""
     space = setup.search.space
     for word in setup.words:
         if word.partition("=")[0].lstrip("+") in {one.key for one in space}:
@@ -116,7 +116,8 @@ def _check_space(setup: Setup) -> str:
             _experiments(setup, corner)
         except InputError as error:
             raise InputError(f"search.space: {error}") from None
-    return _tasks(setup, setup.search.first())[0][-1].id
+    first = _tasks(setup, setup.search.first())[0][-1]
+    return f"{first.id}, validated every {first.config['optim']['validate_every']} steps"  # and may be pruned
 
 
 def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[Task]]:

@@ -24,6 +24,7 @@ class Task:
         config: the resolved config of an experiment that needs it.
         upstream: the run that must be done before; None for none.
         stages: identities of the evaluations and the deployment that are wanted of it.
+        what: what it has in common with runs of other recipe numbers (`Identity.what`).
     """
 
     id: str
@@ -31,6 +32,7 @@ class Task:
     config: Mapping[str, Any]
     upstream: str | None = None
     stages: tuple[str, ...] = ()
+    what: str = ""
 
     @property
     def key(self) -> str:

@@ -20,6 +20,7 @@ from memmlp.cli.plan import find_sweep, orphans, planned
 from memmlp.cli.sweep import split_executor
 from memmlp.cli.work import perform
 from memmlp.errors import InputError
+from memmlp.recipes import RECIPES
 from memmlp.runs import Run, list_runs
 from memmlp.sweep.board import name
 
@@ -222,3 +223,23 @@ def test_a_worker_of_other_code_or_data_leaves_the_run_alone(home: Path, monkeyp
     with pytest.raises(InputError, match="the data or the code changed since the sweep began"):
         perform(home / "plan.json", 1, plan, other)
     assert not plan.run_of(other).folder.exists()
+
+
+def test_runs_of_an_older_recipe_are_said_and_made_again(home: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(RECIPES, "memory.none", RECIPES["memory.none"] + 1)
+    words = (
+        "table",
+        "trial.yaml",
+        *TINY,
+        "optim.log_every=3",
+    )  # which changes no result, but is another plan
+    said = " ".join(run(home, *words).split())
+    assert "missing: 'none' seed 0, 'wild' seed 0" in said
+    known = next(
+        one for one in list_runs(home / "outputs") if "memory.none" in one.manifest.get("recipes", {})
+    )
+    before = RECIPES["memory.none"] - 1
+    assert (
+        f"made again by the sweep: 'none' seed 0 (run {known.id}: memory.none {before} -> {before + 1})"
+        in said
+    )
