@@ -284,10 +284,13 @@ def test_every_protocol_builds(name, tmp_path):
 
 
 def test_a_joint_vqvae_is_part_of_the_runs_identity_and_its_own_stage_is_not():
+    def experiment_of(*overrides: str) -> pipeline.Experiment:
+        return build_experiment(composed(["memory=vq_joint", *overrides]))
+
     def identity(*overrides: str) -> str:
-        return pipeline.motion_id(build_experiment(composed(["memory=vq_joint", *overrides])), "data")
+        return pipeline.motion_identity(experiment_of(*overrides), "data").id
 
     base = identity()
     assert all(identity(change) != base for change in ("vqvae.codes=32", "vqvae.encoder_depth=2"))
     assert all(identity(change) == base for change in ("vqvae.steps=7", "vqvae.lr=0.5", "tracker=none"))
-    assert pipeline.vqvae_id(build_experiment(composed(["memory=vq_joint"])), "data") is None
+    assert pipeline.vqvae_identity(experiment_of(), "data") is None

@@ -22,7 +22,7 @@ from memmlp.memory import CodeMemory
 from memmlp.model import WindowModel
 from memmlp.parity import streamed
 from memmlp.quantization import accuracy, compared, quantise
-from memmlp.runs import Run, list_runs
+from memmlp.runs import Deployed, list_runs
 from memmlp.session import OnnxStream
 from memmlp.streaming import Stream, streaming
 
@@ -119,26 +119,27 @@ def test_accuracy_is_that_of_the_evaluation(pair):
 def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
     monkeypatch.chdir(home)
     (made,) = (found for found in list_runs(home / "outputs") if found.manifest["kind"] == "memmlp")
-    written = made.latency.read_text()
+    place = made.shipped
+    written = place.latency.read_text()
     record = json.loads(written)
     assert record["graph"] == "streaming"
     assert 0 < record["step_macs"] < record["macs"]
     cost = record["int8"]
     assert cost["growth"] == pytest.approx(cost["int8"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
     assert cost["median_ms"] > 0
-    assert cost["onnx_bytes"] == made.int8.stat().st_size
+    assert cost["onnx_bytes"] == place.int8.stat().st_size
     assert made.verify() == []
     assert math.isclose(cost["fp32"]["MPJPE"], made.results["stream"]["rotation"]["MPJPE"], rel_tol=1e-3)
-    for default, used in ((True, made.int8), (False, made.onnx)):
+    for default, used in ((True, place.int8), (False, place.onnx)):
         cost["default"] = default
-        made.latency.write_text(json.dumps(record))
+        place.latency.write_text(json.dumps(record))
         assert made.deployed == used
         assert package.Stream(made).network.path == used
         assert package.Stream(str(made.folder)).network.path == used
-    made.latency.write_text(written)
+    place.latency.write_text(written)
     assert made.verify() == []
-    made.int8.write_bytes(b"")
-    assert made.verify() == ["step.int8.onnx"]
+    place.int8.write_bytes(b"")
+    assert made.verify() == [f"deployments/{place.folder.name}/step.int8.onnx"]
 
     line = ["export", made.id, "--out", "int8.onnx", "--precision", "int8"]
     assert "MPJPE" in memmlp(*line, "--max-growth", "50").out
@@ -154,9 +155,8 @@ def test_the_naive_graph_by_switch(tmp_path):
     """No run: what a config's deployment writes."""
     shipped = {}
     for graph in ("naive", "auto"):
-        made = Run(tmp_path / graph)
-        made.begin("memmlp", {}, data="d", upstream=None)
-        shipped[graph] = Deployment(1, graph).ship(tiny.model(), made, CLIPS, CLIPS)
+        place = Deployed(tmp_path / graph)
+        shipped[graph] = Deployment(1, graph).ship(tiny.model(), place, "0" * 16, CLIPS, CLIPS)
     assert [record["graph"] for record in shipped.values()] == ["naive", "streaming"]
     assert shipped["naive"]["step_macs"] == shipped["naive"]["macs"] == shipped["auto"]["macs"]
     assert build_experiment(composed(["export.graph=naive"])).deployment.graph == "naive"

@@ -339,7 +339,10 @@ def test_it_needs_no_torch(file):
 
 
 def test_a_run_or_its_folder_is_a_source(file, tmp_path):
-    (tmp_path / "step.onnx").write_bytes(file.read_bytes())
+    place = Run(tmp_path).deployment("fp32-0")
+    place.folder.mkdir(parents=True)
+    place.onnx.write_bytes(file.read_bytes())
+    place.finish({})
     for source in (tmp_path, str(tmp_path), Run(tmp_path)):
         assert memmlp.Stream(source).network.frames == 7
     with pytest.raises(AttributeError, match="Streams"):

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command_line import MAIN
@@ -32,13 +33,19 @@ def finished(home: Path, memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch) -> Run
 
 @pytest.fixture
 def clips(finished: Run) -> list[str]:
-    return [row["name"] for row in json.loads(finished.clips.read_text())]
+    return [row["name"] for row in rows(finished)]
+
+
+def rows(run: Run) -> list[dict[str, Any]]:
+    """The test clips in stream mode."""
+    (report,) = run.evaluations.glob("stream-*.json")
+    return json.loads(report.read_text())["clips"]
 
 
 def test_a_figure(memmlp: Memmlp, finished: Run, clips: list[str], tmp_path: Path):
     out = tmp_path / "heat.png"
     ran = memmlp("render", finished.id, "--out", str(out), "--frames", "2", "--label", "ours")
-    error = json.loads(finished.clips.read_text())[0]["stream"]["rotation"]["MPJPE"]
+    error = rows(finished)[0]["rotation"]["MPJPE"]
     assert (ran.code, ran.out) == (0, f"{out}: {clips[0]}, ours {error:.1f} cm\n")
     with Image.open(out) as image:
         assert image.size[0] < 700

@@ -15,7 +15,8 @@ from memmlp.runs import Run, list_runs
 MOMENTS = (
     "data/**/*.npz",  # the first clip of the data is there
     "runs/*/checkpoint.safetensors",  # the VQ-VAE is being trained
-    "runs/*/clips.json",  # the network is evaluated, and about to be exported
+    "runs/*/evaluations/*.json",  # the network is evaluated in one mode, and about to be in the other
+    "runs/*/deployments/*/step.onnx",  # it is exported, and about to be timed
 )
 
 
