@@ -103,7 +103,7 @@ def _search_config(words: Sequence[str], config_dir: Path | None) -> dict[str, A
 
 
 def _check_space(setup: Setup) -> str:
-    """Refuse a range with a value that the config refuses; the first trial's run, and when it is validated."""
+    """Refuse a range with a value that the config refuses; the first trial's run, and its validations."""
     space = setup.search.space
     for word in setup.words:
         if word.partition("=")[0].lstrip("+") in {one.key for one in space}:
