@@ -49,7 +49,7 @@ def test_it_is_the_stream(name, network, folder: Path):
         export_full(network, file, RUN, name)
     assert full_parity(network, file, PERSON.frames, name) <= TOLERANCE
     positions, rotations = space.positions_out(PERSON.positions), space.rotations_out(PERSON.rotations)
-    poses = live.play(Stream(folder, space=name), positions, rotations)
+    poses = live.play(Stream(folder / "step.onnx", space=name), positions, rotations)
     full = OnnxStream(file)
     for _ in range(2):
         for index, pose in enumerate(poses):

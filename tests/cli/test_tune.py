@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import re
 import shutil
-from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -15,8 +14,7 @@ from command_line import run_apart
 from filelock import FileLock
 
 from memmlp.cli.bench.chaos import examine
-from memmlp.cli.plan import digest
-from memmlp.cli.tune import _tasks, prepared
+from memmlp.cli.tune import prepared
 from memmlp.runs import Run
 
 TINY = [*BASE, "optim.validate_every=3"]
@@ -136,11 +134,14 @@ def test_what_counts_gives_a_search_of_its_own(tmp_path: Path):
     assert folder("search.seeds=1") == base
 
 
-def test_a_search_of_one_seed_is_the_one_that_came_before_the_key(tmp_path: Path):
-    setup = prepared(TINY, None, tmp_path)
-    first = _tasks(setup, setup.search.first())[0][-1].id
-    counted = {**asdict(setup.search), "n_trials": None, "storage": None}
-    assert setup.folder.name.endswith(digest([first, {k: v for k, v in counted.items() if k != "seeds"}])[:8])
+def test_a_search_is_named_after_what_its_trials_follow_from(tmp_path: Path):
+    """When a run is validated changes no run, but which trials are pruned."""
+    names = {
+        prepared([*TINY, *words], None, tmp_path).folder.name
+        for words in ([], ["search.seeds=2"], ["optim.validate_every=3"], ["optim.lr=0.1"])
+    }
+    assert len(names) == 4
+    assert prepared([*TINY, "search.n_trials=7"], None, tmp_path).folder.name in names
 
 
 def test_a_folder_of_ones_own_searches(tmp_path: Path):
