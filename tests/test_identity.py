@@ -16,10 +16,11 @@ from omegaconf import OmegaConf
 
 from memmlp import evaluation, pipeline
 from memmlp.cli.build import build_experiment
+from memmlp.cli.schema import restored
 from memmlp.cli.train import composed
 from memmlp.data.dataset import Frames
 from memmlp.deployment import GRAPHS
-from memmlp.identity import NEUTRAL, flatten
+from memmlp.identity import NEUTRAL, Identity, deployment_id, evaluation_id, flatten
 from memmlp.runs import Run
 
 BASE = [
@@ -215,3 +216,23 @@ def test_a_compiled_training_is_another():
         return pipeline.motion_identity(build_experiment(composed([*BASE, *overrides])), "data").id
 
     assert identity("optim.compile=true") != identity()
+
+
+def test_a_class_that_moves_changes_no_identity_and_is_found_where_it_is_now():
+    """Of every slot: the record of a run names the class where it lay when the run was made."""
+
+    def moved(tree: dict[str, Any]) -> dict[str, Any]:
+        found = {key: moved(value) if isinstance(value, dict) else value for key, value in tree.items()}
+        return {
+            key: f"memmlp.elsewhere.{key}" if key == "_target_" else value for key, value in found.items()
+        }
+
+    cfg = composed(BASE)
+    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    before = moved(config)
+    assert before != config
+    assert Identity("memmlp", before, "d").id == Identity("memmlp", config, "d").id
+    assert (evaluation_id(before, "stream"), deployment_id(before)) == (
+        evaluation_id(config, "stream"), deployment_id(config)
+    )  # fmt: skip
+    assert OmegaConf.to_container(restored(before)) == config
