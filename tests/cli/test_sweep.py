@@ -68,7 +68,7 @@ def test_status_and_dry_run_show_and_do_nothing(home: Path):
     assert "failed" in said
     assert "3 done, 1 failed" in said
     forecast = command(home, "seed=0,1", "--dry-run", "--workers", "2")
-    assert "3 of 7 runs to do, 2 at once: about" in forecast
+    assert "4 of 8 runs to do, 2 at once: about" in forecast
     slurm = command(
         home, "--dry-run", "executor=slurm", "slurm.partition=gpu", "slurm.time=30", "slurm.mem_gb=8"
     )
