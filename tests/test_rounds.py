@@ -18,7 +18,7 @@ from memmlp.tables.render import markdown
 from memmlp.tables.rounds import Rounds, advanced, as_json, begin, of_json, outlook
 
 ORIGIN = Origin("c", False, "d", "cpu")
-CLIPS = [f"clip {number}" for number in range(20)]
+CLIPS = [f"clip {number}" for number in range(10)]
 SWEEP = parse_sweep(
     "mine",
     {
@@ -210,7 +210,7 @@ def test_the_table_shows_rounds(tmp_path):
     assert "'unsure' seed 6; fill with" in markdown(collect(rounds.spent(SWEEP), world.runs, rounds=rounds))
 
 
-def false_claims(truth: float, spend: Callable[[Rounds], Rounds], times: int = 120) -> float:
+def false_claims(truth: float, noise: float, spend: Callable[[Rounds], Rounds], times: int = 200) -> float:
     """The share of sweeps with a false claim; differences of seeds alone, where the p-values are exact.
 
     truth: of all arms' differences; 0, or the smallest effect of interest of 1, where none is equivalent.
@@ -222,8 +222,8 @@ def false_claims(truth: float, spend: Callable[[Rounds], Rounds], times: int = 1
     for number in range(times):
 
         def draw(label: str, seed: int, metric: str, number: int = number) -> np.ndarray:
-            noise = np.random.default_rng([number, seed, *label.encode(), *metric.encode()]).normal()
-            return (label != "full") * (0.3 * noise + truth) + np.zeros(len(CLIPS))
+            rng = np.random.default_rng([number, seed, *label.encode(), *metric.encode()])
+            return (label != "full") * (noise * rng.normal() + truth) + np.zeros(len(CLIPS))
 
         rounds = World(sweep, draw).to_the_end(spend(begin(sweep)))
         counts.append(any(finding.verdict in false for finding, _ in rounds.latest().values()))
@@ -235,10 +235,10 @@ def wasteful(rounds: Rounds) -> Rounds:
     return replace(rounds, levels=(0.05,) * len(rounds.looks))
 
 
-@pytest.mark.parametrize("truth", [0.0, 1.0])
-def test_false_claims_keep_to_the_level_over_all_rounds(truth: float):
-    assert false_claims(truth, lambda rounds: rounds) <= 0.06
+@pytest.mark.parametrize(("truth", "noise"), [(0.0, 5.0), (1.0, 0.5)])
+def test_false_claims_keep_to_the_level_over_all_rounds(truth: float, noise: float):
+    assert false_claims(truth, noise, lambda rounds: rounds) <= 0.08
 
 
 def test_the_whole_level_at_every_look_would_not_keep_it():
-    assert false_claims(1.0, wasteful) > 0.06
+    assert false_claims(0.0, 5.0, wasteful) > 0.11
