@@ -105,6 +105,7 @@ def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
     from memmlp.tables.rounds import advanced, as_json
 
     path = record(sweep, outputs)
+    path.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(path.with_name(".rounds.lock")):
         kept = read(path)
         if kept is not None and len(kept.taken) > len(rounds.taken):
