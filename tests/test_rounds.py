@@ -141,6 +141,21 @@ def test_what_is_decided_stays_though_later_data_would_reverse_it():
     assert cell.effect.significant
 
 
+def test_a_decided_comparison_of_an_open_arm_is_not_looked_at_again():
+    """Worse in stream mode at three seeds, better after them; window mode stays open."""
+    sweep = parse_sweep("mixed", {"seeds": [0], "metrics": ["MPJPE"], "arms": {"full": [], "other": ["a=1"]}})
+
+    def draw(label: str, seed: int, metric: str) -> np.ndarray:
+        if label == "full" or "window" in metric:
+            return planted({"other": "unsure"}.get(label, label), seed, metric)
+        return planted("worse", seed, metric) - 9 * (seed >= 3)
+
+    rounds = World(sweep, draw).to_the_end(begin(sweep))
+    assert verdicts(rounds) == {"other": ("higher", 3)}
+    assert len(rounds.taken) > 1
+    assert {finding.mode for look in rounds.taken[1:] for finding in look.found} == {"window"}
+
+
 def test_a_look_uses_its_seeds_alone_whatever_other_runs_there_are():
     few, many = World(), World()
     whole = begin(SWEEP, 13)

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import yaml
-from command_line import MAIN, TINY, run
+from command_line import MAIN, TINY, run, run_apart
 
 from memmlp.runs import list_runs
 
@@ -31,7 +31,7 @@ def test_rounds_go_on_after_a_kill(tmp_path: Path):
     os.killpg(killed.pid, signal.SIGKILL)
     killed.wait()
     assert not list(tmp_path.glob("outputs/sweeps/*/rounds.json"))
-    said = run(tmp_path, *WORDS, "--until-decided")
+    said = run_apart(tmp_path, *WORDS, "--until-decided")
     assert "all verdicts are decided" in said
     runs = list_runs(tmp_path / "outputs")
     assert len(runs) == 3
