@@ -17,7 +17,7 @@ from memmlp.cli.shipped import shipped
 from memmlp.errors import InputError
 from memmlp.files import read_json, write_json
 from memmlp.sweep.plan import Entry, Plan, Task, unique
-from memmlp.sweep.spec import Sweep, load_sweep
+from memmlp.sweep.spec import Arm, Sweep, load_sweep
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -84,7 +84,7 @@ def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[s
     data: dict[str, dict[str, Any]] = {}
     complete = True
     for arm in sweep.runnable():
-        for seed, experiment in _experiments(sweep, arm.label, sweep.overrides(arm), outputs):
+        for seed, experiment in _experiments(sweep, arm, outputs):
             known = _data_digest(experiment, prepare, data)
             complete &= known is not None
             if known is not None:
@@ -96,20 +96,18 @@ def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[s
     return plan, list(data.values()) if complete else None
 
 
-def _experiments(
-    sweep: Sweep, label: str, overrides: tuple[str, ...], outputs: Path
-) -> Iterable[tuple[int, Experiment]]:
+def _experiments(sweep: Sweep, arm: Arm, outputs: Path) -> Iterable[tuple[int, Experiment]]:
     """The checked experiments of an arm, seed by seed."""
     from memmlp.cli.build import build_experiment
     from memmlp.cli.train import composed
 
     try:
-        cfg = composed(list(overrides))
-        for seed in sweep.seeds:
+        cfg = composed(list(sweep.overrides(arm)))
+        for seed in sweep.seeds_of(arm):
             cfg.seed, cfg.paths.outputs = seed, str(outputs)
             yield seed, build_experiment(cfg)
     except InputError as error:
-        raise InputError(f"sweep {sweep.name}, arm '{label}': {error}") from None
+        raise InputError(f"sweep {sweep.name}, arm '{arm.label}': {error}") from None
 
 
 def tasks_of(experiment: Experiment, data: str) -> list[Task]:

@@ -17,6 +17,7 @@ from memmlp.cli.options import outputs_option
 from memmlp.errors import InputError
 
 if TYPE_CHECKING:
+    from memmlp.cli.rounds import Shown
     from memmlp.sweep.controller import Fleet
     from memmlp.sweep.executors import Executor
     from memmlp.sweep.plan import Plan
@@ -33,6 +34,8 @@ OPTIONS = ("partition", "time", "mem_gb", "cpus", "gpus", "account", "qos", "con
 @click.option("--dry-run", is_flag=True, help="Show what would be run, and do nothing.")
 @click.option("--retry", is_flag=True, help="Run again what failed.")
 @click.option("--fail-fast", is_flag=True, help="End the sweep with the first run that fails.")
+@click.option("--until-decided", is_flag=True, help="Spend seeds in rounds, where verdicts are open.")
+@click.option("--max-seeds", type=int, help="Of an arm, with --until-decided; 13 by default.")
 @click.option("--yes", is_flag=True, hidden=True)
 @outputs_option
 def sweep(
@@ -43,6 +46,8 @@ def sweep(
     dry_run: bool,
     retry: bool,
     fail_fast: bool,
+    until_decided: bool,
+    max_seeds: int | None,
     yes: bool,
     outputs: Path,
 ) -> None:
@@ -51,17 +56,26 @@ def sweep(
     OVERRIDES are those of `memmlp train`, for all arms; `seed=0,1` sets the seeds. The workers are processes
     of this machine, Slurm jobs (`executor=slurm slurm.partition=P slurm.time=MINUTES slurm.mem_gb=16
     slurm.cpus=4 slurm.gpus=1`) or tasks of Ray (`executor=ray`).
+
+    With --until-decided all arms get three seeds, and then those with open verdicts alone further ones, up to
+    --max-seeds.
     """
+    from memmlp.cli import rounds
     from memmlp.cli.plan import find_sweep, planned, sweep_folder
     from memmlp.sweep.executors import sbatch
 
     engine, options, rest = split_executor(overrides)
+    rounds.check(rest, until_decided, max_seeds)
     count = workers or os.cpu_count() or 1
     chosen = find_sweep(name).with_overrides(rest)
     outputs = outputs.absolute()
-    plan = planned(chosen, outputs, prepare=not (status or dry_run))
+    known = rounds.begun(chosen, outputs, max_seeds) if until_decided else None
+    spent = known.spent(chosen) if known else chosen
+    plan = planned(spent, outputs, prepare=not (status or dry_run))
     if status or dry_run:
-        show(chosen, plan)
+        show(spent, plan)
+        if known:
+            click.echo("\n".join([rounds.schedule(known), *rounds.told(known, chosen)]))
         if dry_run:
             forecast(plan, count)
             if engine == "slurm":
@@ -70,11 +84,15 @@ def sweep(
     if retry:
         for task in plan.tasks:
             plan.run_of(task).retry()
+    work = partial(bring_to_end, engine=engine, options=options, workers=count)
+    if known:
+        known, plan = rounds.until_decided(chosen, outputs, known, work, fail_fast)
+        report(rounds.Shown(known.spent(chosen), plan, known), [name, *rest], chosen)
+        return
     plan = replace(plan, fail_fast=fail_fast)
     if plan.left():
-        bring_to_end(chosen, plan, engine, options, count)
-        track(plan)
-    report(chosen, plan, [name, *rest])
+        work(chosen, plan)
+    report(rounds.Shown(chosen, plan, None, rounds.spent_before(chosen, outputs)), [name, *rest], chosen)
 
 
 def split_executor(words: tuple[str, ...]) -> tuple[str, dict[str, object], tuple[str, ...]]:
@@ -125,13 +143,14 @@ def slurm_options(options: dict[str, str]) -> dict[str, object]:
 
 
 def bring_to_end(chosen: Sweep, plan: Plan, engine: str, options: dict[str, object], workers: int) -> None:
-    """Start workers and wait for them."""
+    """Start workers, wait for them, and show the runs as the sweep's."""
     from memmlp.cli.plan import sweep_folder
     from memmlp.sweep.board import Board
     from memmlp.sweep.controller import oversee
 
     _, fleet = hire(sweep_folder(chosen, plan.outputs), plan, engine, options, workers)
     oversee(plan, fleet, Board())
+    track(plan)
 
 
 def hire(
@@ -203,16 +222,21 @@ def _seconds(plan: Plan, kind: str) -> list[float]:
     return [sum(seconds.values()) if isinstance(seconds, dict) else seconds for seconds in found]
 
 
-def report(chosen: Sweep, plan: Plan, words: Sequence[str]) -> None:
+def report(shown: Shown, words: Sequence[str], chosen: Sweep) -> None:
     """The table, what is done, what failed, and the next command. Exits with 1 where something failed."""
     from memmlp.cli.plan import orphans
+    from memmlp.cli.rounds import closing
     from memmlp.cli.table import MODES, of_plan, on_screen
     from memmlp.tables.measured import load
 
+    plan, known = shown.plan, shown.rounds
     states = plan.states()
     failed = [task for task in plan.tasks if states[task.key] in ("failed", "blocked")]
     command = " ".join(["memmlp sweep", *words])
-    on_screen([of_plan(chosen, plan, MODES["both"], command, load).table])
+    found = of_plan(shown, MODES["both"], command, load)
+    on_screen([found.table])
+    for line in closing(known, chosen, found.runs) if known else ():
+        click.echo(line)
     click.echo(f"{sum(state == 'done' for state in states.values())} of {len(states)} runs done")
     for entry in orphans(chosen, plan):
         click.echo(f"orphan: run {entry.id} was '{entry.label}' seed {entry.seed} in an earlier version")

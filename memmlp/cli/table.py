@@ -6,6 +6,7 @@ import functools
 import gc
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,6 +17,7 @@ from memmlp.errors import InputError
 from memmlp.sweep.spec import BRANCHES
 
 if TYPE_CHECKING:
+    from memmlp.cli.rounds import Shown
     from memmlp.runs import Run
     from memmlp.sweep.plan import Plan
     from memmlp.sweep.spec import Arm, Sweep
@@ -110,14 +112,14 @@ def gathered(
     A table of the paper whose config lacks something (where AMASS lies) shows the paper's values and says so.
     Raises InputError where none can be composed with the command line's overrides.
     """
-    from memmlp.cli.plan import planned
+    from memmlp.cli.rounds import shown
     from memmlp.tables.collect import without_runs
 
     found, failures = [], []
     for sweep, command in chosen(names, overrides):
         sweep = sweep.with_branch(branch) if branch else sweep
         try:
-            found.append(of_plan(sweep, planned(sweep, outputs.absolute()), modes, command, read))
+            found.append(of_plan(shown(sweep, overrides, outputs.absolute()), modes, command, read))
         except InputError as error:
             failures.append(error)
             table = without_runs(sweep, modes, f"nothing measured: {error}")
@@ -127,12 +129,15 @@ def gathered(
     return found
 
 
-def of_plan(sweep: Sweep, plan: Plan, modes: Sequence[str], command: str, read: Read) -> Found:
+def of_plan(shown: Shown, modes: Sequence[str], command: str, read: Read) -> Found:
     """A planned sweep's finished runs and table."""
     from memmlp.tables.collect import collect, finished
 
+    sweep, plan, rounds, flags = shown
     runs = finished(sweep, finder(plan, read))
-    return Found(sweep, runs, collect(sweep, runs, modes, command, states(plan), older(plan)))
+    command = f"{command} --until-decided" if rounds else command
+    table = collect(sweep, runs, modes, command, states(plan), older(plan), rounds)
+    return Found(sweep, runs, replace(table, flags=(*table.flags, *flags)))
 
 
 def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:

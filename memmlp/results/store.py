@@ -66,7 +66,9 @@ class Kept:
         """The runs of the arms and seeds that the sweep has today."""
         return {
             arm.label: {
-                seed: run for seed, run in sorted(self.runs.get(arm.label, {}).items()) if seed in sweep.seeds
+                seed: run
+                for seed, run in sorted(self.runs.get(arm.label, {}).items())
+                if seed in sweep.seeds_of(arm)
             }
             for arm in sweep.runnable()
         }

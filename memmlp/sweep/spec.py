@@ -54,6 +54,7 @@ class Arm:
         note: a word of warning shown under the table.
         against: label of the arm that this one is compared with; None for the sweep's reference.
         fixed: whether the branch is the arm's own, and not the sweep's.
+        seeds: in place of the sweep's, where seeds are spent on open verdicts alone; None for the sweep's.
     """
 
     label: str
@@ -63,6 +64,7 @@ class Arm:
     note: str | None = None
     against: str | None = None
     fixed: bool = False
+    seeds: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,10 @@ class Sweep:
         """The label of the arm that one is compared with; None for the reference without a control."""
         return arm.against or (self.reference if arm.label != self.reference else None)
 
+    def seeds_of(self, arm: Arm) -> tuple[int, ...]:
+        """The seeds of an arm, the sweep's where it has none of its own."""
+        return self.seeds if arm.seeds is None else arm.seeds
+
     def with_overrides(self, overrides: Sequence[str]) -> Sweep:
         """The same sweep, further overrides standing after its base and before its arms' differences.
 
@@ -139,7 +145,7 @@ class Sweep:
         return [
             Job(arm.label, seed, (*self.overrides(arm), f"seed={seed}"))
             for arm in self.runnable()
-            for seed in self.seeds
+            for seed in self.seeds_of(arm)
         ]
 
 

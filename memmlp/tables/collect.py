@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from memmlp.sweep.spec import COSTS, Arm, Sweep
 from memmlp.tables.effects import Runs, control, effects, paper_effect
 from memmlp.tables.flags import Say, flags, silent
 from memmlp.tables.measured import Measured
 from memmlp.tables.table import Cell, Effect, Key, Row, Table
+
+if TYPE_CHECKING:
+    from memmlp.tables.rounds import Rounds
 
 MODES = ("stream", "window")
 Find = Callable[[Arm, int], Measured | None]
@@ -18,7 +22,7 @@ Find = Callable[[Arm, int], Measured | None]
 def finished(sweep: Sweep, find: Find) -> dict[str, Runs]:
     """The finished runs of each arm, by seed."""
     return {
-        arm.label: {seed: run for seed in sweep.seeds if (run := find(arm, seed)) is not None}
+        arm.label: {seed: run for seed in sweep.seeds_of(arm) if (run := find(arm, seed)) is not None}
         for arm in sweep.runnable()
     }
 
@@ -30,6 +34,7 @@ def collect(
     command: str | None = None,
     state: Say = silent,
     older: Say = silent,
+    rounds: Rounds | None = None,
 ) -> Table:
     """The table of a sweep.
 
@@ -38,11 +43,14 @@ def collect(
         modes: of evaluation ("stream", "window"). command: what fills the missing arms.
         state: how far the unfinished run of an arm and seed is, in a word; None for nothing to say.
         older: the run of an earlier recipe that stands where one is missing; None where there is none.
+        rounds: whose verdicts stand, where seeds were spent so; the sweep is then `rounds.spent(sweep)`.
     """
     shown = tuple(modes) if set(sweep.metrics) - set(COSTS) else tuple(modes)[:1]
     seen = with_existing_branches(sweep, runs)
     found = effects(seen, runs, shown)
     compared = sum(effect.p is not None for effect in found.values())
+    if rounds:
+        found, compared = rounds.judged(found), len(rounds.family(sweep))
     return Table(
         name=sweep.name,
         title=sweep.title,
@@ -56,6 +64,7 @@ def collect(
         rows=tuple(_row(seen, arm, runs.get(arm.label), shown, found) for arm in seen.arms),
         notes=(*sweep.notes, *(f"{arm.label}: {arm.note}" for arm in sweep.arms if arm.note)),
         flags=tuple(flags(seen, sweep, runs, command or f"memmlp sweep {sweep.name}", state, older)),
+        looks=tuple((look.seeds, look.level) for look in rounds.taken) if rounds else (),
     )
 
 
@@ -83,7 +92,7 @@ def _row(sweep: Sweep, arm: Arm, runs: Runs | None, modes: Sequence[str], found:
         return Cell(values, (arm.paper or {}).get(metric), effect, paper_effect(sweep, arm, metric))
 
     cells = {mode: {metric: cell(mode, metric) for metric in sweep.metrics} for mode in modes}
-    wanted = sweep.seeds if runs is not None else ()
+    wanted = sweep.seeds_of(arm) if runs is not None else ()
     against = control(sweep, arm)
     other = against.label if against else None
     return Row(arm.label, arm.branch, other, arm.note, tuple(runs or ()), wanted, cells)

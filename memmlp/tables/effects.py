@@ -60,7 +60,7 @@ def effects(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dic
         for arm, mode, metric in itertools.product(sweep.runnable(), modes, sweep.metrics)
     }
     return _costs(sweep, runs, modes) | _judged(
-        _tested(paired(sweep, runs, modes), sweep.smallest), sweep.smallest, printed
+        tested(paired(sweep, runs, modes), sweep.smallest), sweep.smallest, printed
     )
 
 
@@ -109,7 +109,7 @@ def alike(pairs: Mapping[Key, Paired]) -> Iterator[tuple[list[Key], np.ndarray, 
         yield keys, np.stack([pairs[key].matrix for key in keys]), pairs[keys[0]].groups
 
 
-def _tested(pairs: Mapping[Key, Paired], smallest: Mapping[str, float]) -> dict[Key, Effect]:
+def tested(pairs: Mapping[Key, Paired], smallest: Mapping[str, float]) -> dict[Key, Effect]:
     """The effects with their own p-values, in the pairs' order."""
     found: dict[Key, Effect] = {}
     for keys, differences, groups in alike(pairs):
@@ -121,7 +121,7 @@ def _tested(pairs: Mapping[Key, Paired], smallest: Mapping[str, float]) -> dict[
         columns = zip(keys, numbers.mean, numbers.low, numbers.high, numbers.p, same, seen, strict=True)
         for key, mean, low, high, p, equal, least in columns:
             words = {"low": low, "high": high, "p": p, "equal": equal, "detectable": least}
-            known: dict[str, Any] = {name: _known(number) for name, number in words.items()}
+            known: dict[str, Any] = {name: or_none(number) for name, number in words.items()}
             found[key] = Effect(float(mean), **known, **size)
     return {key: found[key] for key in pairs}
 
@@ -131,12 +131,12 @@ def _judged(
 ) -> dict[Key, Effect]:
     """The effects with corrected p-values, differences by one Holm and equivalences by another; verdicts."""
     keys = list(tested)
-    different = holm(np.array([_bare(tested[key].p) for key in keys]))
-    equal = holm(np.array([_bare(tested[key].equal) for key in keys]))
+    different = holm(np.array([or_nan(tested[key].p) for key in keys]))
+    equal = holm(np.array([or_nan(tested[key].equal) for key in keys]))
     judged = {}
     for key, p, q in zip(keys, different, equal, strict=True):
         said = verdict(float(p), float(q), tested[key].mean, printed.get(key))
-        judged[key] = replace(tested[key], holm=_known(p), equal=_known(q), verdict=said)
+        judged[key] = replace(tested[key], holm=or_none(p), equal=or_none(q), verdict=said)
     return judged
 
 
@@ -156,11 +156,11 @@ def _mean_cost(runs: Runs, metric: str) -> float:
     return float(np.mean(costs)) if costs else math.nan
 
 
-def _known(number: float) -> float | None:
+def or_none(number: float) -> float | None:
     """The number; None for NaN."""
     return None if math.isnan(number) else float(number)
 
 
-def _bare(number: float | None) -> float:
+def or_nan(number: float | None) -> float:
     """The number; NaN for None."""
     return math.nan if number is None else number

@@ -73,7 +73,7 @@ def _older(sweep: Sweep, runs: Mapping[str, Runs], older: Say) -> Iterable[str]:
 
 
 def _gaps(sweep: Sweep, arm: Arm, runs: Mapping[str, Runs]) -> list[int]:
-    return [seed for seed in sweep.seeds if seed not in runs[arm.label]]
+    return [seed for seed in sweep.seeds_of(arm) if seed not in runs[arm.label]]
 
 
 def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, Runs], command: str) -> Iterable[str]:

@@ -77,7 +77,7 @@ def legend(table: Table) -> list[str]:
     if table.measured_metrics:
         lines.append("mean ± sd over seeds of the means over test clips")
     if any(True for mode in table.modes for _ in table.effects(mode)):
-        lines += [_differences(table), _meanings(table), *_power(table)]
+        lines += [_differences(table), _meanings(table), *_looks(table), *_power(table)]
     if any(cell.agrees is not None for row in table.rows for c in row.cells.values() for cell in c.values()):
         lines.append(_agreement(table))
     return lines
@@ -104,7 +104,8 @@ def _differences(table: Table) -> str:
     """What a line of differences has, and of which arms it is."""
     own = [row for row in table.rows if row.against not in (None, table.reference)]
     others = "".join(f", of '{row.label}' from '{row.against}'" for row in own)
-    star = f"; * p < 0.05 by Holm's correction over the table's {table.comparisons} comparisons"
+    least = "its look's level" if table.looks else "0.05"
+    star = f"; * p < {least} by Holm's correction over the table's {table.comparisons} comparisons"
     return (
         f"diff.: from '{table.reference}'{others} [95 % interval, paired by seed and test clip]"
         f"{star if table.comparisons else ''}"
@@ -123,6 +124,17 @@ def _meanings(table: Table) -> str:
         "higher or lower (significant, where the paper prints no difference), equivalent (nearer to 0 than "
         f"the smallest effect of interest: {', '.join(margins)}), open (none of these)"
     )
+
+
+def _looks(table: Table) -> list[str]:
+    """At how many seeds which part of the 5 % was spent."""
+    words = [f"{seeds} ({100 * level:.2g} %)" for seeds, level in sorted(set(table.looks))]
+    if not words:
+        return []
+    return [
+        f"seeds were spent in rounds, where verdicts were open: looks at {', '.join(words)} seeds, each with "
+        "its part of 5 %; (3): decided at 3 seeds, and final; means and intervals are of all the arm's seeds"
+    ]
 
 
 def _power(table: Table) -> list[str]:
@@ -184,7 +196,8 @@ def effect_words(cell: Cell, metric: str) -> tuple[str, ...]:
     places = _places(effect.high - effect.low)
     low, high = (_signed(number, f".{places}f") for number in (effect.low, effect.high))
     star = "*" if effect.significant else ""
-    verdict = () if effect.verdict is None else (str(effect.verdict),)
+    at = f" ({effect.decided})" if effect.decided else ""
+    verdict = () if effect.verdict is None else (f"{effect.verdict}{at}",)
     return _signed(effect.mean, f"+.{places}f") + star, f"[{low}, {high}]", *verdict
 
 

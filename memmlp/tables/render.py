@@ -143,8 +143,9 @@ def _html_line(line: Line) -> str:
 
 def _html_mark(text: str) -> str:
     """A part of a cell, its sign of agreement or significance set off; a verdict in a class of its name."""
-    if text in set(Verdict):
-        return f'<span class="verdict {text}">{text}</span>'
+    word = text.partition(" ")[0]
+    if word in set(Verdict):
+        return f'<span class="verdict {word}">{text}</span>'
     marks = {"✓": "same", "✗": "opposite", "*": "significant"}
     escaped = _html(text)
     for mark, name in marks.items():

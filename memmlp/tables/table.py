@@ -32,6 +32,8 @@ class Effect:
         verdict: what follows from them. detectable: the smallest difference that this comparison would have
             called significant with 80 % power. All of these are None where there are none, as of costs.
         seeds, clips, groups: how many were paired.
+        level: what the corrected p-values are compared with. decided: of a verdict that is final since a look
+            at so many seeds, those.
     """
 
     mean: float
@@ -45,11 +47,13 @@ class Effect:
     seeds: int = 0
     clips: int = 0
     groups: int = 0
+    level: float = LEVEL
+    decided: int | None = None
 
     @property
     def significant(self) -> bool:
-        """Whether it is significant at 5 % after the correction."""
-        return self.holm is not None and self.holm < LEVEL
+        """Whether it is significant at its level after the correction."""
+        return self.holm is not None and self.holm < self.level
 
 
 @dataclass(frozen=True)
@@ -124,6 +128,7 @@ class Table:
         smallest: the smallest effect of interest by metric.
         comparisons: how many p-values the correction is over.
         notes: about the paper's values. flags: what a reader has to know of these runs.
+        looks: at how many seeds and which levels verdicts were decided; none at a fixed number of seeds.
     """
 
     name: str
@@ -138,6 +143,7 @@ class Table:
     rows: tuple[Row, ...]
     notes: tuple[str, ...]
     flags: tuple[str, ...]
+    looks: tuple[tuple[int, float], ...] = ()
 
     @property
     def measured_metrics(self) -> tuple[str, ...]:

@@ -1,0 +1,311 @@
+"""Rounds of seeds for arms with open verdicts: looks fixed beforehand, and what was decided at which.
+
+Every arm goes through the same looks, each at a number of seeds that was fixed at the start; an arm whose
+comparisons are all decided goes no further. A look takes an arm's first seeds and its control's, whatever
+others there are, and what it decides is final. It spends its level over all comparisons of the sweep that
+nobody has claimed, those of arms that are elsewhere too; so the levels add up to 5 % for either family of
+claims, also where an arm is late because its runs failed (docs/statistics.md).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from memmlp.statistics import Verdict, looks, seeds_needed, sequential, spending, verdict
+from memmlp.sweep.spec import COSTS, Arm, Sweep
+from memmlp.tables.collect import MODES, with_existing_branches
+from memmlp.tables.effects import Runs, control, or_nan, or_none, paired, paper_effect, tested
+from memmlp.tables.table import Effect, Key
+
+MOST = 13  # seeds of an arm, where nothing else is asked for
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a look found of a comparison.
+
+    Attributes:
+        label, mode, metric: of the comparison. verdict: final unless it is open.
+        mean, p: the difference and its p-value; None with one group of clips, where nothing can be decided.
+        holm, equal: p-values of difference and equivalence, corrected, to be compared with the look's level.
+    """
+
+    label: str
+    mode: str
+    metric: str
+    verdict: Verdict
+    mean: float
+    p: float | None
+    holm: float | None
+    equal: float | None
+
+    @property
+    def key(self) -> Key:
+        """The comparison's."""
+        return Key(self.label, self.mode, self.metric)
+
+    @property
+    def open(self) -> bool:
+        """Whether more seeds may decide it."""
+        return self.verdict is Verdict.OPEN and self.p is not None
+
+
+@dataclass(frozen=True)
+class Look:
+    """A look that was taken.
+
+    Attributes:
+        seeds: of each arm. level: what it spent.
+        runs: by the labels of the arms that were looked at, what tells the runs, theirs and their controls'.
+        found: the comparisons that were open before.
+    """
+
+    seeds: int
+    level: float
+    runs: Mapping[str, str]
+    found: tuple[Finding, ...]
+
+
+@dataclass(frozen=True)
+class Rounds:
+    """The rounds of a sweep.
+
+    Attributes:
+        subject: what the looks are of (`subject`). seeds: all that may be spent, in order.
+        looks: seeds after each round. levels: what each look spends. taken: the looks that were taken.
+    """
+
+    subject: Mapping[str, Any]
+    seeds: tuple[int, ...]
+    looks: tuple[int, ...]
+    levels: tuple[float, ...]
+    taken: tuple[Look, ...] = ()
+
+    def position(self, label: str) -> int:
+        """How many looks an arm went through."""
+        return sum(label in look.runs for look in self.taken)
+
+    def latest(self) -> dict[Key, tuple[Finding, Look]]:
+        """The last finding of each comparison, which for a decided one is where it was decided."""
+        return {finding.key: (finding, look) for look in self.taken for finding in look.found}
+
+    def next_looks(self, sweep: Sweep) -> dict[str, int]:
+        """The number of the next look of each arm that has one: an open comparison, and looks left."""
+        going = {finding.label for finding, _ in self.latest().values() if finding.open}
+        found = {arm.label: self.position(arm.label) for arm, _ in _compared(sweep)}
+        return {
+            label: number
+            for label, number in found.items()
+            if number < len(self.looks) and (number == 0 or label in going)
+        }
+
+    def counts(self, sweep: Sweep) -> dict[str, int]:
+        """Seeds that each arm had or needs for the next look, its own or one that it is the control of."""
+        ahead = self.next_looks(sweep)
+        found = {arm.label: self.looks[0] for arm in sweep.runnable()}
+        for arm, other in _compared(sweep):
+            number = ahead.get(arm.label, self.position(arm.label) - 1)
+            for label in (arm.label, other.label):
+                found[label] = max(found[label], self.looks[number])
+        return found
+
+    def spent(self, sweep: Sweep) -> Sweep:
+        """The sweep with each arm's own seeds: those that were spent on it, and those of the next look."""
+        counts = self.counts(sweep)
+        arms = tuple(
+            replace(arm, seeds=self.seeds[: counts[arm.label]]) if arm.label in counts else arm
+            for arm in sweep.arms
+        )
+        return replace(sweep, arms=arms, seeds=self.seeds[: max(counts.values())])
+
+    def family(self, sweep: Sweep) -> list[Key]:
+        """All comparisons: those that were found and, of arms that had no look yet, all there may be."""
+        new = [arm for arm, _ in _compared(sweep) if not self.position(arm.label)]
+        return list(dict.fromkeys([*self.latest(), *(key for arm in new for key in _keys(sweep, arm))]))
+
+    def judged(self, effects: Mapping[Key, Effect]) -> dict[Key, Effect]:
+        """Effects with the verdicts of the looks in place of those of a fixed number of seeds."""
+        latest = self.latest()
+        return {
+            key: _as_found(effect, *latest.get(key, (None, None))) if effect.verdict else effect
+            for key, effect in effects.items()
+        }
+
+
+def subject(sweep: Sweep) -> dict[str, Any]:
+    """What verdicts are of, as JSON holds it: what can't change between two looks."""
+    return {
+        "arms": {
+            arm.label: {
+                "branch": arm.branch,
+                "against": sweep.control(arm),
+                "paper": {metric: paper_effect(sweep, arm, metric) for metric in sweep.metrics},
+            }
+            for arm in sweep.runnable()
+        },
+        "metrics": list(sweep.metrics),
+        "smallest": {name: sweep.smallest[name] for name in sweep.metrics if name in sweep.smallest},
+    }
+
+
+def begin(sweep: Sweep, most: int = MOST) -> Rounds:
+    """The rounds of a sweep with up to so many seeds: its own first, then the numbers that follow."""
+    following = itertools.count(max(sweep.seeds) + 1)
+    seeds = tuple(itertools.islice(itertools.chain(sweep.seeds, following), most))
+    schedule = looks(most)
+    return Rounds(subject(sweep), seeds, schedule, spending(len(schedule)))
+
+
+def advanced(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], named: Mapping[str, str]) -> Rounds:
+    """The rounds after the next look that can be taken; the same where none can.
+
+    An arm can be looked at when it and its control have all seeds of its next look. Of arms that are at
+    different looks, because runs failed, the ones that are behind come first.
+
+    Args:
+        sweep: as it was begun with. runs: the finished runs by label and seed.
+        named: what tells the runs of an arm and its control up to its next look, by label.
+    """
+    numbers = rounds.next_looks(sweep)
+    ready = [label for label, number in numbers.items() if _ready(rounds, sweep, runs, label, number)]
+    if not ready:
+        return rounds
+    number = min(numbers[label] for label in ready)
+    labels = [label for label in ready if numbers[label] == number]
+    look = Look(rounds.looks[number], rounds.levels[number], {label: named[label] for label in labels}, ())
+    found = _found(rounds, sweep, runs, look)
+    return replace(rounds, taken=(*rounds.taken, replace(look, found=tuple(found))))
+
+
+def outlook(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs]) -> dict[Key, int | None]:
+    """The seeds that would decide each open comparison of arms without a next look, with 80 % power.
+
+    If its effect is what was measured, at one look for all, corrected over what nobody has claimed. None
+    where no number of seeds would do with these clips.
+    """
+    latest, ahead = rounds.latest(), rounds.next_looks(sweep)
+    still = [key for key, (finding, _) in latest.items() if finding.open and key.label not in ahead]
+    unclaimed = sum(
+        key not in latest or latest[key][0].verdict is Verdict.OPEN for key in rounds.family(sweep)
+    )
+    found = {}
+    for key, pair in paired(with_existing_branches(sweep, runs), runs, MODES).items():
+        if key in still:
+            mean = abs(float(pair.matrix.mean()))
+            effect = max(mean, sweep.smallest[key.metric] - mean)
+            found[key] = seeds_needed(pair.matrix, effect, unclaimed, pair.groups)
+    return found
+
+
+def as_json(rounds: Rounds) -> dict[str, Any]:
+    """What a file holds of them."""
+    return asdict(rounds)
+
+
+def of_json(content: Mapping[str, Any]) -> Rounds:
+    """The rounds of a file. Raises KeyError, TypeError or ValueError where it holds none."""
+    taken = [
+        Look(
+            **{
+                **look,
+                "found": tuple(Finding(**{**f, "verdict": Verdict(f["verdict"])}) for f in look["found"]),
+            }
+        )
+        for look in content["taken"]
+    ]
+    words = {name: tuple(content[name]) for name in ("seeds", "looks", "levels")}
+    return Rounds(content["subject"], **words, taken=tuple(taken))
+
+
+def _compared(sweep: Sweep) -> Iterator[tuple[Arm, Arm]]:
+    """The arms that have a control and something to compare, with it."""
+    for arm in sweep.runnable():
+        other = control(sweep, arm)
+        if other is not None and set(sweep.metrics) - set(COSTS):
+            yield arm, other
+
+
+def _keys(sweep: Sweep, arm: Arm) -> list[Key]:
+    """All comparisons that an arm may have."""
+    metrics = [metric for metric in sweep.metrics if metric not in COSTS]
+    return [Key(arm.label, mode, metric) for mode, metric in itertools.product(MODES, metrics)]
+
+
+def _ready(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], label: str, number: int) -> bool:
+    """Whether the runs of an arm's look are all there."""
+    wanted = set(rounds.seeds[: rounds.looks[number]])
+    return all(wanted <= set(runs[one]) for one in pair_of(sweep, label))
+
+
+def pair_of(sweep: Sweep, label: str) -> tuple[str, str]:
+    """The labels of an arm and its control."""
+    return next((arm.label, other.label) for arm, other in _compared(sweep) if arm.label == label)
+
+
+def _found(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], look: Look) -> list[Finding]:
+    """What a look finds of the comparisons of its arms that are not decided."""
+    before = {key: finding.verdict for key, (finding, _) in rounds.latest().items()}
+    seen = _seen(rounds, sweep, runs, look)
+    fresh = {key: e for key, e in seen.items() if before.get(key, Verdict.OPEN) is Verdict.OPEN}
+    elsewhere = [
+        before.get(key, Verdict.OPEN)
+        for key in rounds.family(sweep)
+        if key not in fresh and (key in before or key.label not in look.runs)
+    ]
+    different, equal = _corrected(list(fresh.values()), elsewhere, look.level)
+    arms = {arm.label: arm for arm in sweep.arms}
+    found = []
+    for (key, effect), p, q in zip(fresh.items(), different, equal, strict=True):
+        paper = paper_effect(sweep, arms[key.label], key.metric)
+        said = verdict(float(p), float(q), effect.mean, paper, look.level)
+        found.append(Finding(*key, said, effect.mean, effect.p, or_none(p), or_none(q)))
+    return found
+
+
+def _seen(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], look: Look) -> dict[Key, Effect]:
+    """All comparisons of a look's arms over exactly its seeds."""
+    seeds = rounds.seeds[: look.seeds]
+    cut = {label: {s: found[s] for s in seeds if s in found} for label, found in runs.items()}
+    pairs = paired(with_existing_branches(sweep, cut), cut, MODES)
+    return tested({key: pair for key, pair in pairs.items() if key.label in look.runs}, sweep.smallest)
+
+
+def _corrected(
+    fresh: Sequence[Effect], elsewhere: Sequence[Verdict], level: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """P-values of differences and of equivalences (K,), corrected over fresh comparisons and all others.
+
+    elsewhere: the verdicts of the others, decided before or open where their arms are at another look.
+    """
+    none = [Verdict.OPEN] * len(fresh)
+    same = np.array([said is Verdict.EQUIVALENT for said in [*none, *elsewhere]], bool)
+    differ = np.array([said not in (Verdict.EQUIVALENT, Verdict.OPEN) for said in [*none, *elsewhere]], bool)
+    away = np.arange(len(same)) >= len(fresh)
+    p, q = (
+        np.array([or_nan(getattr(effect, name)) for effect in fresh] + [math.nan] * len(elsewhere))
+        for name in ("p", "equal")
+    )
+    equal = sequential(q, same, away & ~same)
+    different = sequential(p, differ, (away | (equal <= level)) & ~differ)
+    return different[: len(fresh)], equal[: len(fresh)]
+
+
+def _as_found(effect: Effect, finding: Finding | None, look: Look | None) -> Effect:
+    """The effect as its last look found it; open where there was none."""
+    if finding is None or look is None:
+        return replace(effect, holm=None, equal=None, verdict=Verdict.OPEN)
+    decided = None if finding.verdict is Verdict.OPEN else look.seeds
+    return replace(
+        effect,
+        holm=finding.holm,
+        equal=finding.equal,
+        verdict=finding.verdict,
+        level=look.level,
+        decided=decided,
+    )

@@ -1,0 +1,215 @@
+"""`memmlp sweep --until-decided`, on runs that were not trained and, once, on such as were and are killed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from conftest import Memmlp, one_line
+from fake_runs import CLIPS, fake_run
+
+from memmlp.runs import Run
+from memmlp.sweep.plan import Entry, Plan, Task
+from memmlp.sweep.spec import Sweep
+
+ARMS = {"full": [], "worse": ["a=1"], "same": ["a=2"]}
+FACTORS = {"worse": 1.5, "newer": 1.4}
+
+
+class Runs:
+    """Stands in for planning and training: runs of made-up numbers, and which were made."""
+
+    def __init__(self, outputs: Path):
+        self.outputs, self.made, self.version = outputs, [], ""
+        self.groups: dict[str, str] | None = None
+        self.failing: set[str] = set()
+        self.patience = 1000  # runs until it is interrupted
+
+    def name(self, label: str) -> str:
+        return f"{label}{self.version}"
+
+    def planned(self, sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
+        cells = [(arm.label, seed) for arm in sweep.runnable() for seed in sweep.seeds_of(arm)]
+        entries = [Entry(label, seed, self._id(label, seed)) for label, seed in cells]
+        tasks = [Task(entry.id, "memmlp", {"optim": {"steps": 1}}) for entry in entries]
+        return Plan(sweep.name, self.outputs, tuple(entries), tuple(tasks))
+
+    def _id(self, label: str, seed: int) -> str:
+        return hashlib.sha256(f"{self.name(label)} {seed}".encode()).hexdigest()[:16]
+
+    def work(self, sweep: Sweep, plan: Plan, **settings: object) -> None:
+        for entry in plan.entries:
+            if any(entry.id == task.id for task in plan.left()):
+                self.make(entry)
+
+    def make(self, entry: Entry) -> None:
+        if len(self.made) == self.patience:
+            raise KeyboardInterrupt
+        if entry.label in self.failing:
+            failed = Run.of(self.outputs, entry.id)
+            failed.folder.mkdir(parents=True, exist_ok=True)
+            failed.fail("loss is nan")
+            return
+        self.made.append((entry.label, entry.seed))
+        factor = FACTORS.get(entry.label, 1.0)
+        fake_run(self.outputs, self.name(entry.label), entry.seed, factor, groups=self.groups)
+
+
+@pytest.fixture
+def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Runs:
+    monkeypatch.chdir(tmp_path)
+    write(ARMS)
+    found = Runs(tmp_path / "outputs")
+    monkeypatch.setattr("memmlp.cli.plan.planned", found.planned)
+    monkeypatch.setattr("memmlp.cli.sweep.bring_to_end", found.work)
+    return found
+
+
+def write(arms: dict, **others: object) -> None:
+    content = {"metrics": ["MPJPE"], "arms": arms, **others}
+    Path("trial.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+
+
+def record() -> dict:
+    return json.loads(Path("outputs/sweeps/trial/rounds.json").read_text())
+
+
+def looked() -> list[tuple[int, list[str]]]:
+    return [(look["seeds"], sorted(look["runs"])) for look in record()["taken"]]
+
+
+SWEEP = ("sweep", "trial.yaml", "--until-decided")
+
+
+def test_seeds_go_where_verdicts_are_open(memmlp: Memmlp, runs: Runs):
+    ran = memmlp(*SWEEP)
+    assert ran.code == 0, ran.err
+    assert looked() == [(3, ["same", "worse"]), (5, ["same"]), (8, ["same"])]
+    assert sorted(runs.made) == sorted(
+        [("worse", seed) for seed in range(3)] + [(label, s) for label in ("full", "same") for s in range(8)]
+    )
+    assert "look at 3 seeds (0.33 %): 2 of 4 comparisons decided" in ran.out
+    assert re.search(r"^worse +2 +0 +3$", ran.out, re.M)
+    assert re.search(r"^same +0 +2 +5 +look at 5$", ran.out, re.M)
+    assert "look at 5 seeds (0.67 %): 2 of 4 comparisons decided" in ran.out
+    assert "look at 8 seeds (1.3 %): 4 of 4 comparisons decided" in ran.out
+    assert "all verdicts are decided" in ran.out
+    assert "19 runs were spent; 24 with 8 seeds for every arm, 39 with 13 seeds for every arm" in ran.out
+    before = record()
+    assert memmlp(*SWEEP).code == 0
+    assert len(runs.made) == 19
+    assert record() == before
+
+
+def test_the_table_shows_the_rounds(memmlp: Memmlp, runs: Runs):
+    memmlp(*SWEEP)
+    out = " ".join(memmlp("table", "trial.yaml").out.split())
+    assert "higher (3)" in out
+    assert "equivalent (8)" in out
+    assert "seeds were spent in rounds" in out
+    assert out.count("3/3") == 2
+    assert out.count("8/8") == 4
+    chosen = " ".join(memmlp("table", "trial.yaml", "seed=0,1,2").out.split())
+    assert "seeds were spent in rounds with other seeds: these verdicts do not keep the 5 %" in chosen
+    branch = " ".join(memmlp("table", "trial.yaml", "--branch", "position").out.split())
+    assert "seeds were spent in rounds with other arms" in branch
+    assert "higher (3)" not in branch
+    runs.version = "of other data"
+    other = " ".join(memmlp("table", "trial.yaml").out.split())
+    assert "seeds were spent in rounds, but not of these runs" in other
+
+
+@pytest.mark.parametrize("patience", [0, 4, 9, 11, 18])
+def test_interrupted_anywhere_it_ends_the_same(memmlp: Memmlp, runs: Runs, patience: int):
+    runs.patience = patience
+    assert memmlp(*SWEEP).code == 130
+    runs.patience = 1000
+    assert memmlp(*SWEEP).code == 0
+    assert looked() == [(3, ["same", "worse"]), (5, ["same"]), (8, ["same"])]
+    assert len(runs.made) == len(set(runs.made)) == 19
+
+
+def test_what_was_decided_is_of_the_sweep_as_it_was(memmlp: Memmlp, runs: Runs):
+    memmlp(*SWEEP)
+    before = record()
+    for arms, others, word in (
+        ({**ARMS, "newer": ["a=3"]}, {}, "arms"),
+        (ARMS, {"metrics": ["MPJRE"]}, "arms"),
+        (ARMS, {"smallest": {"MPJPE": 0.5}}, "smallest"),
+        (ARMS, {"branch": "position"}, "arms"),
+        (ARMS, {"seeds": [7]}, "seeds"),
+    ):
+        write(arms, **others)
+        line = f"rounds.json: its looks were taken with other {word}; remove it to begin anew"
+        assert one_line(memmlp(*SWEEP), line)
+    write(ARMS)
+    assert one_line(memmlp(*SWEEP, "--max-seeds", "8"), "--max-seeds 8: the looks of")
+    runs.version = "of other data"
+    assert one_line(memmlp(*SWEEP), "its looks were taken of other runs of 'worse'")
+    assert record() == before
+    runs.version = ""
+    Path("outputs/sweeps/trial/rounds.json").write_text("{")
+    assert one_line(memmlp(*SWEEP), "rounds.json: no record of rounds")
+
+
+def test_one_group_of_clips_is_said(memmlp: Memmlp, runs: Runs):
+    runs.groups = dict.fromkeys(CLIPS, "one take")
+    out = memmlp(*SWEEP).out
+    assert len(runs.made) == 9
+    assert "the test clips are one group: no number of seeds decides" in out
+
+
+def test_open_to_the_end_is_said_with_what_it_would_take(memmlp: Memmlp, runs: Runs):
+    write(ARMS, smallest={"MPJPE": 0.01})
+    out = memmlp(*SWEEP, "--max-seeds", "5").out
+    assert looked() == [(3, ["same", "worse"]), (5, ["same"])]
+    assert re.search(r"open of 'same', if its effects are as measured: 2 would take about \d+ seeds", out)
+    assert "all verdicts are decided" not in out
+
+
+def test_failed_runs_are_late_and_made_up_for(memmlp: Memmlp, runs: Runs):
+    runs.failing = {"worse"}
+    ran = memmlp(*SWEEP)
+    assert ran.code == 1
+    assert "again with: --retry" in ran.err
+    assert "all verdicts are decided" not in ran.out
+    assert [labels for _, labels in looked()] == [["same"]] * len(looked())
+    runs.failing = set()
+    assert memmlp(*SWEEP).code == 1
+    assert memmlp(*SWEEP, "--retry").code == 0
+    assert looked()[-1] == (3, ["worse"])
+
+
+def test_the_first_failure_may_end_it(memmlp: Memmlp, runs: Runs):
+    runs.failing = {"worse"}
+    assert memmlp(*SWEEP, "--fail-fast").code == 1
+    assert not Path("outputs/sweeps/trial/rounds.json").exists()
+
+
+def test_status_and_dry_run_say_the_schedule(memmlp: Memmlp, runs: Runs):
+    out = memmlp(*SWEEP, "--dry-run", "--max-seeds", "5", "--workers", "2").out
+    assert "looks at 3 (1.7 %), 5 (3.3 %) seeds; together they spend 5 %" in out
+    assert "9 of 9 runs to do, 2 at once" in out
+    assert re.search(r"^same +0 +0 +3 +look at 3$", out, re.M)
+    assert not runs.made
+    runs.patience = 10
+    memmlp(*SWEEP)
+    out = memmlp(*SWEEP, "--status").out
+    assert re.search(r"^same +0 +2 +5 +look at 5$", out, re.M)
+    assert len(runs.made) == 10
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["sweep", "trial.yaml", "--max-seeds", "5"], "--max-seeds: goes with --until-decided"),
+        ([*SWEEP, "--max-seeds", "2"], "--max-seeds 2: allowed is at least 3"),
+        ([*SWEEP, "seed=0,1"], "seed=0,1: not with --until-decided"),
+    ],
+)
+def test_bad_combinations_are_one_line(memmlp: Memmlp, runs: Runs, words: list[str], line: str):
+    assert one_line(memmlp(*words), line)

@@ -1,0 +1,44 @@
+"""Rounds of seeds under a SIGKILL: started again, they end with every run made once."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import yaml
+from command_line import MAIN, TINY, run, run_apart
+
+from memmlp.runs import list_runs
+
+WORDS = ["sweep", "trial.yaml", *TINY, "data.synth.minutes=1", "data.split.test=0.5", "executor=debug"]
+
+
+def test_rounds_go_on_after_a_kill(tmp_path: Path):
+    """Of two arms that are the same, which three seeds show."""
+    content = {"metrics": ["MPJPE"], "arms": {"one": ["memory=none"], "other": ["memory=none"]}}
+    (tmp_path / "trial.yaml").write_text(yaml.safe_dump(content))
+    line = [*MAIN, *WORDS, "--until-decided"]
+    killed = subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.DEVNULL, start_new_session=True)
+    deadline = time.monotonic() + 120
+    while not any(one.done for one in list_runs(tmp_path / "outputs")):
+        assert killed.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    os.killpg(killed.pid, signal.SIGKILL)
+    killed.wait()
+    assert not list(tmp_path.glob("outputs/sweeps/*/rounds.json"))
+    said = run_apart(tmp_path, *WORDS, "--until-decided")
+    assert "all verdicts are decided" in said
+    runs = list_runs(tmp_path / "outputs")
+    assert len(runs) == 3
+    assert all(one.done for one in runs)
+    path = next(tmp_path.glob("outputs/sweeps/*/rounds.json"))
+    (look,) = json.loads(path.read_text())["taken"]
+    assert {finding["verdict"] for finding in look["found"]} == {"equivalent"}
+    before = [one.marker.stat().st_mtime_ns for one in runs]
+    assert "3 of 3 runs done" in run(tmp_path, *WORDS, "--until-decided")
+    assert [one.marker.stat().st_mtime_ns for one in runs] == before
