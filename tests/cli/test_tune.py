@@ -138,7 +138,7 @@ def test_a_search_is_named_after_what_its_trials_follow_from(tmp_path: Path):
     """When a run is validated changes no run, but which trials are pruned."""
     names = {
         prepared([*TINY, *words], None, tmp_path).folder.name
-        for words in ([], ["search.seeds=2"], ["optim.validate_every=3"], ["optim.lr=0.1"])
+        for words in ([], ["search.seeds=2"], ["optim.validate_every=11"], ["optim.lr=0.1"])
     }
     assert len(names) == 4
     assert prepared([*TINY, "search.n_trials=7"], None, tmp_path).folder.name in names
