@@ -211,6 +211,7 @@ def test_other_synthetic_motion_is_another_identity():
 
 def test_a_compiled_training_is_another():
     """Of which no result is made here: compiling takes half a minute."""
+
     def identity(*overrides: str) -> str:
         return pipeline.motion_identity(build_experiment(composed([*BASE, *overrides])), "data").id
 
