@@ -35,7 +35,7 @@ NEUTRAL = (
 """Config keys that change no result of any stage."""
 
 PATHS = ("_target_", "_partial_")
-"""Where a component's class lies; its `name` says what it is."""
+"""Where a component's class lies; the `name` of one of this package says what it is."""
 
 EVALUATION = ("evaluation",)
 DEPLOYMENT = ("export",)
@@ -106,7 +106,8 @@ def evaluation_settings(config: Mapping[str, Any], mode: str) -> dict[str, Any]:
     groups = ((config.get("data") or {}).get("split") or {}).get(
         "groups"
     )  # its rows say who belongs together
-    return {"mode": mode, **solver, **_inference(config), **({"groups": groups} if groups else {})}
+    drawn = {"batch": group.get("batch")} if _inference(config).get("memory.blend") == "sampled" else {}
+    return {"mode": mode, **solver, **_inference(config), **({"groups": groups} if groups else {}), **drawn}
 
 
 def deployment_id(config: Mapping[str, Any]) -> str:
@@ -148,7 +149,7 @@ def trained_by(config: Mapping[str, Any]) -> dict[str, Any]:
     later = (*EVALUATION, *DEPLOYMENT, *(() if _rolls_out(config) else INFERENCE))
     out = (*NEUTRAL, *later, *_unused(config))
     flat = {key: _canonical(value) for key, value in flatten(config).items() if value is not None}
-    counting = {key: flat[key] for key in flat if not _below(key, out) and _leaf(key) not in PATHS}
+    counting = {key: flat[key] for key in flat if not _below(key, out) and not _is_path(key, flat[key])}
     return counting | _draws(config)
 
 
@@ -190,8 +191,9 @@ def _below(key: str, names: Iterable[str]) -> bool:
     return any(key == name or key.startswith(f"{name}.") for name in names)
 
 
-def _leaf(key: str) -> str:
-    return key.rsplit(".", 1)[-1]
+def _is_path(key: str, value: Any) -> bool:
+    """Whether a key says where a class of this package lies. A foreign one is known by its path alone."""
+    return key.rsplit(".", 1)[-1] in PATHS and (value is True or str(value).startswith("memmlp."))
 
 
 def _digest(what: Mapping[str, Any]) -> str:

@@ -322,6 +322,7 @@ def train_run(
     """Train one network, and mark its run as done."""
     begin(experiment, run, motion_identity(experiment, manifest.digest), experiment.config)
     run.write_manifest({"body": manifest.body})
+    run.clear_stages()
     started = time.monotonic()
     model = trained(experiment, run, cache, manifest, upstream, watch)
     checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
@@ -336,6 +337,7 @@ def evaluate_run(experiment: Experiment, run: Run, cache: Path, modes: Sequence[
     model = experiment.architecture.load(run).to(experiment.device)
     test = Frames.open(cache, "test").to(experiment.device)
     for mode in modes:
+        torch.manual_seed(experiment.seed)  # for a blend that is sampled: alike in whatever order
         found = evaluation.evaluate(model, test, [mode], experiment.evaluation_batch, experiment.ik)
         rows = [{key: row[key] for key in ("name", "group", "frames")} | row[mode] for row in found["clips"]]
         report = {"mode": mode, "settings": evaluation_settings(experiment.config, mode)}

@@ -105,20 +105,22 @@ class Run:
     """
 
     FILES = (
-        "config.yaml",
-        "manifest.json",
-        "code.patch",
-        "metrics.jsonl",
+        "deployments/*/latency.json",
+        "deployments/*/step.onnx",
+        "deployments/*/step.int8.onnx",
+        "evaluations/*.json",
         "checkpoint.safetensors",
         "model.safetensors",
         "results.json",
+        "metrics.jsonl",
         "poses.png",
         "FAILED",
-        "evaluations/*.json",
-        "deployments/*/step.onnx",
-        "deployments/*/step.int8.onnx",
-        "deployments/*/latency.json",
+        "code.patch",
+        "config.yaml",
+        "manifest.json",
     )
+    """A run's own files, in the order in which a reset removes them: results before what they are of."""
+    STAGES = FILES[:4]
 
     def __init__(self, folder: Path | str):
         self.folder = Path(folder)
@@ -387,7 +389,14 @@ class Run:
             return
         self.marker.unlink(missing_ok=True)
         sync_folder(self.folder)
-        for name in (*self.FILES, self.marker.name):
+        self._remove((*self.FILES, self.marker.name))
+
+    def clear_stages(self) -> None:
+        """Remove what was made of earlier weights."""
+        self._remove(self.STAGES)
+
+    def _remove(self, names: Iterable[str]) -> None:
+        for name in names:
             temporary = str(Path(name).with_name(f".{Path(name).name}.*.tmp"))
             for path in (*self.folder.glob(name), *self.folder.glob(temporary)):
                 path.unlink(missing_ok=True)

@@ -54,7 +54,7 @@ from memmlp.recipes import RECIPES
 from memmlp.rollout import OwnPredictions, PersistentStreams, Rollout, TeacherForcing
 from memmlp.session import OnnxStream
 from memmlp.streaming import streaming
-from memmlp.training import MotionTask, Optim, VQVAETask, seed_step, train_step
+from memmlp.training import MotionTask, Optim, VQVAETask, seed_step, train_step, vqvae_optim
 from memmlp.vqvae import VQVAE
 
 PATH = Path(__file__).with_name("golden.json")
@@ -128,7 +128,7 @@ def vqvae(codebook: str = "ema") -> Numbers:
     """Three steps of its training, and what it then makes of frames."""
     torch.manual_seed(3)
     model = VQVAE(codes=8, width=12, encoder_depth=2, codebook=codebook)
-    optim = Optim(steps=3, batch=16, lr=1e-3, schedule="milestones", decoupled=False)
+    optim = vqvae_optim(3, 16, 1e-3, 0.1)
     task = VQVAETask(model, tiny.frame(), frames(), frames(), optim, seed=0)
     return _trained(task, optim) | task.validate()
 

@@ -15,7 +15,7 @@ from memmlp.cli.results import sources
 from memmlp.errors import InputError
 from memmlp.results.claims import NEVER, WORDS, claims
 from memmlp.results.pages import Source, pages
-from memmlp.results.store import Kept, dumps, load_kept, save, without_paths
+from memmlp.results.store import Kept, dumps, load_kept, overrides_of, save, without_paths
 from memmlp.statistics import Verdict, holm, paired_effects
 from memmlp.sweep.spec import Sweep, load_sweep
 from memmlp.tables.collect import collect
@@ -33,7 +33,7 @@ def sweep() -> Sweep:
 @pytest.fixture
 def kept(sweep: Sweep, tmp_path: Path) -> Kept:
     find = fake_sweep(tmp_path, sweep, {"2": 1.1, "2, 4": 1.03}, groups=GROUPS)
-    return Kept("table14", ("data=mocap",), runs_of(sweep, find))
+    return Kept("table14", ("data=mocap",), runs_of(sweep, find), overrides_of(sweep))
 
 
 def source(sweep: Sweep, kept: Kept) -> Source:
@@ -228,6 +228,16 @@ def by_hand(content: dict, row, table, mode: str, metric: str) -> tuple[float, f
     return float(effects.low[0]), float(effects.high[0])
 
 
+def test_results_of_an_arm_that_was_another_are_refused(sweep: Sweep, kept: Kept):
+    """Its numbers would stand under a name that means something else now."""
+    arms = [replace(arm, overrides=("memory=gru",)) if arm.label == "2" else arm for arm in sweep.arms]
+    other = replace(sweep, arms=tuple(arms))
+    with pytest.raises(InputError, match="arm '2' was made with the overrides"):
+        kept.of(other)
+    with pytest.raises(InputError, match="arm '2' was made with the overrides"):
+        kept.merged(replace(kept, arms=overrides_of(other)))
+
+
 def test_prose_claims_nothing_by_hand():
     for path in (ROOT / "README.md", *(DOCS / "templates").glob("*.md")):
         assert claims(path.read_text(encoding="utf-8")) == [], path
@@ -245,4 +255,4 @@ def test_by_hand_is_what_a_page_has(sweep: Sweep, kept: Kept):
 
 
 def test_nothing_to_keep(sweep: Sweep):
-    assert Kept("table14", (), runs_of(sweep, nothing)).every == []
+    assert Kept("table14", (), runs_of(sweep, nothing), {}).every == []

@@ -71,8 +71,11 @@ def test_what_a_run_is_does_not_move_with_recipes(monkeypatch: pytest.MonkeyPatc
 
 
 def test_where_a_class_lies_does_not_count():
-    here, there = ({**CONFIG, "memory": {"name": "gru", "_target_": path}} for path in ("a.B", "c.d.B"))
-    assert identity(here) == identity(there)
+    def of(path: str) -> str:
+        return identity({**CONFIG, "memory": {"name": "gru", "_target_": path}})
+
+    assert of("memmlp.a.B") == of("memmlp.c.d.B")
+    assert len({of("memmlp.a.B"), of("mine.B"), of("theirs.B")}) == 3  # a name alone tells no foreign class
 
 
 def test_stages_have_identities_of_what_changes_them_alone():
@@ -232,6 +235,31 @@ def test_reset_removes_the_runs_files_and_no_others(tmp_path: Path):
     run.reset()
     assert [path.name for path in run.folder.iterdir()] == ["notes.txt"]
     assert not run.done
+
+
+def test_a_reset_that_is_cut_short_leaves_no_results_of_what_is_gone(tmp_path: Path, monkeypatch):
+    """Whatever the moment: weights, checkpoint and evaluations go before what they are of."""
+    run = begun(tmp_path)
+    for name in Run.FILES:
+        path = run.folder / name.replace("*", "0")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("{}")
+    unlink, left = Path.unlink, []
+
+    def spy(path: Path, missing_ok: bool = False) -> None:
+        unlink(path, missing_ok=missing_ok)
+        results = [
+            run.checkpoint,
+            run.model,
+            *run.folder.glob("evaluations/*"),
+            *run.folder.glob("deployments/*/*"),
+        ]
+        left.append((run.manifest_path.exists(), any(one.exists() for one in results)))
+
+    monkeypatch.setattr(Path, "unlink", spy)
+    run.reset()
+    assert (False, True) not in left
+    assert left[-1] == (False, False)
 
 
 def test_reset_removes_the_marker_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -197,7 +197,14 @@ def test_another_branch_and_what_has_one_head(sweep: Sweep, tmp_path: Path):
         sum("no other branch, so the row shows rotation: 'no | memory'" in flag for flag in table.flags) == 1
     )
     lines = " ".join(printed(table, 100).split())
-    assert "combined; 'no | memory' rotation, 'by position' position (the text says so)" in lines
+    assert "combined; 'no | memory' rotation, 'by position' position" in lines
+    assert "the text says so" not in lines  # the paper's values are of another branch
+    assert cell(table, "full_model", "MPJPE").paper is None
+    assert {row.cells["stream"]["MPJPE"].effect.verdict for row in table.rows[1:3]} <= {
+        "higher",
+        "lower",
+        "open",
+    }
     run = runs_of(source, find)["full_model"][0]
     assert cell(table, "full_model", "MPJPE").values[0] == run.value("stream", "combined", "MPJPE")
 
@@ -344,7 +351,22 @@ def test_runs_of_different_origin_are_flagged(
 
 
 def test_equal_origins_are_not_flagged(table: Table):
-    assert table.flags == ()
+    assert [flag for flag in table.flags if "a group of its own" not in flag] == []
+
+
+def test_arms_that_are_one_run_are_not_compared(sweep: Sweep, tmp_path: Path):
+    """They would be equivalent with certainty, whatever the paper says of them."""
+    runs = {seed: fake_run(tmp_path, "one", seed) for seed in sweep.seeds}
+    table = table_of(sweep, lambda arm, seed: runs[seed])
+    assert cell(table, "no | memory", "MPJPE").effect is None
+    assert any("'no | memory' and 'full_model' are one run" in flag for flag in table.flags)
+    assert cell(table, "by position", "MPJPE").effect is not None  # another branch of it
+
+
+def test_a_comparison_of_one_seed_among_others_of_more_is_said(sweep: Sweep, tmp_path: Path):
+    find = fake_sweep(tmp_path, sweep)
+    table = table_of(sweep, lambda arm, seed: find(arm, seed) if seed == 0 or "no" not in arm.label else None)
+    assert sum(flag.startswith("one seed, so that") and "'no | memory'" in flag for flag in table.flags) == 1
 
 
 def test_recipes_of_what_only_some_arms_have_do_not_differ(sweep: Sweep, tmp_path: Path):

@@ -29,7 +29,7 @@ from memmlp.memory import Memory
 from memmlp.model import WindowModel
 from memmlp.runs import Run
 from memmlp.tracking import Tracker
-from memmlp.training import Optim
+from memmlp.training import Optim, vqvae_optim
 from memmlp.vqvae import VQVAE
 
 COORDINATES: dict[str, type[World]] = {"head_relative": HeadRelative, "world": World, "heading": Heading}
@@ -135,20 +135,10 @@ def build_ik(cfg: DictConfig) -> IK:
 
 
 def build_vqvae_optim(cfg: DictConfig, frames: int) -> Optim:
-    """Adam as App. A has it; an epoch is as many frames as there are in training."""
-    steps = cfg.vqvae.steps or math.ceil(cfg.vqvae.epochs * frames / cfg.vqvae.batch)
-    return Optim(
-        steps=steps,
-        batch=cfg.vqvae.batch,
-        lr=cfg.vqvae.lr,
-        schedule="milestones",
-        weight_decay=cfg.vqvae.weight_decay,
-        betas=(0.9, 0.99),
-        decoupled=False,
-        checkpoint_every=cfg.optim.checkpoint_every,
-        validate_every=steps,
-        log_every=cfg.optim.log_every,
-    )
+    """The VQ-VAE's training; an epoch is as many frames as there are in the training split."""
+    own, often = cfg.vqvae, {name: cfg.optim[name] for name in ("checkpoint_every", "log_every")}
+    steps = own.steps or math.ceil(own.epochs * frames / own.batch)
+    return vqvae_optim(steps, own.batch, own.lr, own.weight_decay, **often)
 
 
 def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ from memmlp.errors import InputError
 if TYPE_CHECKING:
     from memmlp.results.pages import Source
     from memmlp.results.store import Kept
+    from memmlp.tables.table import Table
 
 FOLDER = Path("docs/results")
 PROSE = Path("README.md")
@@ -42,16 +44,22 @@ def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | N
 
     SWEEP and OVERRIDES are those of `memmlp sweep`. What the file has of other arms and seeds stays.
     """
-    from memmlp.cli.plan import find_sweep, planned
+    from memmlp.cli.plan import find_sweep
+    from memmlp.cli.rounds import shown
     from memmlp.cli.table import finder
-    from memmlp.results.store import Kept, load_kept, save, without_paths
+    from memmlp.files import plain
+    from memmlp.results.store import Kept, load_kept, overrides_of, save, without_paths
     from memmlp.tables.collect import finished
     from memmlp.tables.measured import load
+    from memmlp.tables.rounds import as_json
 
     sweep = find_sweep(name).with_overrides(overrides)
-    found = finished(sweep, finder(planned(sweep, outputs.absolute()), functools.cache(load)))
+    known = shown(sweep, overrides, outputs.absolute())
+    found = finished(known.sweep, finder(known.plan, functools.cache(load)))
     words = tuple(word for word in overrides if not word.startswith("seed="))
-    kept = Kept(name if "/" in name else sweep.name, without_paths(words), found)
+    rounds = plain(as_json(known.rounds)) if known.rounds else None
+    source = name if "/" in name else sweep.name
+    kept = Kept(source, without_paths(words), found, overrides_of(sweep), rounds)
     if not kept.every:
         raise InputError(f"sweep {name}: no finished run to keep; make them with: {kept.command}")
     path = out / f"{stem or sweep.name}.json"
@@ -104,14 +112,30 @@ def sources(folder: Path) -> dict[str, Source]:
     return found
 
 
-def _table(kept: Kept):
+def _table(kept: Kept) -> Table:
     """The table that kept results come to, of the seeds that any of them has."""
     from memmlp.cli.plan import find_sweep
     from memmlp.tables.collect import collect
+    from memmlp.tables.rounds import of_json
 
-    seeds = sorted({seed for runs in kept.runs.values() for seed in runs})
-    sweep = find_sweep(kept.sweep).with_overrides([f"seed={','.join(map(str, seeds))}"])
-    return collect(sweep, kept.of(sweep), command=kept.command)
+    sweep = find_sweep(kept.sweep)
+    if kept.rounds:
+        rounds = of_json(kept.rounds)
+        spent = rounds.spent(sweep)
+        table = collect(spent, kept.of(spent), command=f"{kept.command} --until-decided", rounds=rounds)
+    else:
+        seeds = sorted({seed for runs in kept.runs.values() for seed in runs})
+        sweep = sweep.with_overrides([f"seed={','.join(map(str, seeds))}"])
+        table = collect(sweep, kept.of(sweep), command=kept.command)
+    return replace(table, flags=(*table.flags, *_outdated(kept)))
+
+
+def _outdated(kept: Kept) -> list[str]:
+    """The line about kept runs whose components have other recipe numbers now."""
+    from memmlp.recipes import outdated
+
+    found = sorted({words for run in kept.every for words in outdated(run.origin.recipes)})
+    return [f"made by an earlier recipe: {', '.join(found)}"] if found else []
 
 
 def _merged(path: Path, before: Kept, kept: Kept) -> Kept:

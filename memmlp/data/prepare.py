@@ -28,6 +28,7 @@ from memmlp.data.clip import Clip, read_clip, resample
 from memmlp.data.splits import PARTS, Split, group_names
 from memmlp.errors import InputError
 from memmlp.progress import track
+from memmlp.recipes import RECIPES
 
 FORMAT = 2  # of the cache; a new number makes every cache anew
 FRAMES = 1  # of what a frame holds; a new number changes every digest, and so makes every run anew
@@ -368,7 +369,8 @@ def _digest(clips: Sequence[ClipRecord], rest: np.ndarray, min_frames: int) -> s
 def _request(source: Source, rest: np.ndarray) -> str:
     """Digest of settings and sources by path, size and time: no source is opened."""
     files = [(file, *_stamp(source.root / file)) for file in _sources(source.root)]
-    return _hash([FORMAT, source.min_frames, rest.tolist(), source.split.describe(), files])
+    code = [FORMAT, FRAMES, RECIPES["features"]]
+    return _hash([*code, source.min_frames, rest.tolist(), source.split.describe(), files])
 
 
 def _stamp(path: Path) -> tuple[int, int]:

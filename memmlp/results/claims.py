@@ -22,8 +22,11 @@ from memmlp.units import UNITS
 WORDS = (
     "lose", "loses", "raise", "raises", "raised", "lower", "lowers", "lowered", "higher", "better", "best",
     "worse", "worst", "smoother", "rougher", "improve", "improves", "improved", "reduces", "reduced",
-    "increases", "increased", "doubles", "halves", "help", "helps", "hurts", "gains", "holds", "opposite",
-    "equivalent",
+    "increases", "increased", "increase", "reduce", "doubles", "halves", "help", "helps", "hurts", "gain",
+    "gains", "holds", "opposite", "equivalent", "drop", "drops", "dropped", "fall", "falls", "fell", "rise",
+    "rises", "rose", "grow", "grows", "grew", "cut", "cuts", "decrease", "decreases", "decreased", "smaller",
+    "smallest", "larger", "largest", "greater", "greatest", "shrinks", "halved", "doubled", "improvement",
+    "reduction", "brings",
 )  # fmt: skip
 NEVER = ("significant", "significantly", "beat", "beats", "lose against", "loses against", "outperforms")
 

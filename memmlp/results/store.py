@@ -34,11 +34,15 @@ class Kept:
     Attributes:
         sweep: its name, as the commands take it. overrides: those of the command line.
         runs: the finished runs by the arm's label and the seed.
+        arms: the overrides of each arm that the runs were made with.
+        rounds: of seeds that were spent in rounds, as JSON holds them; None where they were not.
     """
 
     sweep: str
     overrides: tuple[str, ...]
     runs: Mapping[str, Runs]
+    arms: Mapping[str, tuple[str, ...]]
+    rounds: Mapping[str, Any] | None = None
 
     @property
     def command(self) -> str:
@@ -58,12 +62,21 @@ class Kept:
         """
         if (self.sweep, self.overrides) != (other.sweep, other.overrides):
             raise InputError(f"holds the results of '{self.command}', not of '{other.command}'")
+        self.check(other.arms)
         labels = dict.fromkeys([*self.runs, *other.runs])
         runs = {label: {**self.runs.get(label, {}), **other.runs.get(label, {})} for label in labels}
-        return replace(self, runs=runs)
+        return replace(self, runs=runs, arms={**self.arms, **other.arms}, rounds=other.rounds)
+
+    def check(self, arms: Mapping[str, tuple[str, ...]]) -> None:
+        """Raise InputError where an arm has other overrides: the runs are of another arm of that name."""
+        for label, words in arms.items():
+            if label in self.arms and self.arms[label] != words:
+                before, now = ", ".join(self.arms[label]) or "none", ", ".join(words) or "none"
+                raise InputError(f"arm '{label}' was made with the overrides {before}, and has {now}")
 
     def of(self, sweep: Sweep) -> dict[str, Runs]:
-        """The runs of the arms and seeds that the sweep has today."""
+        """The runs of the arms and seeds that the sweep has today. Raises InputError as `check` does."""
+        self.check(overrides_of(sweep))
         return {
             arm.label: {
                 seed: run
@@ -72,6 +85,12 @@ class Kept:
             }
             for arm in sweep.runnable()
         }
+
+
+def overrides_of(sweep: Sweep) -> dict[str, tuple[str, ...]]:
+    """The overrides that the file of a sweep gives each arm, its base's among them."""
+    bare = replace(sweep, extra=())
+    return {arm.label: without_paths(bare.overrides(arm)) for arm in sweep.runnable()}
 
 
 def without_paths(overrides: Iterable[str]) -> tuple[str, ...]:
@@ -95,6 +114,8 @@ def dumps(kept: Kept) -> str:
         "sweep": kept.sweep,
         "overrides": list(kept.overrides),
         "command": kept.command,
+        "arms": {label: list(words) for label, words in sorted(kept.arms.items())},
+        "rounds": kept.rounds,
         "clips": dict(sorted(clips.items())),
         "cells": {
             label: {str(seed): runs[seed].id for seed in sorted(runs)}
@@ -119,7 +140,8 @@ def load_kept(path: Path) -> Kept:
             label: {int(seed): measured[name] for seed, name in seeds.items()}
             for label, seeds in content["cells"].items()
         }
-        return Kept(content["sweep"], tuple(content["overrides"]), cells)
+        arms = {label: tuple(words) for label, words in content["arms"].items()}
+        return Kept(content["sweep"], tuple(content["overrides"]), cells, arms, content["rounds"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: no file of results ({error}); make it with memmlp results save") from None
 

@@ -105,11 +105,15 @@ class Sweep:
     def with_branch(self, branch: str) -> Sweep:
         """The same sweep, its arms showing another branch; an arm whose file gives it its own keeps it.
 
-        Raises InputError for a branch that there is none of.
+        The paper's values are another branch's then, and left out. Raises InputError for a branch that there
+        is none of.
         """
         name = _branch(branch, "branch")
-        arms = tuple(arm if arm.fixed else replace(arm, branch=name) for arm in self.arms)
-        return replace(self, arms=arms)
+        arms = tuple(
+            arm if arm.fixed or arm.branch == name else replace(arm, branch=name, paper={})
+            for arm in self.arms
+        )
+        return self if arms == self.arms else replace(self, arms=arms, branch_source=None)
 
     def control(self, arm: Arm) -> str | None:
         """The label of the arm that one is compared with; None for the reference without a control."""

@@ -45,6 +45,8 @@ def paired(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dict
     found = {}
     for arm, other in _compared(sweep):
         ours, theirs = runs[arm.label], runs[other.label]
+        if one_and_the_same(arm, other, ours, theirs):
+            continue
         shared = _shared(ours, theirs)
         for mode, metric in itertools.product(modes, sweep.metrics):
             if metric not in COSTS:
@@ -62,6 +64,12 @@ def effects(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dic
     return _costs(sweep, runs, modes) | _judged(
         tested(paired(sweep, runs, modes), sweep.smallest), sweep.smallest, printed
     )
+
+
+def one_and_the_same(arm: Arm, other: Arm, ours: Runs, theirs: Runs) -> bool:
+    """Whether two arms show the same branch of the same runs, so that there is nothing to compare."""
+    same = any(ours[seed].id == theirs[seed].id for seed in ours.keys() & theirs.keys())
+    return same and arm.branch == other.branch
 
 
 def _compared(sweep: Sweep) -> Iterator[tuple[Arm, Arm]]:

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from memmlp.sweep.spec import COSTS, Arm, Sweep
-from memmlp.tables.effects import Runs, control
+from memmlp.tables.effects import Runs, control, one_and_the_same
 from memmlp.tables.measured import Measured
 
 Say = Callable[[Arm, int], str | None]
@@ -36,6 +36,7 @@ def flags(
     yield from _missing(sweep, runs, command, state)
     yield from _older(sweep, runs, older)
     yield from _branches(sweep, asked, runs, command)
+    yield from _same(sweep, runs)
     yield from _unequal_clips(sweep, runs)
     for attribute, what in ORIGIN.items():
         yield from _differing(what, [(getattr(run.origin, attribute), label) for label, run in every])
@@ -130,12 +131,33 @@ def _replicates(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
         return
     if max(map(len, measured.values())) == 1:
         yield "one seed an arm: the intervals speak of other clips, not of other seeds; nothing is starred"
+    yield from _single(sweep, runs)
     groups = [len({run.group(clip) for clip in run.clips}) for found in measured.values() for run in found]
+    clips = [len(run.clips) for found in measured.values() for run in found]
+    if groups == clips and max(groups) > 1:
+        yield "each test clip is a group of its own (data.split.groups): right where none share a person"
     if max(groups) == 1:
         yield "one group of test clips: the intervals speak of other seeds, not of other takes or people"
     shared = [label for label, found in measured.items() if _one_vqvae(found)]
     if shared:
         yield f"all seeds share one VQ-VAE, which they so do not replicate: {_quoted(shared)}"
+
+
+def _same(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+    """Arms that are one run: what tells them apart has no effect under these overrides."""
+    for arm in sweep.runnable():
+        other = control(sweep, arm)
+        if other and one_and_the_same(arm, other, runs[arm.label], runs[other.label]):
+            yield f"'{arm.label}' and '{other.label}' are one run: what tells them apart has no effect here"
+
+
+def _single(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+    """Comparisons of one seed, where others have more."""
+    pairs = [(arm.label, other.label) for arm in sweep.runnable() if (other := control(sweep, arm))]
+    shared = {one: len(runs[one].keys() & runs[two].keys()) for one, two in pairs}
+    few = [label for label, number in shared.items() if number == 1]
+    if few and max(shared.values()) > 1:
+        yield f"one seed, so that the interval speaks of other clips alone, and no star: {_quoted(few)}"
 
 
 def _one_vqvae(found: Sequence[Measured]) -> bool:

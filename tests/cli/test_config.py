@@ -112,6 +112,18 @@ def test_ignored_keys_are_keys_of_the_config():
         assert any(key == ignored or key.startswith(f"{ignored}.") for key in keys), ignored
 
 
+def test_a_foreign_class_has_a_name_of_its_own(tmp_path: Path):
+    (tmp_path / "predictor").mkdir()
+    for name, refused in (("two_branch", True), ("mine", False)):
+        (tmp_path / "predictor/mine.yaml").write_text(f"{{name: {name}, _target_: mine.Mine, depth: 2}}")
+        words = ["--config-dir", str(tmp_path), "predictor=mine"]
+        if refused:
+            with pytest.raises(InputError, match=r"predictor\.name=two_branch: allowed for mine\.Mine"):
+                composed(words)
+        else:
+            assert composed(words).predictor.name == "mine"
+
+
 def test_the_last_of_several_choices_wins():
     assert composed(["memory=vq", "seed=1", "memory=none", "seed=2"]).seed == 2
     assert composed(["memory=vq", "memory=none"]).memory._target_ == "memmlp.memory.NoMemory"

@@ -11,7 +11,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from memmlp.cli.schema.config import Config
+from memmlp.cli.schema.config import SCHEMAS, Config
 from memmlp.cli.schema.network import Reference
 from memmlp.cli.schema.training import AGRoLLoss, NoHand, ReferenceLoss, TeacherForcing
 from memmlp.errors import InputError
@@ -69,8 +69,21 @@ def _show(value: Any) -> str:
     return str(list(value)) if OmegaConf.is_list(value) else str(value)
 
 
+SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "tracker")
+
+
+def _check_names(cfg: DictConfig) -> None:
+    """A component that is not of this package has a name that is not of this package's."""
+    for slot in SLOTS:
+        node = cfg[slot]
+        path = node.get("_target_") if node is not None else None
+        if path and not path.startswith("memmlp.") and f"{slot}_{node.name}" in SCHEMAS:
+            raise InputError(f"{slot}.name={node.name}: allowed for {path} is a name of its own")
+
+
 def _check_combinations(cfg: DictConfig) -> None:
     """What no key alone can tell."""
+    _check_names(cfg)
     if cfg.optim.final_lr > cfg.optim.lr:
         raise InputError(f"optim.final_lr={cfg.optim.final_lr}: allowed is at most optim.lr={cfg.optim.lr}")
     if _is(cfg.model, Reference):
