@@ -30,6 +30,8 @@ from memmlp.identity import flatten, used_as_configured
 HEARTBEAT = 5.0  # seconds between signs of life of a run's process
 STALE = 60.0  # seconds without one after which a process on another machine counts as dead
 
+MACHINE = ("device", "gpu", "threads", "precision", "cpu")  # what can change a result's last digits
+
 ID = re.compile(r"[0-9a-f]{16}")
 
 
@@ -265,10 +267,12 @@ class Run:
         atomic_write(self.config_path, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
         if patch := changes():
             atomic_write(self.folder / "code.patch", patch)
-        identity = {"id": self.id, "kind": kind, "data": data, "upstream": upstream, **facts}
+        identity = {"id": self.id, "kind": kind, "data": data, "upstream": upstream}
+        before = self.manifest if self.checkpoint.exists() else {}
+        made = joined(before, {**facts, **environment(), "sources": sources()})
         self.attempt("training")
         times = {"started": self.manifest.get("started", now()), "finished": None}
-        self.write_manifest(identity | times | environment() | {"sources": sources()})
+        self.write_manifest(identity | times | made)
 
     def attempt(self, stage: str) -> None:
         """Note that a process is at a stage of the run."""
@@ -404,6 +408,26 @@ class Run:
             with contextlib.suppress(OSError):  # there is none, or there are files of the user's
                 folder.rmdir()
         sync_folder(self.folder)
+
+
+def joined(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+    """What a training was made on and by that was resumed: where the two differ, both.
+
+    A file whose code changed in between has no digest that any code has.
+    """
+    found = dict(after)
+    for key in MACHINE:
+        words = [before[key]] if key in before and before[key] != after.get(key) else []
+        found[key] = ", ".join(map(str, [*words, after[key]])) if words else after.get(key)
+    old, new = before.get("git"), after.get("git")
+    if old and new:
+        other = old.get("before") or (old["commit"] if old["commit"] != new["commit"] else None)
+        found["git"] = {**new, "dirty": old["dirty"] or new["dirty"]} | ({"before": other} if other else {})
+    known = before.get("sources", after["sources"])
+    found["sources"] = {
+        name: digest if known.get(name) == digest else "mixed" for name, digest in after["sources"].items()
+    }
+    return found
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:

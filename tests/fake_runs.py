@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from memmlp.runs import Run, write_report
+from memmlp.runs import Run
 from memmlp.sweep.spec import Arm, Sweep
 from memmlp.tables.collect import MODES, collect, finished
 from memmlp.tables.effects import Runs
@@ -39,6 +39,7 @@ def fake_run(
     clips: Sequence[str] = CLIPS,
     branches: Sequence[str] = ("rotation", "position", "combined"),
     origin: Mapping[str, Any] | None = None,
+    evaluated: Mapping[str, Any] | None = None,
     config: Mapping[str, Any] | None = None,
     log: bool = False,
     groups: Mapping[str, str] | None = None,
@@ -69,8 +70,10 @@ def fake_run(
             {key: row[key] for key in ("name", "frames", "group") if key in row} | row[mode] for row in rows
         ]
         mean = _means([row[mode] for row in rows])
-        report = {"mode": mode, "settings": {}, "mean": mean, "clips": clips_of_mode}
-        write_report(run.evaluation(f"{mode}-0"), report)
+        report = {"mode": mode, "settings": {}, "mean": mean, "clips": clips_of_mode, "made_by": manifest}
+        path = run.evaluation(f"{mode}-0")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(report | {"made": "2026"} | (evaluated or {})))
     if log:
         _log(run, factor)
     return run

@@ -237,6 +237,26 @@ def test_reset_removes_the_runs_files_and_no_others(tmp_path: Path):
     assert not run.done
 
 
+def test_a_training_that_is_resumed_elsewhere_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Its weights are of both machines and of both codes."""
+    run = Run.of(tmp_path, "0" * 16)
+
+    def begin(device: str, commit: str, dirty: bool, losses: str) -> dict:
+        made = {"git": {"commit": commit, "dirty": dirty}, "cpu": "A"}
+        monkeypatch.setattr("memmlp.runs.environment", lambda: made)
+        monkeypatch.setattr("memmlp.runs.sources", lambda: {"losses.py": losses, "ik.py": "i"})
+        run.begin("memmlp", {}, data="d", upstream=None, device=device, threads=2)
+        return run.manifest
+
+    begin("cuda:0", "a" * 40, True, "old")
+    assert begin("cpu", "b" * 40, False, "new")["device"] == "cpu"  # nothing was trained before
+    run.checkpoint.touch()
+    found = begin("cuda:0", "c" * 40, False, "newer")
+    assert (found["device"], found["threads"], found["cpu"]) == ("cpu, cuda:0", 2, "A")
+    assert found["git"] == {"commit": "c" * 40, "dirty": False, "before": "b" * 40}
+    assert run.changed_sources == ["losses.py"]
+
+
 def test_a_reset_that_is_cut_short_leaves_no_results_of_what_is_gone(tmp_path: Path, monkeypatch):
     """Whatever the moment: weights, checkpoint and evaluations go before what they are of."""
     run = begun(tmp_path)

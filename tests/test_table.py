@@ -354,6 +354,19 @@ def test_equal_origins_are_not_flagged(table: Table):
     assert [flag for flag in table.flags if "a group of its own" not in flag] == []
 
 
+def test_what_an_evaluation_ran_on_counts_too(sweep: Sweep, tmp_path: Path):
+    """Its numbers are no less a result of that than the weights."""
+    other = {"device": "cuda:0", "made_by": {**ORIGIN, "git": {"commit": "fedcba98", "dirty": True}}}
+    runs = {
+        arm.label: fake_run(tmp_path, arm.label, evaluated=other if arm.label == "by position" else None)
+        for arm in sweep.runnable()
+    }
+    said = " ".join(table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label]).flags)
+    assert "0123456, fedcba9 of 'by position'" in said
+    assert ", cuda:0 of 'by position'" in said
+    assert "uncommitted changes: 'by position'" in said
+
+
 def test_arms_that_are_one_run_are_not_compared(sweep: Sweep, tmp_path: Path):
     """They would be equivalent with certainty, whatever the paper says of them."""
     runs = {seed: fake_run(tmp_path, "one", seed) for seed in sweep.seeds}

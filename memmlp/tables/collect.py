@@ -47,7 +47,8 @@ def collect(
     """
     shown = tuple(modes) if set(sweep.metrics) - set(COSTS) else tuple(modes)[:1]
     seen = with_existing_branches(sweep, runs)
-    found = effects(seen, runs, shown)
+    every = MODES if set(sweep.metrics) - set(COSTS) else shown  # corrected over both, whichever is shown
+    found = effects(seen, runs, every)
     compared = sum(effect.p is not None for effect in found.values())
     if rounds:
         found, compared = rounds.judged(found), len(rounds.family(sweep))

@@ -47,14 +47,16 @@ def _of_metric(
 
 
 def _errors(runs: Runs, clips: list[str], mode: str, arm: Arm, metric: str) -> np.ndarray:
-    """Errors (S, C), less the clips of which a run has none."""
-    errors = np.array([run.by_clip(clips, mode, arm.branch, metric) for run in runs.values()])
-    return errors[:, ~np.isnan(errors).any(0)]
+    """Errors (S, C), NaN for a clip of which a run has none."""
+    return np.array([run.by_clip(clips, mode, arm.branch, metric) for run in runs.values()])
 
 
 def _distribution(label: str, errors: Mapping[str, np.ndarray], other: Arm | None) -> Distribution:
-    ours, theirs = errors[label], errors.get(other.label) if other else None
+    every, theirs = errors[label], errors.get(other.label) if other else None
+    known = ~np.isnan(every).any(0)
+    ours = every[:, known]
     middle = interquartile_mean(ours) if ours.size else None
-    if theirs is None or not ours.size or theirs.shape[1:] != ours.shape[1:]:
+    both = known & ~np.isnan(theirs).any(0) if theirs is not None else known
+    if theirs is None or not both.any():
         return Distribution(label, ours, middle, None)
-    return Distribution(label, ours, middle, probability_of_improvement(ours, theirs))
+    return Distribution(label, ours, middle, probability_of_improvement(every[:, both], theirs[:, both]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from memmlp.errors import InputError
 from memmlp.files import read_json
+from memmlp.identity import used_as_configured
 from memmlp.runs import Run, intact
 
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # mode -> branch -> metric -> value
@@ -111,20 +112,24 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     means: dict[str, dict[str, Any]] = {}
     clips: dict[str, dict[str, Any]] = {}
     groups: dict[str, str] = {}
-    for report in sorted(map(_read, _evaluations(run, stages)), key=lambda report: report["made"]):
+    reports = sorted(map(_read, _evaluations(run, stages)), key=lambda report: report["made"])
+    for report in reports:
         means.setdefault(report["mode"], {}).update(report["mean"])
         for clip in report["clips"]:
             clips.setdefault(clip["name"], {}).setdefault(report["mode"], {}).update(clip)
             groups |= {clip["name"]: clip["group"]} if clip.get("group") else {}
     deployed = [run.deployment(name) for name in stages or () if run.deployment(name).done] or [run.shipped]
     latency = read_json(deployed[-1].latency)
-    return Measured(run.id, means, clips, groups, _costs(latency), _origin(manifest), latency, run)
+    origin = _evaluated(_origin(manifest), reports)
+    return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run)
 
 
 def _evaluations(run: Run, stages: Sequence[str] | None) -> list[Path]:
-    """The files of some evaluations, or of all of them."""
-    wanted = [run.evaluation(name) for name in stages or ()]
-    return [path for path in wanted if path.is_file()] or sorted(run.evaluations.glob("*.json"))
+    """The files of some evaluations, or of all that use the network as the run's own config does."""
+    if wanted := [path for name in stages or () if (path := run.evaluation(name)).is_file()]:
+        return wanted
+    config, every = run.config, sorted(run.evaluations.glob("*.json"))
+    return [path for path in every if used_as_configured(read_json(path).get("settings", {}), config)]
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -157,8 +162,9 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
         return str(manifest.get(key) or UNKNOWN)
 
     git = manifest.get("git") or {}
+    before = [git["before"][:7]] if git.get("before") else []  # of a training that was resumed by other code
     return Origin(
-        code=git["commit"][:7] if git else f"version {of('version')}",
+        code=", ".join([*before, git["commit"][:7]]) if git else f"version {of('version')}",
         changed=bool(git.get("dirty")),
         data=of("data")[:8],
         hardware=of("cpu"),
@@ -171,6 +177,16 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
         recipes=manifest.get("recipes") or {},
         vqvae=manifest.get("upstream"),
     )
+
+
+def _evaluated(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Origin:
+    """The origin of a run with that of its evaluations, where they were made by or on something else."""
+    others = [_origin({**report.get("made_by", {}), **report}) for report in reports]
+    found: dict[str, Any] = {"changed": origin.changed or any(other.changed for other in others)}
+    for name in ("code", "hardware", "device", "gpu", "threads", "torch"):
+        known = [word for other in others if (word := getattr(other, name)) not in (UNKNOWN, "version ?")]
+        found[name] = ", ".join(dict.fromkeys([getattr(origin, name), *known]))
+    return replace(origin, **found)
 
 
 def _number(errors: Errors, mode: str, branch: str, metric: str) -> float | None:
