@@ -1,4 +1,4 @@
-"""The numbers that every component makes of fixed inputs, as tests/test_golden.py looks at them.
+"""The numbers that every component makes of fixed inputs, for tests/test_golden.py.
 
 `make golden` writes that file anew. It refuses where a component's numbers changed and its number in
 memmlp/recipes.py did not: raise that first, in the same commit.
