@@ -18,8 +18,9 @@ WORDS = ["sweep", "trial.yaml", *TINY, "data.synth.minutes=1", "data.split.test=
 
 
 def test_rounds_go_on_after_a_kill(tmp_path: Path):
-    """Of two arms that are the same, which three seeds show."""
-    content = {"metrics": ["MPJPE"], "arms": {"one": ["memory=none"], "other": ["memory=none"]}}
+    """Of two arms that hardly differ, which three seeds show."""
+    hardly = ["memory=none", "optim.weight_decay=1.001e-4"]
+    content = {"metrics": ["MPJPE"], "arms": {"one": ["memory=none"], "other": hardly}}
     (tmp_path / "trial.yaml").write_text(yaml.safe_dump(content))
     line = [*MAIN, *WORDS, "--until-decided"]
     killed = subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.DEVNULL, start_new_session=True)
@@ -34,11 +35,11 @@ def test_rounds_go_on_after_a_kill(tmp_path: Path):
     said = run_apart(tmp_path, *WORDS, "--until-decided")
     assert "all verdicts are decided" in said
     runs = list_runs(tmp_path / "outputs")
-    assert len(runs) == 3
+    assert len(runs) == 6
     assert all(one.done for one in runs)
     path = next(tmp_path.glob("outputs/sweeps/*/rounds.json"))
     (look,) = json.loads(path.read_text())["taken"]
     assert {finding["verdict"] for finding in look["found"]} == {"equivalent"}
     before = [one.marker.stat().st_mtime_ns for one in runs]
-    assert "3 of 3 runs done" in run(tmp_path, *WORDS, "--until-decided")
+    assert "6 of 6 runs done" in run(tmp_path, *WORDS, "--until-decided")
     assert [one.marker.stat().st_mtime_ns for one in runs] == before
