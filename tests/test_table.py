@@ -586,3 +586,13 @@ def test_without_runs_the_papers_values_and_the_reason_are_shown():
     assert "nothing measured: data.root" in text
     assert "14.27" in text
     assert "missing" not in text
+
+
+def test_the_correction_is_the_same_whichever_mode_is_shown(sweep: Sweep, tmp_path: Path):
+    """No star comes of looking at one mode alone."""
+    find = fake_sweep(tmp_path, sweep, EFFECTS)
+    both, one = table_of(sweep, find), table_of(sweep, find, modes=("stream",))
+    assert one.modes == ("stream",)
+    assert one.comparisons == both.comparisons
+    for label, metric in (("no | memory", "MPJPE"), ("by position", "Jitter")):
+        assert cell(one, label, metric).effect == cell(both, label, metric).effect

@@ -19,6 +19,7 @@ from memmlp.data.prepare import Manifest, Source, prepare
 from memmlp.data.splits import SeededSplit
 from memmlp.errors import InputError
 from memmlp.features import motion_frames
+from memmlp.recipes import RECIPES
 
 
 def motion(length: int, seed: int, fps: float = 60.0) -> Clip:
@@ -216,3 +217,15 @@ def test_the_sampler_draws_every_window_alike_and_the_step_is_its_position(frame
     assert not torch.equal(sampler.draw(7)[1], WindowSampler(frames, 200, 6, seed=1).draw(7)[1])
     clips = WindowSampler(frames, batch=3000, window=6, seed=0, weighting="clips").draw(0)[0]
     assert torch.bincount(clips).min() > 800
+
+
+def test_frames_of_an_older_recipe_are_made_again(root, tmp_path, monkeypatch):
+    """A run of a new recipe of the features is trained on what the new code makes."""
+    first = prepare(source(root), tmp_path / "cache")
+    made = (tmp_path / "cache" / "train.npy").stat().st_mtime_ns
+    prepare(source(root), tmp_path / "cache")
+    assert (tmp_path / "cache" / "train.npy").stat().st_mtime_ns == made
+    monkeypatch.setitem(RECIPES, "features", RECIPES["features"] + 1)
+    again = prepare(source(root), tmp_path / "cache")
+    assert (tmp_path / "cache" / "train.npy").stat().st_mtime_ns > made
+    assert again.digest == first.digest
