@@ -94,7 +94,9 @@ def test_a_mode_a_solver_or_a_precision_is_that_stages_work_alone(home):
     assert "finished already" in command(home, "train", *TINY, INT8, *seed_of(run), *ik)
     assert "deployment done" in command(home, "eval", run.id, "export.precision=fp32", "export.graph=naive")
     assert "evaluation and deployment done" in command(home, "eval", run.id, "memory.blend=1")
+    assert "measured before" in command(home, "eval", run.id, "evaluation.ik=off", INT8)
     assert "changes the training" in command(home, "eval", run.id, "memory.shift=frame", code=2)
+    assert "evaluation.ik" in command(home, "eval", run.id, "evaluation.ik=[", code=2)
     assert "evaluation.ik=guess" in command(home, "eval", run.id, "evaluation.ik=guess", code=2)
     assert (run.model.read_bytes(), run.metrics_path.read_bytes()) == (weights, log)
     now = Run(run.folder).results

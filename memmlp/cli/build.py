@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -172,6 +174,7 @@ def _override(cfg: DictConfig, word: str) -> None:
     if not equals:
         raise InputError(f"{word}: allowed is KEY=VALUE")
     try:
-        cfg.merge_with_dotlist([word])
-    except OmegaConfBaseException as error:
+        override = OverridesParser.create().parse_override(word)  # as `memmlp train` reads it: off is a word
+        OmegaConf.update(cfg, key, override.value(), merge=True)
+    except (OmegaConfBaseException, HydraException) as error:
         raise InputError(f"{key}: {str(error).splitlines()[0]}") from None
