@@ -9,5 +9,5 @@ __version__ = "0.1.0"
 def __getattr__(name: str) -> Any:
     """`memmlp.Stream`, imported when it is asked for."""
     if name == "Stream":
-        return import_module("memmlp.avatar.stream").Stream
+        return import_module("memmlp.live.stream").Stream
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from memmlp.runs import Run
-from memmlp.sweep.spec import Arm, Sweep
-from memmlp.tables.collect import MODES, collect, finished
+from memmlp.runs.run import Run
+from memmlp.sweep.spec import MODES, Arm, Sweep
+from memmlp.tables.collect import collect, finished
 from memmlp.tables.effects import Runs
 from memmlp.tables.measured import Measured, load
 from memmlp.tables.table import Table

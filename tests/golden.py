@@ -1,7 +1,7 @@
 """The numbers that every component makes of fixed inputs, for tests/test_golden.py.
 
 `make golden` writes that file anew. It refuses where a component's numbers changed and its number in
-memmlp/recipes.py did not: raise that first, in the same commit.
+memmlp/runs/recipes.py did not: raise that first, in the same commit.
 """
 
 from __future__ import annotations
@@ -18,13 +18,35 @@ import tiny
 import torch
 from torch import Tensor, nn
 
-from memmlp import evaluation, latency, metrics
-from memmlp.body import SPARSE_DIM
-from memmlp.data.dataset import Frames, WindowSampler
-from memmlp.export import export
-from memmlp.features import Frame, Heading, HeadRelative, World
-from memmlp.ik import LBFGS
-from memmlp.losses import (
+from memmlp.deploy import latency
+from memmlp.deploy.export import export
+from memmlp.deploy.parity import streamed
+from memmlp.deploy.quantization import quantise
+from memmlp.deploy.session import OnnxStream
+from memmlp.evaluation import metrics
+from memmlp.evaluation import modes as evaluation
+from memmlp.evaluation.ik import LBFGS
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.coordinates import Heading, HeadRelative, World
+from memmlp.motion.dataset import Frames, WindowSampler
+from memmlp.motion.normalizer import Frame
+from memmlp.networks.memory import (
+    CodeMemory,
+    GRUMemory,
+    JointCodeMemory,
+    LSTMMemory,
+    NoCodesMemory,
+    NoMemory,
+    State,
+)
+from memmlp.networks.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
+from memmlp.networks.streaming import streaming
+from memmlp.networks.vqvae import VQVAE
+from memmlp.networks.window_model import WindowModel
+from memmlp.runs.recipes import RECIPES
+from memmlp.training.codes import VQVAETask
+from memmlp.training.loop import seed_step, train_step
+from memmlp.training.losses import (
     AGRoLLoss,
     AvatarPoserLoss,
     Fixed,
@@ -37,25 +59,9 @@ from memmlp.losses import (
     Terms,
     Uncertainty,
 )
-from memmlp.memory import (
-    CodeMemory,
-    GRUMemory,
-    JointCodeMemory,
-    LSTMMemory,
-    NoCodesMemory,
-    NoMemory,
-    State,
-)
-from memmlp.model import WindowModel
-from memmlp.parity import streamed
-from memmlp.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
-from memmlp.quantization import quantise
-from memmlp.recipes import RECIPES
-from memmlp.rollout import OwnPredictions, PersistentStreams, Rollout, TeacherForcing
-from memmlp.session import OnnxStream
-from memmlp.streaming import streaming
-from memmlp.training import MotionTask, Optim, VQVAETask, seed_step, train_step, vqvae_optim
-from memmlp.vqvae import VQVAE
+from memmlp.training.network import MotionTask
+from memmlp.training.optim import Optim, vqvae_optim
+from memmlp.training.rollout import OwnPredictions, PersistentStreams, Rollout, TeacherForcing
 
 PATH = Path(__file__).with_name("golden.json")
 BOTH = frozenset({"rotation", "position"})
@@ -203,8 +209,7 @@ def training() -> Numbers:
 def rollout(make: Callable[[], Rollout]) -> Numbers:
     """The calls of three steps, the network's own motion in them."""
     model, slot, split = tiny.model(NoCodesMemory), make(), frames()
-    if isinstance(slot, PersistentStreams):
-        slot.build(model)
+    slot.begin(model)
     draws, found = WindowSampler(split, batch=2, window=7, seed=0), {}
     for step in range(3):
         seed_step(0, step)
@@ -389,7 +394,7 @@ def record() -> None:
     wrong = [case for case in same if changed(now[case]["numbers"], before[case]["numbers"], tolerance(case))]  # type: ignore[arg-type]
     if wrong:
         sys.exit(
-            f"raise the number of {', '.join(wrong)} in memmlp/recipes.py: what they compute has changed"
+            f"raise the number of {', '.join(wrong)} in memmlp/runs/recipes.py: what they compute has changed"
         )
     kept = {case: before[case] if case in same else now[case] for case in CASES}
     PATH.write_text(json.dumps(kept, indent=1) + "\n")

@@ -10,16 +10,18 @@ import pytest
 import tiny
 import torch
 
-from memmlp import evaluation, pipeline
-from memmlp.cli.build import build_experiment
-from memmlp.cli.train import composed
-from memmlp.data.dataset import Frames
-from memmlp.errors import InputError
-from memmlp.export import export
-from memmlp.features import Frame
-from memmlp.model import MemMLP
-from memmlp.parity import TOLERANCE, parity
-from memmlp.runs import Run
+from memmlp.common.errors import InputError
+from memmlp.config.build import build_experiment
+from memmlp.config.compose import composed
+from memmlp.deploy.export import export
+from memmlp.deploy.parity import TOLERANCE, parity
+from memmlp.evaluation import modes as evaluation
+from memmlp.motion.dataset import Frames
+from memmlp.motion.normalizer import Frame
+from memmlp.networks.mem_mlp import MemMLP
+from memmlp.pipeline.experiment import Experiment
+from memmlp.pipeline.run import codes_run
+from memmlp.runs.run import Run
 
 TINY = [
     "profile=tiny", "data.synth.minutes=0.2", "tracker=none", "threads=1", "optim.steps=2", "vqvae.steps=2",
@@ -103,16 +105,15 @@ def trained(overrides: list[str]) -> Arm:
 
 def train_and_stream(overrides: list[str]) -> Arm:
     experiment = build_experiment(composed(overrides))
-    cache, manifest = experiment.data.prepare()
-    uses_codes = experiment.architecture.uses_codes
-    upstream = pipeline.vqvae_run(experiment, cache, manifest) if uses_codes else None
+    data = experiment.data.prepare()
+    codes = codes_run(experiment, data).model if experiment.architecture.uses_codes else None
     run = Run(Path("variants") / str(len(ARMS)))
     run.folder.mkdir(parents=True)
-    model = pipeline.trained(experiment, run, cache, manifest, upstream)
-    test = Frames.open(cache, "test")
+    model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)
+    test = data.open("test")
     short = Frames(test.frames[:40], torch.tensor([0]), torch.tensor([40]), test.names[:1])
     torch.manual_seed(0)
-    results = evaluation.evaluate(model, short, experiment.modes, 4, experiment.ik)
+    results = evaluation.evaluate(model, short, experiment.evaluation.modes, 4, experiment.evaluation.ik)
     torch.manual_seed(0)
     motion = evaluation.stream(model, [short.frames])[0]
     return Arm(model, [entry.values for entry in run.metrics()], motion, results["mean"])
@@ -284,13 +285,13 @@ def test_every_protocol_builds(name, tmp_path):
 
 
 def test_a_joint_vqvae_is_part_of_the_runs_identity_and_its_own_stage_is_not():
-    def experiment_of(*overrides: str) -> pipeline.Experiment:
+    def experiment_of(*overrides: str) -> Experiment:
         return build_experiment(composed(["memory=vq_joint", *overrides]))
 
     def identity(*overrides: str) -> str:
-        return pipeline.motion_identity(experiment_of(*overrides), "data").id
+        return experiment_of(*overrides).identity("data").id
 
     base = identity()
     assert all(identity(change) != base for change in ("vqvae.codes=32", "vqvae.encoder_depth=2"))
     assert all(identity(change) == base for change in ("vqvae.steps=7", "vqvae.lr=0.5", "tracker=none"))
-    assert pipeline.vqvae_identity(experiment_of(), "data") is None
+    assert experiment_of().codes_identity("data") is None

@@ -1,11 +1,11 @@
-"""What components compute is what their recipe numbers stand for (memmlp/recipes.py)."""
+"""What components compute is what their recipe numbers stand for (memmlp/runs/recipes.py)."""
 
 from __future__ import annotations
 
 import golden
 import pytest
 
-from memmlp.recipes import RECIPES
+from memmlp.runs.recipes import RECIPES
 
 
 @pytest.mark.parametrize("case", golden.CASES)
@@ -16,7 +16,7 @@ def test_a_component_computes_what_its_recipe_number_stands_for(case: str):
     now = golden.numbers(case)
     wrong = golden.changed(now, known["numbers"], golden.tolerance(case))
     assert not wrong, (
-        f"raise the number of {case} in memmlp/recipes.py: it computes other numbers ({wrong[:4]})"
+        f"raise the number of {case} in memmlp/runs/recipes.py: it computes other numbers ({wrong[:4]})"
     )
 
 

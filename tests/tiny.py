@@ -9,16 +9,19 @@ from functools import partial
 import numpy as np
 import torch
 
-from memmlp.body import FRAME_DIM, builtin_rest_joints
-from memmlp.data.dataset import Frames
-from memmlp.features import Frame, HeadRelative, World, motion_frames
-from memmlp.losses import AGRoLLoss, AvatarPoserLoss, Loss
-from memmlp.memory import CodeMemory, JointCodeMemory, Memory, NoMemory, RecurrentMemory
-from memmlp.model import MemMLP, WindowModel
-from memmlp.predictor import Predictor, TwoBranch
-from memmlp.reference.agrol import AGRoLDiffusion, AGRoLMLP
-from memmlp.reference.avatar_poser import AvatarPoser
-from memmlp.vqvae import VQVAE
+from memmlp.motion.body import FRAME_DIM, builtin_rest_joints
+from memmlp.motion.coordinates import HeadRelative, World
+from memmlp.motion.dataset import Frames
+from memmlp.motion.features import motion_frames
+from memmlp.motion.normalizer import Frame
+from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP
+from memmlp.networks.baselines.avatar_poser import AvatarPoser
+from memmlp.networks.mem_mlp import MemMLP
+from memmlp.networks.memory import CodeMemory, JointCodeMemory, Memory, NoMemory, RecurrentMemory
+from memmlp.networks.predictor import Predictor, TwoBranch
+from memmlp.networks.vqvae import VQVAE
+from memmlp.networks.window_model import WindowModel
+from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss
 
 SIZES = {"hidden": 16, "frames": 7}
 DEPTH = 4

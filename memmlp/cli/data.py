@@ -10,11 +10,11 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from memmlp.errors import InputError
+from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
-    from memmlp.data.prepare import ClipRecord, Manifest
-    from memmlp.data.splits import Split
+    from memmlp.motion.prepare import ClipRecord, Manifest
+    from memmlp.motion.splits import Split
 
 PATH = click.Path(path_type=Path)
 MOST_MM, MOST_DEGREES = 1.0, 3.0  # what an import may be off by
@@ -33,7 +33,7 @@ def data() -> None:
 @click.option("--fps", default=60.0, show_default=True, help="Frame rate of the clips.")
 def synth(out: Path, minutes: float, seed: int, fps: float) -> None:
     """Write procedural motion (walking, squats, reaching, ...) in AMASS' layout."""
-    from memmlp.data.synthetic import synthesize
+    from memmlp.motion.synthetic import synthesize
 
     paths = synthesize(out, minutes=minutes, seed=seed, fps=fps)
     click.echo(f"{len(paths)} clips, {minutes:g} minutes, in {out}")
@@ -52,7 +52,7 @@ def import_(
     source: Path, out: Path, skeleton: str | None, fps: tuple[str, ...], body: str, strict: bool
 ) -> None:
     """Import BVH files (a folder or one file) as AMASS npz on the 22-joint tree."""
-    from memmlp.data.importing import import_folder
+    from memmlp.motion.importing import import_folder
 
     rates = dict(map(_rate, fps))
     report = import_folder(source, out, skeleton=skeleton, fps=rates, body=body, strict=strict)
@@ -75,7 +75,7 @@ def verify(source: Path, skeleton: str | None, body: str) -> None:
     Millimetres: of any mapped joint, on the clip's own bones. Degrees: of upper arms, forearms, thighs and
     shins on the body.
     """
-    from memmlp.data.fidelity import verify_folder
+    from memmlp.motion.fidelity import verify_folder
 
     rows = verify_folder(source, skeleton=skeleton, body=body)
     table = Table("clip", "skeleton")
@@ -120,8 +120,8 @@ def prepare(
     strict: bool,
 ) -> None:
     """Write the memory-mappable cache of a folder of AMASS npz files, and its manifest."""
-    from memmlp.data.prepare import Source
-    from memmlp.data.prepare import prepare as run
+    from memmlp.motion.prepare import Source
+    from memmlp.motion.prepare import prepare as run
 
     chosen = _split(split, val, test, seed, group)
     _show_manifest(run(Source(root, chosen, body, min_frames, strict), out))
@@ -131,7 +131,7 @@ def prepare(
 @click.argument("path", type=PATH)
 def inspect(path: Path) -> None:
     """Show a cache or a folder of npz files: clips, hours, frame rates, splits, what is bad."""
-    from memmlp.data.prepare import MANIFEST, Manifest, survey
+    from memmlp.motion.prepare import MANIFEST, Manifest, survey
 
     if (path / MANIFEST).is_file():
         _show_manifest(Manifest.load(path))
@@ -154,7 +154,7 @@ def _rate(text: str) -> tuple[str, float]:
 
 def _split(name: str, val: float, test: float, seed: int, groups: tuple[str, ...]) -> Split:
     """The split of that name."""
-    from memmlp.data.splits import S2_TEST, S2_TRAIN, ListSplit, SeededSplit, SubsetSplit
+    from memmlp.motion.splits import S2_TEST, S2_TRAIN, ListSplit, SeededSplit, SubsetSplit
 
     if name == "seeded":
         return SeededSplit(test, val, seed, groups)

@@ -31,24 +31,23 @@ def evaluate(
     OVERRIDES are keys of the evaluation or the export, such as evaluation.ik=lbfgs, evaluation.modes=[stream]
     or export.precision=int8. What was not measured so before is measured now; nothing is trained.
     """
-    from dataclasses import replace
-
     from rich.console import Console
 
-    from memmlp import pipeline
-    from memmlp.cli.opened import opened
-    from memmlp.cli.report import metrics_table
-    from memmlp.files import write_json
+    from memmlp.cli.outcome import metrics_table
+    from memmlp.common.files import write_json
+    from memmlp.config.opened import opened
+    from memmlp.evaluation.predictions import save_predictions as write_predictions
+    from memmlp.pipeline.run import clip_rows, finished
 
     found = opened(outputs, run, device, overrides)
     experiment = found.experiment
-    results, made = pipeline.finished(experiment, found.run, found.cache, again=again)
+    results, made = finished(experiment, found.run, found.data, again=again)
     said = f"{' and '.join(made)} done" if made else "measured before"
     click.echo(f"run {found.run.id}: {said}")
     Console(highlight=False).print(metrics_table(results))
     if json_path is not None:
-        write_json(json_path, {"mean": results, "clips": pipeline.clip_rows(experiment, found.run)})
+        write_json(json_path, {"mean": results, "clips": clip_rows(experiment, found.run)})
     if save_predictions is not None:
-        model = experiment.architecture.load(found.run).to(experiment.device)
-        pipeline.save_predictions(replace(experiment, save_predictions=save_predictions), model, found.cache)
+        model = experiment.architecture.load(found.run.model).to(experiment.device)
+        write_predictions(experiment.evaluation, model, found.test, save_predictions)
         click.echo(f"predictions of {len(found.test.names)} clips under {save_predictions}")

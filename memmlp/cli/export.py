@@ -13,7 +13,7 @@ from memmlp.cli.options import outputs_option
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from memmlp.streaming import Stream
+    from memmlp.networks.streaming import Stream
 
 
 @click.command("export")
@@ -71,15 +71,14 @@ def export(
 
     import numpy as np
 
-    from memmlp.avatar.full import export_full, full_parity
-    from memmlp.cli.build import build_experiment, config_of
-    from memmlp.data.dataset import Frames
-    from memmlp.deployment import GRAPHS
-    from memmlp.errors import InputError
-    from memmlp.export import export as export_network
-    from memmlp.parity import TOLERANCE, parity
-    from memmlp.runs import find_run
-    from memmlp.streaming import Stream
+    from memmlp.common.errors import InputError
+    from memmlp.config.build import build_experiment, config_of
+    from memmlp.deploy.deployment import GRAPHS
+    from memmlp.deploy.export import export as export_network
+    from memmlp.deploy.parity import TOLERANCE, parity
+    from memmlp.live.full import export_full, full_parity
+    from memmlp.networks.streaming import Stream
+    from memmlp.runs.lookup import find_run
 
     found = find_run(outputs, run)
     if not out.parent.is_dir():
@@ -96,14 +95,14 @@ def export(
             partial(full_parity, space=space or "amass"),
         )
     experiment = build_experiment(config_of(found))
-    cache, _ = experiment.data.prepare()
-    model = experiment.architecture.load(found)
+    data = experiment.data.prepare()
+    model = experiment.architecture.load(found.model)
     network = GRAPHS[graph](model)
-    test = Frames.open(cache, "test").clips()
+    test = data.open("test").clips()
     if precision == "int8":
         if scope == "full" or not isinstance(network, Stream):
             raise InputError("--precision int8: allowed with --scope network and a streaming graph")
-        write_int8(network, out, found.id, Frames.open(cache, "train").clips(), test, max_growth / 100)
+        write_int8(network, out, found.id, data.open("train").clips(), test, max_growth / 100)
         return
     checked = test[: clips or None]
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
@@ -123,8 +122,8 @@ def write_int8(
     """Write the int8 file if it is as accurate as asked; say what it costs."""
     import tempfile
 
-    from memmlp.export import export as export_network
-    from memmlp.quantization import compared, quantise
+    from memmlp.deploy.export import export as export_network
+    from memmlp.deploy.quantization import compared, quantise
 
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         exact, quantised = Path(folder) / "fp32.onnx", Path(folder) / "int8.onnx"

@@ -13,7 +13,7 @@ from memmlp.cli.options import Finite, outputs_option
 if TYPE_CHECKING:
     import numpy as np
 
-    from memmlp.player.sources import Clip, ClipSource, Source
+    from memmlp.live.player.sources import Clip, ClipSource, Source
 
 PORT = click.IntRange(1, 65535)
 
@@ -55,8 +55,8 @@ def live(
     It is fed a clip in real time, over and over, or tracker poses that arrive as packets.
     The README has their format. Ctrl-C ends it.
     """
-    from memmlp.errors import InputError
-    from memmlp.player.packets import needs_osc
+    from memmlp.common.errors import InputError
+    from memmlp.live.player.packets import needs_osc
 
     ports = [number for number in (udp, osc) if number is not None]
     if len(ports) > 1 or (ports and clip is not None and not send):
@@ -78,8 +78,8 @@ def source_of(
     network: str, clip: str | None, udp: int | None, osc: int | None, space: str, hz: float, outputs: Path
 ) -> Source:
     """The source that the options name."""
-    from memmlp.player.packets import from_json, from_osc
-    from memmlp.player.sources import PacketSource
+    from memmlp.live.player.packets import from_json, from_osc
+    from memmlp.live.player.sources import PacketSource
 
     if udp is not None:
         return PacketSource("UDP", udp, from_json, space)
@@ -92,15 +92,15 @@ def clip_source(
     network: str, clip: str | None, hz: float, outputs: Path, rounds: float = float("inf")
 ) -> ClipSource:
     """A clip at a rate."""
-    from memmlp.player.sources import ClipSource
+    from memmlp.live.player.sources import ClipSource
 
     return ClipSource(clip_of(network, clip, outputs), hz, rounds)
 
 
 def clip_of(network: str, clip: str | None, outputs: Path) -> Clip:
     """A test clip of a run, or an AMASS npz on the built-in body."""
-    from memmlp.errors import InputError
-    from memmlp.player.sources import Clip
+    from memmlp.common.errors import InputError
+    from memmlp.live.player.sources import Clip
 
     if clip is not None and clip.endswith(".npz"):
         return Clip(Path(clip).stem, npz_frames(Path(clip)))
@@ -108,7 +108,7 @@ def clip_of(network: str, clip: str | None, outputs: Path) -> Clip:
         raise InputError(
             f"{network}: has no test clips; allowed with it are --clip FILE.npz, --udp and --osc"
         )
-    from memmlp.cli.opened import clip_index, opened
+    from memmlp.config.opened import clip_index, opened
 
     test = opened(outputs, network).test
     index = 0 if clip is None else clip_index(test, clip)
@@ -119,10 +119,10 @@ def npz_frames(path: Path) -> np.ndarray:
     """Frames (N, 252) at 60 Hz of an AMASS npz on the built-in body."""
     import torch
 
-    from memmlp.body import builtin_rest_joints
-    from memmlp.data.clip import read_clip, resample
-    from memmlp.errors import InputError
-    from memmlp.features import motion_frames
+    from memmlp.common.errors import InputError
+    from memmlp.motion.body import builtin_rest_joints
+    from memmlp.motion.clip import read_clip, resample
+    from memmlp.motion.features import motion_frames
 
     clip, _ = resample(read_clip(path, path.stem))
     if len(clip) < 3:
@@ -133,9 +133,9 @@ def npz_frames(path: Path) -> np.ndarray:
 
 def sent(source: ClipSource, udp: int | None, osc: int | None, space: str) -> None:
     """Send a clip's packets, in a space."""
-    from memmlp.avatar.spaces import space_of
-    from memmlp.player.packets import to_json, to_osc
-    from memmlp.player.sources import send
+    from memmlp.live.player.packets import to_json, to_osc
+    from memmlp.live.player.sources import send
+    from memmlp.live.spaces import space_of
 
     port, pack = (udp, to_json) if udp is not None else (osc, to_osc)
     assert port is not None
@@ -148,10 +148,10 @@ def watched(network: str, source: Source, port: int, no_browser: bool, outputs: 
     import threading
     import webbrowser
 
-    from memmlp.avatar.stream import Stream
-    from memmlp.player.play import greeting, play
-    from memmlp.player.server import Hub, Server
-    from memmlp.runs import find_run
+    from memmlp.live.player.play import greeting, play
+    from memmlp.live.player.server import Hub, Server
+    from memmlp.live.stream import Stream
+    from memmlp.runs.lookup import find_run
 
     with contextlib.closing(source):
         if network.endswith(".onnx"):

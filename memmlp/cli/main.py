@@ -13,7 +13,7 @@ from typing import NamedTuple, NoReturn
 import click
 
 import memmlp
-from memmlp.errors import InputError, TrainingDiverged
+from memmlp.common.errors import InputError, TrainingDiverged
 
 
 class Command(NamedTuple):
@@ -32,7 +32,7 @@ COMMANDS = {
     "tune": Command("tune", "tune", "Search loss weights, or other keys, by the errors on validation."),
     "table": Command("table", "table", "The paper's tables beside measured numbers."),
     "results": Command("results", "results", "Keep runs' results with the code; make pages of them."),
-    "report": Command("page", "page", "All tables and figures as one HTML page."),
+    "report": Command("report", "report", "All tables and figures as one HTML page."),
     "runs": Command("runs", "runs", "List, show and compare runs."),
     "track": Command("track", "track", "Show run folders in MLflow."),
     "ui": Command("track", "ui", "MLflow's page on the tracked runs."),

@@ -12,7 +12,7 @@ from memmlp.cli.options import Finite, outputs_option
 if TYPE_CHECKING:
     import numpy as np
 
-    from memmlp.cli.opened import Opened
+    from memmlp.config.opened import Opened
     from memmlp.render.take import Take
 
 SUFFIXES = (".png", ".gif", ".mp4")
@@ -57,8 +57,8 @@ def render(
     A PNG has a row for each run and a column for each pose; a GIF or MP4 has them side by side at 30
     pictures a second. One colour scale holds for all.
     """
-    from memmlp.cli.opened import opened
-    from memmlp.errors import InputError
+    from memmlp.common.errors import InputError
+    from memmlp.config.opened import opened
     from memmlp.render.figure import heatmap_png
     from memmlp.render.film import film, pyav
 
@@ -80,7 +80,7 @@ def render(
 
 def check(out: Path, runs: tuple[str, ...], labels: tuple[str, ...]) -> None:
     """Raise InputError for what is wrong before any run is read."""
-    from memmlp.errors import InputError
+    from memmlp.common.errors import InputError
 
     if out.suffix.lower() not in SUFFIXES:
         raise InputError(f"--out {out}: no such kind of picture; allowed are {', '.join(SUFFIXES)}")
@@ -101,8 +101,8 @@ def taken(
     """The piece of a clip between two times, seconds, as these runs predict it."""
     import numpy as np
 
-    from memmlp.cli.opened import clip_of
-    from memmlp.errors import InputError
+    from memmlp.common.errors import InputError
+    from memmlp.config.opened import clip_of
     from memmlp.render.take import Take
 
     names = labels or tuple(run.run.id[:8] for run in runs)
@@ -124,11 +124,11 @@ def taken(
 
 def predicted(run: Opened, clip: str, last: int, branch: str, mode: str) -> tuple[np.ndarray, np.ndarray]:
     """Truth and prediction (last, 22, 3) of a test clip's frames up to `last`, metres, world."""
-    from memmlp import evaluation
-    from memmlp.body import SPARSE_DIM
-    from memmlp.cli.opened import clip_of
+    from memmlp.config.opened import clip_of
+    from memmlp.evaluation import modes as evaluation
+    from memmlp.motion.body import SPARSE_DIM
 
-    model = run.experiment.architecture.load(run.run)
+    model = run.experiment.architecture.load(run.run.model)
     frames = clip_of(run.test, clip)
     if mode == "stream":  # what comes later can't matter, as it does to the windows of the other
         frames = frames[:last]
@@ -143,8 +143,8 @@ def predicted(run: Opened, clip: str, last: int, branch: str, mode: str) -> tupl
 
 def span(length: int, title: str, begin: float, end: float | None) -> tuple[int, int]:
     """The first frame of a clip's piece between two times, seconds, and the one after its last."""
-    from memmlp.body import FPS
-    from memmlp.errors import InputError
+    from memmlp.common.errors import InputError
+    from memmlp.motion.body import FPS
 
     first, last = round(begin * FPS), length if end is None else min(round(end * FPS), length)
     if first >= last:

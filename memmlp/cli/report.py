@@ -1,73 +1,57 @@
-"""What a person sees at the end of a run."""
+"""`memmlp report`: all tables and figures as one HTML page."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
-from typing import Any
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.table import Table
+import click
 
-from memmlp.pipeline import Outcome
-from memmlp.runs import Run
-from memmlp.units import UNITS
+from memmlp.cli.options import outputs_option
 
-STAGES = ("training", "evaluation", "deployment")
-BRANCHES = ("rotation", "position", "combined")
-COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHES]
+if TYPE_CHECKING:
+    from memmlp.report.html import Chapter
 
-
-def show(outcome: Outcome) -> None:
-    """Print a run's metrics in both modes, its latency and sizes, and what to look at next."""
-    console = Console(highlight=False)
-    run, results = outcome.run, outcome.results
-    console.print(said(outcome), soft_wrap=True)
-    if changed := run.changed_sources:
-        console.print(older_code(run, changed), style="yellow", soft_wrap=True)
-    console.print(metrics_table(results))
-    measured = results["latency"]
-    console.print(
-        f"a frame on one CPU core: {measured['median_ms']:.2f} ms median, {measured['p95_ms']:.2f} ms p95 "
-        f"({measured['ratio_to_reference']:.2f} x the reference network)",
-        soft_wrap=True,
-    )
-    console.print(
-        f"{measured['parameters'] / 1e6:.2f} M parameters "
-        f"({measured['parameters_with_vqvae'] / 1e6:.2f} M with the frozen VQ-VAE), "
-        f"{measured['macs'] / 1e6:.0f} MMAC a frame, ONNX {measured['onnx_bytes'] / 1e6:.1f} MB",
-        soft_wrap=True,
-    )
-    console.print(f"run      {run.folder}", soft_wrap=True)
-    console.print(f"picture  {run.folder / 'poses.png'}", soft_wrap=True)
+EVERY = ["all", "memory_control"]
 
 
-def said(outcome: Outcome) -> str:
-    """What was done, and what was found done."""
-    if not outcome.made:
-        return f"run {outcome.run.id} is finished already; nothing was done (force=true does it again)"
-    found = [stage for stage in STAGES if stage not in outcome.made]
-    before = f"; {' and '.join(found)} found done" if found else ""
-    return f"run {outcome.run.id}: {', '.join(outcome.made)} done{before}"
+@click.command("report")
+@click.argument("words", nargs=-1, metavar="[NAMES]... [OVERRIDES]...")
+@click.option(
+    "--out", type=click.Path(path_type=Path, dir_okay=False), help="[default: report.html in --outputs]"
+)
+@outputs_option
+def report(words: tuple[str, ...], out: Path | None, outputs: Path) -> None:
+    """One page of tables, effects, accuracy against latency, training curves and runs; needs no network.
+
+    NAMES are those of `memmlp table`; without any, all tables of the paper and the memory's controls.
+    OVERRIDES find the runs again that were made with them.
+    """
+    from memmlp.cli.table import write
+    from memmlp.config.shipped import shipped
+    from memmlp.report.html import page as written
+    from memmlp.report.html import published
+    from memmlp.runs.environment import environment
+    from memmlp.sweep.spec import load_sweep
+
+    names = [word for word in words if "=" not in word and not word.startswith("~")] or EVERY
+    chapters = chapters_of(names, [word for word in words if word not in names], outputs)
+    folder = shipped("sweeps")
+    systems = published(load_sweep(folder / "table01.yaml"), load_sweep(folder / "table17.yaml"))
+    git = environment()["git"] or {}
+    code = f"{git.get('commit', environment()['version'])[:7]}{' with changes' if git.get('dirty') else ''}"
+    when = datetime.now(UTC).strftime("Generated %Y-%m-%d %H:%M UTC")
+    write(out or outputs / "report.html", written(chapters, systems, when, code))
 
 
-def older_code(run: Run, changed: Sequence[str]) -> str:
-    """The warning that a run was made before code changed under the same recipe numbers."""
-    names = ", ".join(changed[:5]) + (f" and {len(changed) - 5} more" if len(changed) > 5 else "")
-    return (
-        f"run {run.id} was made before the code of {names} changed, under the same recipe numbers: "
-        "force=true makes it again"
-    )
+def chapters_of(names: Sequence[str], overrides: Sequence[str], outputs: Path) -> list[Chapter]:
+    """The tables of some names with the finished runs behind them, each run read once."""
+    from memmlp.cli.table import MODES, gathered
+    from memmlp.report.html import Chapter
+    from memmlp.tables.measured import load
 
-
-def metrics_table(results: dict[str, Any]) -> Table:
-    """The test metrics by mode and branch."""
-    columns = [(mode, branch) for mode, branch in COLUMNS if branch in results.get(mode, {})]
-    table = Table(title="test clips", title_justify="left")
-    table.add_column("metric")
-    table.add_column("unit")
-    for mode, branch in columns:
-        table.add_column(f"{mode}\n{branch}", justify="right")
-    for name, unit in UNITS.items():
-        values = [results[mode][branch].get(name) for mode, branch in columns]
-        table.add_row(name, unit, *("-" if value is None else f"{float(value):.2f}" for value in values))
-    return table
+    found = gathered(names, overrides, outputs, MODES["both"], functools.cache(load))
+    return [Chapter(sweep, table, runs) for sweep, runs, table in found]

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 import click
 
 from memmlp.cli.options import outputs_option
-from memmlp.errors import InputError
+from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
-    from memmlp.results.pages import Source
-    from memmlp.results.store import Kept
+    from memmlp.report.markdown import Source
+    from memmlp.report.store import Kept
     from memmlp.tables.table import Table
 
 FOLDER = Path("docs/results")
@@ -44,13 +44,13 @@ def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | N
 
     SWEEP and OVERRIDES are those of `memmlp sweep`. What the file has of other arms and seeds stays.
     """
-    from memmlp.cli.plan import find_sweep
     from memmlp.cli.rounds import shown
-    from memmlp.cli.table import finder
-    from memmlp.files import plain
-    from memmlp.results.store import Kept, load_kept, overrides_of, save, without_paths
+    from memmlp.common.files import plain
+    from memmlp.config.plan import find_sweep
+    from memmlp.report.store import Kept, load_kept, overrides_of, save, without_paths
     from memmlp.tables.collect import finished
     from memmlp.tables.measured import load
+    from memmlp.tables.planned import finder
     from memmlp.tables.rounds import as_json
 
     sweep = find_sweep(name).with_overrides(overrides)
@@ -83,7 +83,7 @@ def docs(folder: Path, check: bool) -> None:
     Every file of data/ gives a table's page; the templates are pages whose sentences take their numbers and
     verdicts from the tables. Prose that claims an effect by hand is refused, there and in README.md.
     """
-    from memmlp.results.pages import check_claims, pages
+    from memmlp.report.markdown import check_claims, pages
 
     made = pages(sources(folder), _templates(folder))
     if PROSE.exists():
@@ -102,8 +102,8 @@ def docs(folder: Path, check: bool) -> None:
 
 def sources(folder: Path) -> dict[str, Source]:
     """The tables of all results that are kept below a folder, by the files' names."""
-    from memmlp.results.pages import Source
-    from memmlp.results.store import load_kept
+    from memmlp.report.markdown import Source
+    from memmlp.report.store import load_kept
 
     found = {}
     for path in sorted((folder / "data").glob("*.json")):
@@ -114,7 +114,7 @@ def sources(folder: Path) -> dict[str, Source]:
 
 def _table(kept: Kept) -> Table:
     """The table that kept results come to, of the seeds that any of them has."""
-    from memmlp.cli.plan import find_sweep
+    from memmlp.config.plan import find_sweep
     from memmlp.tables.collect import collect
     from memmlp.tables.rounds import of_json
 
@@ -132,7 +132,7 @@ def _table(kept: Kept) -> Table:
 
 def _outdated(kept: Kept) -> list[str]:
     """The line about kept runs whose components have other recipe numbers now."""
-    from memmlp.recipes import outdated
+    from memmlp.runs.recipes import outdated
 
     found = sorted({words for run in kept.every for words in outdated(run.origin.recipes)})
     return [f"made by an earlier recipe: {', '.join(found)}"] if found else []
@@ -157,14 +157,14 @@ def _text(path: Path) -> str | None:
 
 def _stale(folder: Path, made: Mapping[str, str]) -> list[str]:
     """Pages of earlier times, whose data or template is gone."""
-    from memmlp.results.pages import MARK
+    from memmlp.report.markdown import MARK
 
     every = {path.name for path in folder.glob("*.md") if (_text(path) or "").startswith(MARK)}
     return sorted(every - made.keys())
 
 
 def _write(folder: Path, made: Mapping[str, str], stale: list[str]) -> None:
-    from memmlp.files import atomic_write
+    from memmlp.common.files import atomic_write
 
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in made.items():

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from memmlp.errors import InputError
+from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
     from memmlp.sweep.plan import Plan
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def record(sweep: Sweep, outputs: Path) -> Path:
     """The file where a sweep's rounds are kept."""
-    from memmlp.cli.plan import sweep_folder
+    from memmlp.config.plan import sweep_folder
 
     return sweep_folder(sweep, outputs) / "rounds.json"
 
@@ -77,7 +77,7 @@ def until_decided(
     """Take look after look, the runs that the next one needs made by `work`, until none can be taken."""
     from dataclasses import replace
 
-    from memmlp.cli.plan import planned
+    from memmlp.config.plan import planned
 
     while True:
         spent = rounds.spent(sweep)
@@ -98,10 +98,10 @@ def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
     """Take the next look that can be taken, and record it. Another process may have done so before."""
     from filelock import FileLock
 
-    from memmlp.cli.table import finder
-    from memmlp.files import write_json
+    from memmlp.common.files import write_json
     from memmlp.tables.collect import finished
     from memmlp.tables.measured import load
+    from memmlp.tables.planned import finder
     from memmlp.tables.rounds import advanced, as_json
 
     path = record(sweep, outputs)
@@ -124,7 +124,7 @@ def names(rounds: Rounds, sweep: Sweep, plan: Plan) -> dict[str, str]:
 
 def _name(rounds: Rounds, sweep: Sweep, plan: Plan, label: str, seeds: int) -> str:
     """A digest of the identities of an arm's and its control's first runs, and of what is shown of them."""
-    from memmlp.cli.plan import digest
+    from memmlp.config.plan import digest
     from memmlp.tables.rounds import pair_of
 
     keys = {(entry.label, entry.seed): entry.key for entry in plan.entries}
@@ -168,7 +168,7 @@ class Shown(NamedTuple):
 
 def shown(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> Shown:
     """The sweep with its rounds, where there were any and they are of what it is now."""
-    from memmlp.cli.plan import planned
+    from memmlp.config.plan import planned
     from memmlp.tables.rounds import begin
 
     path = record(sweep, outputs)

@@ -15,7 +15,7 @@ from rich.table import Table
 from memmlp.cli.options import outputs_option
 
 if TYPE_CHECKING:
-    from memmlp.runs import Run
+    from memmlp.runs.run import Run
 
 NEWEST = 20
 SHOWN = {
@@ -37,7 +37,7 @@ def runs() -> None:
 @outputs_option
 def list_command(every: bool, outputs: Path) -> None:
     """The runs, the newest first: MPJPE of the rotation branch in both modes, Jitter, latency of a frame."""
-    from memmlp.runs import list_runs
+    from memmlp.runs.lookup import list_runs
 
     found = list_runs(outputs)
     if not found:
@@ -60,8 +60,8 @@ def list_command(every: bool, outputs: Path) -> None:
 @outputs_option
 def show_command(run: str, config: bool, outputs: Path) -> None:
     """One run, by its id, the beginning of it, or its folder."""
-    from memmlp.identity import flatten
-    from memmlp.runs import find_run
+    from memmlp.runs.identity import flatten
+    from memmlp.runs.lookup import find_run
 
     found = find_run(outputs, run)
     changed = ", ".join(found.verify())
@@ -82,7 +82,7 @@ def show_command(run: str, config: bool, outputs: Path) -> None:
 @outputs_option
 def diff_command(a: str, b: str, outputs: Path) -> None:
     """What two runs differ in: config and results."""
-    from memmlp.runs import diff, find_run
+    from memmlp.runs.lookup import diff, find_run
 
     first, second = find_run(outputs, a), find_run(outputs, b)
     differences = diff(first, second)

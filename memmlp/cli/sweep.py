@@ -14,7 +14,7 @@ from uuid import uuid4
 import click
 
 from memmlp.cli.options import outputs_option
-from memmlp.errors import InputError
+from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
     from memmlp.cli.rounds import Shown
@@ -61,7 +61,7 @@ def sweep(
     --max-seeds.
     """
     from memmlp.cli import rounds
-    from memmlp.cli.plan import find_sweep, planned, sweep_folder
+    from memmlp.config.plan import find_sweep, planned, sweep_folder
     from memmlp.sweep.executors import sbatch
 
     engine, options, rest = split_executor(overrides)
@@ -144,7 +144,7 @@ def slurm_options(options: dict[str, str]) -> dict[str, object]:
 
 def bring_to_end(chosen: Sweep, plan: Plan, engine: str, options: dict[str, object], workers: int) -> None:
     """Start workers, wait for them, and show the runs as the sweep's."""
-    from memmlp.cli.plan import sweep_folder
+    from memmlp.config.plan import sweep_folder
     from memmlp.sweep.board import Board
     from memmlp.sweep.controller import oversee
 
@@ -160,7 +160,7 @@ def hire(
 
     folder: of the sweep or search; the workers' logs lie there too.
     """
-    from memmlp.cli.work import work, work_alone
+    from memmlp.config.work import work, work_alone
     from memmlp.sweep.controller import Fleet
     from memmlp.sweep.worker import Presence
 
@@ -178,8 +178,8 @@ def track(plan: Plan) -> None:
     """Show the runs as the sweep's, where they are tracked."""
     from omegaconf import OmegaConf
 
-    from memmlp.cli.build import build_tracker
-    from memmlp.tracking import harmless
+    from memmlp.config.build import build_tracker
+    from memmlp.runs.tracking import harmless
 
     labels = {entry.id: entry.label for entry in plan.entries if plan.complete(entry)}
     if labels:
@@ -192,7 +192,7 @@ def show(chosen: Sweep, plan: Plan) -> None:
     """The board once, and what earlier versions of the file left."""
     from rich.console import Console
 
-    from memmlp.cli.plan import orphans
+    from memmlp.config.plan import orphans
     from memmlp.sweep.board import render
 
     missing = len(chosen.jobs()) - len(plan.entries)
@@ -224,9 +224,9 @@ def _seconds(plan: Plan, kind: str) -> list[float]:
 
 def report(shown: Shown, words: Sequence[str], chosen: Sweep) -> None:
     """The table, what is done, what failed, and the next command. Exits with 1 where something failed."""
-    from memmlp.cli.plan import orphans
     from memmlp.cli.rounds import closing
     from memmlp.cli.table import MODES, of_plan, on_screen
+    from memmlp.config.plan import orphans
     from memmlp.tables.measured import load
 
     plan, known = shown.plan, shown.rounds

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import gc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -13,22 +13,17 @@ from typing import TYPE_CHECKING, NamedTuple
 import click
 
 from memmlp.cli.options import outputs_option
-from memmlp.errors import InputError
+from memmlp.common.errors import InputError
 from memmlp.sweep.spec import BRANCHES
 
 if TYPE_CHECKING:
     from memmlp.cli.rounds import Shown
-    from memmlp.runs import Run
-    from memmlp.sweep.plan import Plan
-    from memmlp.sweep.spec import Arm, Sweep
-    from memmlp.tables.collect import Find
+    from memmlp.sweep.spec import Sweep
     from memmlp.tables.effects import Runs
-    from memmlp.tables.flags import Say
-    from memmlp.tables.measured import Measured
+    from memmlp.tables.planned import Read
     from memmlp.tables.planning import Need
     from memmlp.tables.table import Table
 
-    Read = Callable[[Path, tuple[str, ...]], Measured]
 MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", "window")}
 
 
@@ -132,6 +127,7 @@ def gathered(
 def of_plan(shown: Shown, modes: Sequence[str], command: str, read: Read) -> Found:
     """A planned sweep's finished runs and table."""
     from memmlp.tables.collect import collect, finished
+    from memmlp.tables.planned import finder, older, states
 
     sweep, plan, rounds, flags = shown
     runs = finished(sweep, finder(plan, read))
@@ -142,8 +138,8 @@ def of_plan(shown: Shown, modes: Sequence[str], command: str, read: Read) -> Fou
 
 def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
     """The sweeps of some names, with the command line's overrides, and the commands that run them."""
-    from memmlp.cli.plan import find_sweep
-    from memmlp.cli.shipped import shipped
+    from memmlp.config.plan import find_sweep
+    from memmlp.config.shipped import shipped
 
     tables = sorted(path.stem for path in shipped("sweeps").glob("table*.yaml"))
     every = [one for name in names for one in (tables if name == "all" else [name])]
@@ -151,55 +147,6 @@ def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, 
         (find_sweep(one).with_overrides(overrides), " ".join(["memmlp sweep", one, *overrides]))
         for one in every
     ]
-
-
-def finder(plan: Plan, read: Read) -> Find:
-    """What finds the results of a planned sweep's finished runs."""
-
-    entries = {(entry.label, entry.seed): entry for entry in plan.entries}
-
-    def find(arm: Arm, seed: int) -> Measured | None:
-        entry = entries.get((arm.label, seed))
-        complete = entry is not None and plan.complete(entry)
-        return read(plan.run_of(entry).folder, entry.stages) if entry and complete else None
-
-    return find
-
-
-def states(plan: Plan) -> Say:
-    """What tells how far a planned sweep's unfinished runs are, where they began."""
-
-    entries = {(entry.label, entry.seed): entry for entry in plan.entries}
-
-    def state(arm: Arm, seed: int) -> str | None:
-        entry = entries.get((arm.label, seed))
-        word = plan.run_of(entry).state(plan.complete(entry)) if entry else "new"
-        return word if word not in ("new", "done") else None
-
-    return state
-
-
-def older(plan: Plan) -> Say:
-    """What finds runs that differ from those of a planned sweep in recipe numbers alone, by cell."""
-    from memmlp.recipes import outdated
-    from memmlp.runs import list_runs
-
-    whats = {task.key: task.what for task in plan.tasks}
-    entries = {(entry.label, entry.seed): entry for entry in plan.entries}
-
-    @functools.cache
-    def known() -> dict[str, Run]:
-        return {run.manifest.get("what", ""): run for run in list_runs(plan.outputs) if run.done}
-
-    def say(arm: Arm, seed: int) -> str | None:
-        entry = entries.get((arm.label, seed))
-        run = known().get(whats.get(entry.key, "?")) if entry else None
-        if entry is None or run is None or run.id == entry.id:
-            return None
-        changed = ", ".join(outdated(run.manifest.get("recipes", {}))) or "its VQ-VAE's"
-        return f"run {run.id}: {changed}"
-
-    return say
 
 
 def on_screen(tables: Sequence[Table]) -> None:

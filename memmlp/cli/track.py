@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from memmlp.cli.options import outputs_option
-from memmlp.errors import InputError
+from memmlp.common.errors import InputError
 
 
 @click.group("track")
@@ -22,10 +22,10 @@ def track() -> None:
 @outputs_option
 def sync(uri: str | None, outputs: Path) -> None:
     """Bring MLflow's store up to date with all finished runs and sweeps; again as often as you like."""
-    from memmlp.progress import track as bar
-    from memmlp.runs import list_runs
+    from memmlp.common.progress import track as bar
+    from memmlp.runs.lookup import list_runs
+    from memmlp.runs.tracking import MLflowTracker
     from memmlp.sweep.plan import Plan
-    from memmlp.tracking import MLflowTracker
 
     tracker = MLflowTracker(uri, outputs)
     finished = [run for run in list_runs(outputs) if run.done]
@@ -43,7 +43,7 @@ def sync(uri: str | None, outputs: Path) -> None:
 @outputs_option
 def ui(port: int, outputs: Path) -> None:
     """MLflow's page on the tracked runs (needs pip install 'memmlp[ui]')."""
-    from memmlp.tracking import MLflowTracker
+    from memmlp.runs.tracking import MLflowTracker
 
     store = MLflowTracker(None, outputs).store()
     program = shutil.which("mlflow")

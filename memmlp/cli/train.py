@@ -7,26 +7,17 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any, NoReturn, cast
 
 import click
-from hydra import compose, version
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra._internal.hydra import Hydra
-from hydra._internal.utils import _run_hydra, create_config_search_path, get_args_parser
-from hydra.core.config_search_path import SearchPathQuery
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
+from hydra import version
+from hydra._internal.utils import _run_hydra
+from omegaconf import DictConfig
 
-from memmlp.cli.errors import explain
-from memmlp.cli.schema import check, register
-from memmlp.cli.shipped import shipped
-from memmlp.errors import InputError, TrainingDiverged
-
-VERSION_BASE = "1.3"
-CONFIG = "train"
+from memmlp.common.errors import InputError, TrainingDiverged
+from memmlp.config.compose import CONFIG, VERSION_BASE, parse, preflight
+from memmlp.config.explain import explain
+from memmlp.config.schema import check, register
+from memmlp.config.shipped import shipped
 
 
 @click.command(
@@ -52,7 +43,7 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
         _run_hydra(
             args=args,
             args_parser=parser,
-            task_function=_collecting(job or _train, failures),
+            task_function=_collecting(job or run_training, failures),
             config_path=str(shipped("conf")),
             config_name=CONFIG,
         )
@@ -62,93 +53,10 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
         raise failures[-1]
 
 
-def parse(argv: Sequence[str]) -> tuple[argparse.Namespace, argparse.ArgumentParser]:
-    """Hydra's arguments, its flags anywhere among the overrides."""
-    parser = get_args_parser()
-    parser.error = _refuse  # type: ignore[method-assign]
-    args = parser.parse_intermixed_args(list(argv))
-    if args.experimental_rerun:
-        raise InputError("--experimental-rerun: unpickles a file; allowed are overrides")
-    return args, parser
-
-
-def _refuse(message: str) -> NoReturn:
-    raise InputError(f"train: {message} (see memmlp train --help)")
-
-
 def _runs(args: argparse.Namespace) -> bool:
     """Whether anything is to be trained, and not only shown."""
     shows = (args.help, args.hydra_help, args.cfg, args.info, args.shell_completion)
     return not any(shows)
-
-
-def composed(overrides: Sequence[str]) -> DictConfig:
-    """The checked config of the overrides of one job."""
-    args, _ = parse(overrides)
-    register()
-    version.setbase(VERSION_BASE)
-    (cfg,) = preflight(args)
-    return cfg
-
-
-def composed_plain(name: str, overrides: Sequence[str], folder: Path | None = None) -> dict[str, Any]:
-    """The content of a config of another command; folder: of configs of the user's, searched first."""
-    args, _ = parse([*(["--config-dir", str(folder)] if folder else []), *overrides])
-    version.setbase(VERSION_BASE)
-    with _hydra(args), _explained(overrides):
-        return cast(dict[str, Any], OmegaConf.to_container(compose(name, args.overrides), resolve=True))
-
-
-def preflight(args: argparse.Namespace) -> list[DictConfig]:
-    """Compose and check the config of every job, so that a bad one is known before the first starts."""
-    configs = []
-    with _hydra(args):
-        for overrides in _jobs(args):
-            with _explained(overrides):
-                configs.append(compose(args.config_name or CONFIG, overrides))
-            check(configs[-1])
-    return configs
-
-
-@contextmanager
-def _hydra(args: argparse.Namespace) -> Iterator[None]:
-    """Hydra with the search path that the arguments ask for, as it will be when the jobs run."""
-    path = create_config_search_path(str(_folder(args.config_path or shipped("conf"), "--config-path")))
-    if args.config_dir:
-        own = f"file://{_folder(args.config_dir, '--config-dir')}"
-        path.prepend(provider="command-line", path=own, anchor=SearchPathQuery(provider="schema"))
-    Hydra.create_main_hydra2(task_name="train", config_search_path=path)
-    try:
-        yield
-    finally:
-        GlobalHydra.instance().clear()
-
-
-def _folder(name: str | Path, option: str) -> Path:
-    """The absolute path of an option's folder."""
-    if not Path(name).is_dir():
-        raise InputError(f"{option} {name}: allowed is an existing folder")
-    return Path(name).absolute()
-
-
-def _jobs(args: argparse.Namespace) -> list[list[str]]:
-    """The overrides of each job: one, or those of a sweep."""
-    with _explained(args.overrides):
-        overrides = OverridesParser.create().parse_overrides(args.overrides)
-        if not args.multirun and "hydra.mode=MULTIRUN" not in args.overrides:
-            return [args.overrides]
-        return BasicSweeper.split_arguments(overrides, None)[0]
-
-
-@contextmanager
-def _explained(overrides: Sequence[str]) -> Iterator[None]:
-    """Turn what composing raises into an InputError of one line."""
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(explain(error, overrides)) from error
 
 
 @contextmanager
@@ -183,7 +91,15 @@ def _collecting(
     return task
 
 
-def _train(cfg: DictConfig) -> None:
-    from memmlp.cli.build import run_training
+def run_training(cfg: DictConfig) -> None:
+    """Check the config, bring its run to its end, and show the results."""
+    import torch
 
-    run_training(cfg)
+    from memmlp.cli.outcome import show
+    from memmlp.config.build import build_experiment
+    from memmlp.pipeline.run import run
+
+    check(cfg)
+    if cfg.threads:
+        torch.set_num_threads(cfg.threads)
+    show(run(build_experiment(cfg)))

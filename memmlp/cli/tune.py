@@ -13,10 +13,10 @@ import click
 from filelock import FileLock, Timeout
 
 from memmlp.cli.options import outputs_option
-from memmlp.errors import InputError
+from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
-    from memmlp.pipeline import Experiment
+    from memmlp.pipeline.experiment import Experiment
     from memmlp.search.spec import Search, Value
     from memmlp.search.study import Study
     from memmlp.sweep.plan import Task
@@ -78,7 +78,7 @@ class Setup(NamedTuple):
 
 def prepared(words: Sequence[str], config_dir: Path | None, outputs: Path) -> Setup:
     """The search of a command line, its keys and ranges checked against the config."""
-    from memmlp.cli.plan import digest
+    from memmlp.config.plan import digest
     from memmlp.search.spec import parse_search
 
     own = [word for word in words if word.lstrip("+~").partition("=")[0].split(".")[0] == "search"]
@@ -94,7 +94,7 @@ def prepared(words: Sequence[str], config_dir: Path | None, outputs: Path) -> Se
 
 def _search_config(words: Sequence[str], config_dir: Path | None) -> dict[str, Any]:
     """The composed config of the search alone."""
-    from memmlp.cli.train import composed_plain
+    from memmlp.config.compose import composed_plain
 
     found = composed_plain("tune", words, config_dir).get("search")
     if not isinstance(found, dict):
@@ -122,16 +122,16 @@ def _check_space(setup: Setup) -> str:
 
 def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[Task]]:
     """The runs of a trial with those values, seed by seed, the data prepared for them."""
-    from memmlp.cli.plan import tasks_of
+    from memmlp.config.plan import tasks_of
 
     experiments = _experiments(setup, values)
-    return [tasks_of(experiment, experiment.data.prepare()[1].digest) for experiment in experiments]
+    return [tasks_of(experiment, experiment.data.prepare().digest) for experiment in experiments]
 
 
 def _experiments(setup: Setup, values: Mapping[str, Value]) -> list[Experiment]:
     """The checked experiments of a trial with those values: the config's seed, and those that follow it."""
-    from memmlp.cli.build import build_experiment
-    from memmlp.cli.train import composed
+    from memmlp.config.build import build_experiment
+    from memmlp.config.compose import composed
 
     own = ["--config-dir", str(setup.config_dir)] if setup.config_dir else []
     cfg = composed([*own, *setup.overrides(values)])
@@ -169,7 +169,7 @@ def search(setup: Setup, study: Study, engine: str, options: dict[str, object], 
 
 def leave(setup: Setup, study: Study) -> None:
     """Write what the search found, and show its runs where they are tracked."""
-    from memmlp.cli.shipped import shipped
+    from memmlp.config.shipped import shipped
     from memmlp.search import results
 
     results.write_trials(study, setup.folder / "trials.csv")

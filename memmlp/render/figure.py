@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from memmlp.files import atomic_write
-from memmlp.progress import track
+from memmlp.common.files import atomic_write
+from memmlp.common.progress import track
 from memmlp.render.raster import draw
 from memmlp.render.sheet import FAINT, Sheet, png
 from memmlp.render.take import Take

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from memmlp.body import FPS
-from memmlp.errors import InputError
-from memmlp.files import atomic_write
-from memmlp.progress import track
+from memmlp.common.errors import InputError
+from memmlp.common.files import atomic_write
+from memmlp.common.progress import track
+from memmlp.motion.body import FPS
 from memmlp.render.raster import draw
 from memmlp.render.sheet import FAINT, Sheet, indexed
 from memmlp.render.take import Take

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from memmlp.body import HEAD, JOINTS, LEFT_WRIST, PARENTS, RIGHT_WRIST
+from memmlp.motion.body import HEAD, JOINTS, LEFT_WRIST, PARENTS, RIGHT_WRIST
 
 _RADII = {
     "pelvis": 0.100, "hip": 0.082, "knee": 0.054, "ankle": 0.038, "foot": 0.030, "spine1": 0.100,

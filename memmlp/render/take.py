@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from memmlp.body import FPS, ROOT
+from memmlp.motion.body import FPS, ROOT
 from memmlp.render.mannequin import RADII, scale
 from memmlp.render.raster import Camera
 

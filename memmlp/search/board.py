@@ -12,7 +12,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from memmlp.runs import Run
+from memmlp.runs.run import Run
 from memmlp.search.spec import Search
 from memmlp.search.study import Study, deviations
 from memmlp.sweep.board import Screen, progress

@@ -13,8 +13,9 @@ from pathlib import Path
 
 from optuna.trial import Trial, TrialState
 
-from memmlp.errors import InputError
-from memmlp.runs import Metrics, Run
+from memmlp.common.errors import InputError
+from memmlp.runs.log import Metrics
+from memmlp.runs.run import Run
 from memmlp.search.board import SearchBoard
 from memmlp.search.spec import Objective, Value
 from memmlp.search.study import Study, values

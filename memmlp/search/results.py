@@ -15,7 +15,7 @@ import yaml
 from optuna.exceptions import ExperimentalWarning
 from optuna.trial import FrozenTrial, TrialState
 
-from memmlp.files import atomic_write
+from memmlp.common.files import atomic_write
 from memmlp.search.spec import Search
 from memmlp.search.study import Study, deviations, values
 

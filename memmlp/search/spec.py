@@ -27,8 +27,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from memmlp.errors import InputError
-from memmlp.units import UNITS
+from memmlp.common.errors import InputError
+from memmlp.evaluation.units import UNITS
 
 SAMPLERS = ("tpe", "random")
 PRUNERS = ("median", "none")

@@ -23,8 +23,8 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
 
-from memmlp.errors import InputError
-from memmlp.files import sync_folder
+from memmlp.common.errors import InputError
+from memmlp.common.files import sync_folder
 from memmlp.search.spec import Range, Search, Value
 
 ENDED = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)

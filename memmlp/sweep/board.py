@@ -12,7 +12,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from memmlp.runs import Metrics, Run
+from memmlp.runs.log import Metrics
+from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, Task
 
 COLOURS = {"done": "green", "running": "cyan", "failed": "red", "blocked": "red", "lost": "yellow"}

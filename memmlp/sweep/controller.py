@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from memmlp.errors import InputError
+from memmlp.common.errors import InputError
 from memmlp.sweep.board import Board
 from memmlp.sweep.executors import Executor, Handle
 from memmlp.sweep.plan import Plan

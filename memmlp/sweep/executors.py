@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from memmlp.errors import InputError
+from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
     import submitit

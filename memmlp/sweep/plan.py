@@ -10,9 +10,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from memmlp.errors import InputError
-from memmlp.files import write_json
-from memmlp.runs import Run
+from memmlp.common.errors import InputError
+from memmlp.common.files import write_json
+from memmlp.runs.run import Run
 
 
 @dataclass(frozen=True)

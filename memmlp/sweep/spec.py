@@ -29,9 +29,10 @@ from typing import Any
 
 import yaml
 
-from memmlp.errors import InputError
-from memmlp.units import SMALLEST, UNITS
+from memmlp.common.errors import InputError
+from memmlp.evaluation.units import SMALLEST, UNITS
 
+MODES = ("stream", "window")
 BRANCHES = ("rotation", "position", "combined")
 KEYS = (
     "title", "table", "notes", "base", "seeds", "reference", "metrics", "branch", "branch_source", "smallest",

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from memmlp.errors import InputError, TrainingDiverged
-from memmlp.runs import Run
+from memmlp.common.errors import InputError, TrainingDiverged
+from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, Task
 
 PAUSE = 0.5  # seconds between looks at a plan whose tasks are all in other hands

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from memmlp.sweep.spec import COSTS, Arm, Sweep
-from memmlp.tables.effects import Runs, control, effects, paper_effect
+from memmlp.sweep.spec import COSTS, MODES, Arm, Sweep
+from memmlp.tables.effects import Runs, control, effects, paper_effect, with_existing_branches
 from memmlp.tables.flags import Say, flags, silent
 from memmlp.tables.measured import Measured
 from memmlp.tables.table import Cell, Effect, Key, Row, Table
@@ -15,7 +15,6 @@ from memmlp.tables.table import Cell, Effect, Key, Row, Table
 if TYPE_CHECKING:
     from memmlp.tables.rounds import Rounds
 
-MODES = ("stream", "window")
 Find = Callable[[Arm, int], Measured | None]
 
 
@@ -72,17 +71,6 @@ def collect(
 def without_runs(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
     """The table of a sweep whose runs cannot be known: the paper's values, and why there is no more."""
     return replace(collect(sweep, {arm.label: {} for arm in sweep.runnable()}, modes), flags=(reason,))
-
-
-def with_existing_branches(sweep: Sweep, runs: Mapping[str, Runs]) -> Sweep:
-    """The sweep, arms whose networks have one head alone showing that one, the rotation branch."""
-
-    def single(arm: Arm) -> bool:
-        found = runs.get(arm.label, {}).values()
-        return bool(found) and all(run.one_head for run in found)
-
-    arms = tuple(replace(arm, branch="rotation") if single(arm) else arm for arm in sweep.arms)
-    return replace(sweep, arms=arms)
 
 
 def _row(sweep: Sweep, arm: Arm, runs: Runs | None, modes: Sequence[str], found: Mapping[Key, Effect]) -> Row:

@@ -9,8 +9,7 @@ import numpy as np
 
 from memmlp.statistics import interquartile_mean, probability_of_improvement
 from memmlp.sweep.spec import COSTS, Arm, Sweep
-from memmlp.tables.collect import with_existing_branches
-from memmlp.tables.effects import Runs, control
+from memmlp.tables.effects import Runs, control, with_existing_branches
 
 
 class Distribution(NamedTuple):

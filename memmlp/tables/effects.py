@@ -172,3 +172,14 @@ def or_none(number: float) -> float | None:
 def or_nan(number: float | None) -> float:
     """The number; NaN for None."""
     return math.nan if number is None else number
+
+
+def with_existing_branches(sweep: Sweep, runs: Mapping[str, Runs]) -> Sweep:
+    """The sweep, arms whose networks have one head alone showing that one, the rotation branch."""
+
+    def single(arm: Arm) -> bool:
+        found = runs.get(arm.label, {}).values()
+        return bool(found) and all(run.one_head for run in found)
+
+    arms = tuple(replace(arm, branch="rotation") if single(arm) else arm for arm in sweep.arms)
+    return replace(sweep, arms=arms)

@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from memmlp.evaluation.units import UNITS
 from memmlp.statistics import Verdict
 from memmlp.sweep.spec import COSTS
 from memmlp.tables.table import Cell, Row, Table
-from memmlp.units import UNITS
 
 COST_UNITS = {"FLOPs": "G", "MACs": "G", "parameters": "M", "size": "MB", "ms": "", "ratio": "", "FPS": ""}
 MISSING = "-"

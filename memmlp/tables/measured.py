@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from memmlp.errors import InputError
-from memmlp.files import read_json
-from memmlp.identity import used_as_configured
-from memmlp.runs import Run, intact
+from memmlp.common.errors import InputError
+from memmlp.common.files import read_json
+from memmlp.runs.identity import used_as_configured
+from memmlp.runs.reports import intact
+from memmlp.runs.run import Run
 
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # mode -> branch -> metric -> value
 UNKNOWN = "?"

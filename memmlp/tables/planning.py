@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from memmlp.statistics import seeds_needed
-from memmlp.sweep.spec import Sweep
-from memmlp.tables.collect import MODES, with_existing_branches
-from memmlp.tables.effects import Runs, paired, paper_effect
+from memmlp.sweep.spec import MODES, Sweep
+from memmlp.tables.effects import Runs, paired, paper_effect, with_existing_branches
 
 
 class Need(NamedTuple):

@@ -13,7 +13,7 @@ from typing import Any
 
 from rich.console import Console
 
-from memmlp.files import plain
+from memmlp.common.files import plain
 from memmlp.statistics import Verdict
 from memmlp.tables.grid import MINUS, Grid, Line, caption, grids, legend
 from memmlp.tables.table import Table

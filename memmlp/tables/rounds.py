@@ -18,9 +18,17 @@ from typing import Any
 import numpy as np
 
 from memmlp.statistics import Verdict, looks, seeds_needed, sequential, spending, verdict
-from memmlp.sweep.spec import COSTS, Arm, Sweep
-from memmlp.tables.collect import MODES, with_existing_branches
-from memmlp.tables.effects import Runs, control, or_nan, or_none, paired, paper_effect, tested
+from memmlp.sweep.spec import COSTS, MODES, Arm, Sweep
+from memmlp.tables.effects import (
+    Runs,
+    control,
+    or_nan,
+    or_none,
+    paired,
+    paper_effect,
+    tested,
+    with_existing_branches,
+)
 from memmlp.tables.table import Effect, Key
 
 MOST = 13  # seeds of an arm, where nothing else is asked for

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from memmlp.cli.bench.calibration import SHARES, Cell, Sample, Shares, broken, draw, grid, simulate
-from memmlp.files import read_json
+from memmlp.common.files import read_json
 from memmlp.statistics.crossed import error
 
 MODULE = sys.modules["memmlp.cli.bench.calibration"]  # the package has the command by that name

@@ -19,9 +19,10 @@ from command_line import MAIN
 from conftest import Memmlp, one_line
 from PIL import Image
 
-from memmlp.player.packets import Packet
-from memmlp.player.sources import PacketSource
-from memmlp.runs import Run, list_runs
+from memmlp.live.player.packets import Packet
+from memmlp.live.player.sources import PacketSource
+from memmlp.runs.lookup import list_runs
+from memmlp.runs.run import Run
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import yaml
 from conftest import Memmlp, one_line
 from fake_runs import CLIPS, fake_run
 
-from memmlp.runs import Run
+from memmlp.runs.run import Run
 from memmlp.sweep.plan import Entry, Plan, Task
 from memmlp.sweep.spec import Sweep
 
@@ -64,7 +64,7 @@ def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Runs:
     monkeypatch.chdir(tmp_path)
     write(ARMS)
     found = Runs(tmp_path / "outputs")
-    monkeypatch.setattr("memmlp.cli.plan.planned", found.planned)
+    monkeypatch.setattr("memmlp.config.plan.planned", found.planned)
     monkeypatch.setattr("memmlp.cli.sweep.bring_to_end", found.work)
     return found
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from conftest import Memmlp, Ran, one_line
 
-from memmlp.files import write_json
-from memmlp.runs import Run
+from memmlp.common.files import write_json
+from memmlp.runs.run import Run
 
 A, B, C = ("a" * 16, "b" * 16, "c" * 16)
 RESULTS = {

@@ -16,12 +16,13 @@ import pytest
 import yaml
 from command_line import MAIN, TINY, run, run_apart
 
-from memmlp.cli.plan import find_sweep, orphans, planned
 from memmlp.cli.sweep import split_executor
-from memmlp.cli.work import perform
-from memmlp.errors import InputError
-from memmlp.recipes import RECIPES
-from memmlp.runs import Run, list_runs
+from memmlp.common.errors import InputError
+from memmlp.config.plan import find_sweep, orphans, planned
+from memmlp.config.work import perform
+from memmlp.runs.lookup import list_runs
+from memmlp.runs.recipes import RECIPES
+from memmlp.runs.run import Run
 from memmlp.sweep.board import name
 
 ARMS = {"full": [], "none": ["memory=none"], "wild": ["optim.lr=1e30"]}

@@ -15,7 +15,7 @@ from filelock import FileLock
 
 from memmlp.cli.bench.chaos import examine
 from memmlp.cli.tune import prepared
-from memmlp.runs import Run
+from memmlp.runs.run import Run
 
 TINY = [*BASE, "optim.validate_every=3"]
 

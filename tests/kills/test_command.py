@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 from command_line import MAIN, TINY, run
 
-from memmlp.runs import Run, list_runs
+from memmlp.runs.lookup import list_runs
+from memmlp.runs.run import Run
 
 MOMENTS = (
     "data/**/*.npz",  # the first clip of the data is there

@@ -12,7 +12,7 @@ from pathlib import Path
 import yaml
 from command_line import MAIN, TINY, run, run_apart
 
-from memmlp.runs import list_runs
+from memmlp.runs.lookup import list_runs
 
 WORDS = ["sweep", "trial.yaml", *TINY, "data.synth.minutes=1", "data.split.test=0.5", "executor=debug"]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from command_line import run
 
 from memmlp.cli.bench.chaos import check, compare
-from memmlp.files import write_json
-from memmlp.runs import Run
+from memmlp.common.files import write_json
+from memmlp.runs.run import Run
 
 
 def test_a_sweep_under_kills_ends_as_an_undisturbed_one(tmp_path: Path):

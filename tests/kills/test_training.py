@@ -13,11 +13,13 @@ from pathlib import Path
 import tiny
 import torch
 
-from memmlp import checkpoint
-from memmlp.losses import HandPosition, MotionLoss, Uncertainty
-from memmlp.rollout import OwnPredictions
-from memmlp.runs import Run
-from memmlp.training import MotionTask, Optim, train
+from memmlp.networks import checkpoint
+from memmlp.runs.run import Run
+from memmlp.training.loop import train
+from memmlp.training.losses import HandPosition, MotionLoss, Uncertainty
+from memmlp.training.network import MotionTask
+from memmlp.training.optim import Optim
+from memmlp.training.rollout import OwnPredictions
 
 CHILD = """
     import sys; sys.path[:0] = [{here!r}, {tests!r}]

@@ -12,9 +12,9 @@ import pytest
 import tiny
 from PIL import Image
 
-from memmlp.body import SPARSE_DIM
-from memmlp.errors import InputError
-from memmlp.evaluation import joint_positions
+from memmlp.common.errors import InputError
+from memmlp.evaluation.modes import joint_positions
+from memmlp.motion.body import SPARSE_DIM
 from memmlp.render import figure, film
 from memmlp.render.mannequin import HEAT, LIMBS, ends, heat, scale
 from memmlp.render.raster import Camera, draw

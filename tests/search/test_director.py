@@ -14,9 +14,9 @@ import pytest
 import yaml
 from optuna.trial import TrialState
 
-from memmlp.errors import InputError
-from memmlp.identity import run_id
-from memmlp.runs import Run
+from memmlp.common.errors import InputError
+from memmlp.runs.identity import run_id
+from memmlp.runs.run import Run
 from memmlp.search import results
 from memmlp.search import study as study_module
 from memmlp.search.board import figures

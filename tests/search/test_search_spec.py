@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from memmlp.errors import InputError
+from memmlp.common.errors import InputError
 from memmlp.search.spec import Range, parse_search
 
 GOOD: dict[str, Any] = {

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from memmlp.errors import InputError
+from memmlp.common.errors import InputError
 from memmlp.sweep import controller
 from memmlp.sweep.board import Board
 from memmlp.sweep.controller import PATIENCE, Fleet

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from memmlp.errors import InputError
+from memmlp.common.errors import InputError
+from memmlp.evaluation.units import SMALLEST, UNITS
 from memmlp.sweep import spec
 from memmlp.sweep.spec import load_sweep, parse_sweep
-from memmlp.units import SMALLEST, UNITS
 
 ARMS = {"full": [], "none": {"overrides": ["memory=none"], "paper": {"MPJPE": 4.13}}}
 

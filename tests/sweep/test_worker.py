@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from memmlp.cli.work import check_wanted
-from memmlp.errors import InputError, TrainingDiverged
-from memmlp.runs import Run
+from memmlp.common.errors import InputError, TrainingDiverged
+from memmlp.config.work import check_wanted
+from memmlp.runs.run import Run
 from memmlp.sweep import worker
 from memmlp.sweep.plan import Entry, Plan, Task, unique
 from memmlp.sweep.worker import Cancelled, Presence, attempt, work

@@ -10,9 +10,9 @@ import click
 from memmlp.cli.options import outputs_option
 
 if TYPE_CHECKING:
-    from memmlp.avatar.soak import Motion
-    from memmlp.avatar.stream import Stream
-    from memmlp.data.dataset import Frames
+    from memmlp.live.soak import Motion
+    from memmlp.live.stream import Stream
+    from memmlp.motion.dataset import Frames
 
 
 @click.command("avatar")
@@ -45,8 +45,8 @@ def avatar(
 
     import numpy as np
 
-    from memmlp.avatar.stream import Stream
-    from memmlp.runs import find_run
+    from memmlp.live.stream import Stream
+    from memmlp.runs.lookup import find_run
 
     with tempfile.TemporaryDirectory() as folder:
         if run is not None:
@@ -71,9 +71,9 @@ def _alternate(stream: Stream, onnx: Path, frames: int) -> tuple[float, float]:
 
     import numpy as np
 
-    from memmlp.avatar.rotations import quaternion_to_matrix
-    from memmlp.body import SPARSE_DIM
-    from memmlp.session import OnnxStream
+    from memmlp.deploy.session import OnnxStream
+    from memmlp.live.rotations import quaternion_to_matrix
+    from memmlp.motion.body import SPARSE_DIM
 
     random = np.random.default_rng(0)
     alone, seconds = OnnxStream(onnx), np.zeros((frames, 2))
@@ -94,9 +94,9 @@ def _alternate(stream: Stream, onnx: Path, frames: int) -> tuple[float, float]:
 
 def _random(overrides: tuple[str, ...], path: Path) -> Path:
     """The ONNX file of a network with random weights."""
-    from memmlp.cli.build import untrained
-    from memmlp.deployment import GRAPHS
-    from memmlp.export import export
+    from memmlp.config.build import untrained
+    from memmlp.deploy.deployment import GRAPHS
+    from memmlp.deploy.export import export
 
     export(GRAPHS["auto"](untrained(("profile=paper", *overrides))), path, "random")
     return path
@@ -114,12 +114,12 @@ def soak(run: str | None, onnx: Path | None, hours: float, outputs: Path) -> Non
     numbers were finite, the MPJPE of the first and the last tenth, and the growth of memory between their
     ends. Without RUN the motion is synthetic.
     """
-    from memmlp.avatar.soak import repetitions
-    from memmlp.avatar.soak import soak as soaked
-    from memmlp.avatar.stream import Stream
-    from memmlp.body import FPS
-    from memmlp.errors import InputError
-    from memmlp.runs import find_run
+    from memmlp.common.errors import InputError
+    from memmlp.live.soak import repetitions
+    from memmlp.live.soak import soak as soaked
+    from memmlp.live.stream import Stream
+    from memmlp.motion.body import FPS
+    from memmlp.runs.lookup import find_run
 
     if run is not None and onnx is None:
         onnx = find_run(outputs, run).onnx
@@ -138,22 +138,20 @@ def soak(run: str | None, onnx: Path | None, hours: float, outputs: Path) -> Non
 
 def _test_clips(outputs: Path, run: str) -> Frames:
     """The test clips of a run's data."""
-    from memmlp.cli.build import build_experiment, config_of
-    from memmlp.data.dataset import Frames
-    from memmlp.runs import find_run
+    from memmlp.config.build import build_experiment, config_of
+    from memmlp.runs.lookup import find_run
 
-    cache, _ = build_experiment(config_of(find_run(outputs, run))).data.prepare()
-    return Frames.open(cache, "test")
+    return build_experiment(config_of(find_run(outputs, run))).data.prepare().open("test")
 
 
 def _synthetic() -> Frames:
     """Test clips of synthetic motion."""
     import tempfile
 
-    from memmlp.data.dataset import Frames
-    from memmlp.data.prepare import Source, prepare
-    from memmlp.data.splits import SeededSplit
-    from memmlp.data.synthetic import synthesize
+    from memmlp.motion.dataset import Frames
+    from memmlp.motion.prepare import Source, prepare
+    from memmlp.motion.splits import SeededSplit
+    from memmlp.motion.synthetic import synthesize
 
     with tempfile.TemporaryDirectory() as folder:
         synthesize(Path(folder) / "clips", minutes=10)
@@ -164,9 +162,9 @@ def _synthetic() -> Frames:
 
 def _motion(frames: Frames) -> Motion:
     """All clips one after the other, as trackers and truth."""
-    from memmlp.avatar.full import trackers_of
-    from memmlp.avatar.soak import Motion
-    from memmlp.body import N_JOINTS, POSITION, SPARSE_DIM
+    from memmlp.live.full import trackers_of
+    from memmlp.live.soak import Motion
+    from memmlp.motion.body import N_JOINTS, POSITION, SPARSE_DIM
 
     positions, rotations = trackers_of(frames.frames)
     joints = frames.frames[:, SPARSE_DIM:][:, POSITION].unflatten(-1, (N_JOINTS, 3))

@@ -347,9 +347,9 @@ def calibration(tables: int, quick: bool, seed: int, file: Path | None, as_markd
     """
     from rich.console import Console
 
-    from memmlp.errors import InputError
-    from memmlp.files import write_json
-    from memmlp.progress import track
+    from memmlp.common.errors import InputError
+    from memmlp.common.files import write_json
+    from memmlp.common.progress import track
 
     if file and not file.absolute().parent.is_dir():
         raise InputError(f"--json {file}: there is no folder {file.parent}")

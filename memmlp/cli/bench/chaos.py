@@ -20,8 +20,9 @@ from statistics import fmean
 import click
 import yaml
 
-from memmlp.files import file_digest
-from memmlp.runs import Run, list_runs
+from memmlp.common.files import file_digest
+from memmlp.runs.lookup import list_runs
+from memmlp.runs.run import Run
 
 OVERRIDES = ["profile=tiny", "data.synth.minutes=1", "tracker=none", "threads=1"]
 PAUSES = (0.5, 3.0)  # seconds between kills of a sweep's processes

@@ -14,10 +14,10 @@ def prepare(minutes: float) -> None:
     import time
     from pathlib import Path
 
-    from memmlp.data.prepare import Source
-    from memmlp.data.prepare import prepare as run
-    from memmlp.data.splits import SeededSplit
-    from memmlp.data.synthetic import synthesize
+    from memmlp.motion.prepare import Source
+    from memmlp.motion.prepare import prepare as run
+    from memmlp.motion.splits import SeededSplit
+    from memmlp.motion.synthetic import synthesize
 
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "clips"
@@ -49,9 +49,9 @@ def stream(clips: int, frames: int, rounds: int, device: str, overrides: tuple[s
     import numpy as np
     import torch
 
-    from memmlp.body import FRAME_DIM
-    from memmlp.cli.build import untrained
-    from memmlp.evaluation import stream as run
+    from memmlp.config.build import untrained
+    from memmlp.evaluation.modes import stream as run
+    from memmlp.motion.body import FRAME_DIM
 
     model = untrained(("profile=paper", *overrides)).to(device)
     motion = list(0.1 * torch.randn(clips, frames, FRAME_DIM, device=device))

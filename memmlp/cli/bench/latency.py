@@ -42,7 +42,7 @@ def latency(
     """
     import tempfile
 
-    from memmlp.errors import InputError
+    from memmlp.common.errors import InputError
 
     chosen = [name.strip() for name in models.split(",")]
     allowed = [f"{name}:{variant}" for name in MODELS for variant in VARIANTS]
@@ -59,7 +59,7 @@ def latency(
         rows = timed(paths, rounds, steps)
         show(rows, rounds)
         if file:
-            from memmlp.files import write_json
+            from memmlp.common.files import write_json
 
             write_json(file, rows)
         if profile:
@@ -71,11 +71,11 @@ def exported(
     models: list[str], overrides: tuple[str, ...], folder: Path
 ) -> Iterator[tuple[tuple[str, str], Path]]:
     """The ONNX files of models in all variants, with a bar."""
-    from memmlp.cli.build import untrained
-    from memmlp.export import export
-    from memmlp.progress import track
-    from memmlp.quantization import quantise
-    from memmlp.streaming import streaming
+    from memmlp.common.progress import track
+    from memmlp.config.build import untrained
+    from memmlp.deploy.export import export
+    from memmlp.deploy.quantization import quantise
+    from memmlp.networks.streaming import streaming
 
     clips = calibration()
     for name in track(models, "exporting"):
@@ -93,7 +93,7 @@ def calibration() -> list[Any]:
     """A short clip of motion."""
     import torch
 
-    from memmlp.body import FRAME_DIM
+    from memmlp.motion.body import FRAME_DIM
 
     return [0.1 * torch.randn(60, FRAME_DIM, generator=torch.Generator().manual_seed(0))]
 
@@ -102,7 +102,7 @@ def timed(paths: dict[tuple[str, str], Path], rounds: int, steps: int) -> list[d
     """A row of each file: median and p95 milliseconds, the ratio to AvatarPoser and its spread."""
     import numpy as np
 
-    from memmlp.latency import interleaved
+    from memmlp.deploy.latency import interleaved
 
     seconds = interleaved(paths, rounds, steps)
     base = np.median(seconds[BASE], 1)
@@ -154,7 +154,7 @@ def show_profile(path: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from memmlp.latency import profile
+    from memmlp.deploy.latency import profile
 
     table = Table(title=f"{path.name.removesuffix('.onnx')}: microseconds a step", title_justify="left")
     table.add_column("operation")

@@ -1,0 +1,73 @@
+"""What a person sees at the end of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from memmlp.evaluation.units import UNITS
+from memmlp.pipeline.run import Outcome
+from memmlp.runs.run import Run
+
+STAGES = ("training", "evaluation", "deployment")
+BRANCHES = ("rotation", "position", "combined")
+COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHES]
+
+
+def show(outcome: Outcome) -> None:
+    """Print a run's metrics in both modes, its latency and sizes, and what to look at next."""
+    console = Console(highlight=False)
+    run, results = outcome.run, outcome.results
+    console.print(said(outcome), soft_wrap=True)
+    if changed := run.changed_sources:
+        console.print(older_code(run, changed), style="yellow", soft_wrap=True)
+    console.print(metrics_table(results))
+    measured = results["latency"]
+    console.print(
+        f"a frame on one CPU core: {measured['median_ms']:.2f} ms median, {measured['p95_ms']:.2f} ms p95 "
+        f"({measured['ratio_to_reference']:.2f} x the reference network)",
+        soft_wrap=True,
+    )
+    console.print(
+        f"{measured['parameters'] / 1e6:.2f} M parameters "
+        f"({measured['parameters_with_vqvae'] / 1e6:.2f} M with the frozen VQ-VAE), "
+        f"{measured['macs'] / 1e6:.0f} MMAC a frame, ONNX {measured['onnx_bytes'] / 1e6:.1f} MB",
+        soft_wrap=True,
+    )
+    console.print(f"run      {run.folder}", soft_wrap=True)
+    console.print(f"picture  {run.picture}", soft_wrap=True)
+
+
+def said(outcome: Outcome) -> str:
+    """What was done, and what was found done."""
+    if not outcome.made:
+        return f"run {outcome.run.id} is finished already; nothing was done (force=true does it again)"
+    found = [stage for stage in STAGES if stage not in outcome.made]
+    before = f"; {' and '.join(found)} found done" if found else ""
+    return f"run {outcome.run.id}: {', '.join(outcome.made)} done{before}"
+
+
+def older_code(run: Run, changed: Sequence[str]) -> str:
+    """The warning that a run was made before code changed under the same recipe numbers."""
+    names = ", ".join(changed[:5]) + (f" and {len(changed) - 5} more" if len(changed) > 5 else "")
+    return (
+        f"run {run.id} was made before the code of {names} changed, under the same recipe numbers: "
+        "force=true makes it again"
+    )
+
+
+def metrics_table(results: dict[str, Any]) -> Table:
+    """The test metrics by mode and branch."""
+    columns = [(mode, branch) for mode, branch in COLUMNS if branch in results.get(mode, {})]
+    table = Table(title="test clips", title_justify="left")
+    table.add_column("metric")
+    table.add_column("unit")
+    for mode, branch in columns:
+        table.add_column(f"{mode}\n{branch}", justify="right")
+    for name, unit in UNITS.items():
+        values = [results[mode][branch].get(name) for mode, branch in columns]
+        table.add_row(name, unit, *("-" if value is None else f"{float(value):.2f}" for value in values))
+    return table

@@ -1,0 +1,184 @@
+"""From a composed config to built objects."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from hydra.utils import get_class
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from memmlp.common.errors import InputError
+from memmlp.config.components import built
+from memmlp.config.compose import composed
+from memmlp.config.motion import build_motion
+from memmlp.config.schema import check, restored
+from memmlp.deploy.deployment import Deployment
+from memmlp.evaluation.ik import IK, LBFGS, NoIK
+from memmlp.evaluation.stage import Evaluation
+from memmlp.motion.body import builtin_rest_joints
+from memmlp.motion.coordinates import Heading, HeadRelative, World
+from memmlp.motion.normalizer import Frame
+from memmlp.networks.architecture import (
+    VQVAE_SETTINGS,
+    Architecture,
+    MemMLPArchitecture,
+    ReferenceArchitecture,
+)
+from memmlp.networks.memory import Memory
+from memmlp.networks.vqvae import VQVAE
+from memmlp.networks.window_model import WindowModel
+from memmlp.pipeline.experiment import Experiment
+from memmlp.runs.identity import flatten
+from memmlp.runs.run import Run
+from memmlp.runs.tracking import Tracker
+from memmlp.training.codes import CodesTraining
+from memmlp.training.losses import Loss, MotionLoss
+from memmlp.training.network import NetworkTraining
+from memmlp.training.optim import Optim, vqvae_optim
+
+COORDINATES: dict[str, type[World]] = {"head_relative": HeadRelative, "world": World, "heading": Heading}
+
+
+def build_experiment(cfg: DictConfig) -> Experiment:
+    """The experiment of a checked config."""
+    outputs = Path(cfg.paths.outputs)
+    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    return Experiment(
+        config=config,
+        outputs=outputs,
+        device=device(cfg.device),
+        force=cfg.force,
+        data=build_motion(cfg),
+        architecture=build_architecture(cfg),
+        codes=CodesTraining(
+            config={"frame": config["frame"], "vqvae": config["vqvae"]},
+            seed=cfg.vqvae.seed,
+            optim=partial(build_vqvae_optim, cfg),
+        ),
+        training=NetworkTraining(
+            seed=cfg.seed,
+            loss=build_loss(cfg),
+            rollout=built(cfg.rollout),
+            optim=Optim(**config["optim"]),
+            weighting=cfg.data.weighting,
+        ),
+        evaluation=Evaluation(
+            modes=list(cfg.evaluation.modes), batch=cfg.evaluation.batch, ik=build_ik(cfg), seed=cfg.seed
+        ),
+        deployment=Deployment(**config["export"]),
+        predictions=Path(cfg.save_predictions) if cfg.save_predictions else None,
+        tracker=build_tracker(cfg),
+    )
+
+
+def untrained(overrides: Sequence[str]) -> WindowModel:
+    """The network of a command line's overrides with random weights, on the built-in body."""
+    architecture = build_architecture(composed(list(overrides)))
+    torch.manual_seed(0)
+    codes = architecture.vqvae() if architecture.uses_codes else None
+    frame = Frame.raw(architecture.coordinates, torch.as_tensor(builtin_rest_joints()))
+    return architecture.build(frame, codes).eval()
+
+
+def build_tracker(cfg: DictConfig) -> Tracker:
+    """What shows the config's runs elsewhere."""
+    places = {"outputs": Path(cfg.paths.outputs)} if "uri" in cfg.tracker else {}
+    return built(cfg.tracker, **places)
+
+
+def device(name: str) -> torch.device:
+    """The device of a config's word."""
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("device=cuda: there is no CUDA device; allowed here is device=cpu or device=auto")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def build_architecture(cfg: DictConfig) -> Architecture:
+    """What builds the network of a checked config."""
+    space = {"coordinates": COORDINATES[cfg.frame.coordinates](), "normalize": cfg.frame.normalize}
+    vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in VQVAE_SETTINGS})
+    if "_target_" in cfg.model:
+        return ReferenceArchitecture(**space, vqvae=vqvae, network=built(cfg.model))
+    memory, kind = built(cfg.memory), memory_class(cfg)
+    return MemMLPArchitecture(
+        **space,
+        vqvae=vqvae,
+        frames=cfg.model.frames,
+        hidden=cfg.model.width,
+        depth=cfg.model.depth,
+        memory=partial(memory, vqvae=vqvae) if kind.trains_codes else memory,
+        memory_kind=kind,
+        predictor=built(cfg.predictor),
+    )
+
+
+def memory_class(cfg: DictConfig) -> type[Memory]:
+    """The class in the memory slot."""
+    return get_class(cfg.memory._target_)
+
+
+def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
+    """What makes the loss over a network's branches: of Mem-MLP weighting and hand term, else as it is."""
+    loss = built(cfg.loss)
+    if isinstance(loss, Loss):
+        return lambda branches: loss
+    return partial(MotionLoss, loss, built(cfg.hand))
+
+
+def build_ik(cfg: DictConfig) -> IK:
+    """The inverse kinematics of a checked config."""
+    if cfg.evaluation.ik == "off":
+        return NoIK()
+    return LBFGS(cfg.evaluation.ik_iterations)
+
+
+def build_vqvae_optim(cfg: DictConfig, frames: int) -> Optim:
+    """The VQ-VAE's training; an epoch is as many frames as there are in the training split."""
+    own, often = cfg.vqvae, {name: cfg.optim[name] for name in ("checkpoint_every", "log_every")}
+    steps = own.steps or math.ceil(own.epochs * frames / own.batch)
+    return vqvae_optim(steps, own.batch, own.lr, own.weight_decay, **often)
+
+
+def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
+    """The typed and checked config of a finished run of a motion network, with overrides of its keys.
+
+    Raises InputError where it is none of this version's, or an override is wrong.
+    """
+    if not run.done or run.manifest.get("kind") != "memmlp":
+        raise InputError(f"run {run.id}: not a finished Mem-MLP run")
+    if foreign := sorted(name for name in _targets(run.config) if not name.startswith("memmlp.")):
+        raise InputError(f"{run.config_path}: {', '.join(foreign)}: allowed are classes of memmlp")
+    try:
+        cfg = restored(run.config)
+    except (OmegaConfBaseException, KeyError, TypeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{run.config_path}: not a config of this version of memmlp ({reason})") from None
+    for word in overrides:
+        _override(cfg, word)
+    check(cfg)
+    return cfg
+
+
+def _targets(tree: Mapping[str, Any]) -> list[str]:
+    """The paths of all classes that a config names."""
+    return [str(value) for key, value in flatten(tree).items() if key.rsplit(".", 1)[-1] == "_target_"]
+
+
+def _override(cfg: DictConfig, word: str) -> None:
+    """Set a key of a typed config to the value of a word KEY=VALUE."""
+    key, equals, _ = word.partition("=")
+    if not equals:
+        raise InputError(f"{word}: allowed is KEY=VALUE")
+    try:
+        override = OverridesParser.create().parse_override(word)  # as `memmlp train` reads it: off is a word
+        OmegaConf.update(cfg, key, override.value(), merge=True)
+    except (OmegaConfBaseException, HydraException) as error:
+        raise InputError(f"{key}: {str(error).splitlines()[0]}") from None

@@ -1,0 +1,66 @@
+"""A finished run with its experiment and data, for the commands that look at it again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from torch import Tensor
+
+from memmlp.common.errors import InputError
+from memmlp.config.build import build_experiment, config_of, device
+from memmlp.motion.dataset import Frames
+from memmlp.motion.source import Prepared
+from memmlp.pipeline.experiment import Experiment
+from memmlp.runs.identity import trained_by
+from memmlp.runs.lookup import find_run
+from memmlp.runs.run import Run
+
+
+class Opened(NamedTuple):
+    """A finished run, what it was built of, and its prepared data."""
+
+    run: Run
+    experiment: Experiment
+    data: Prepared
+
+    @property
+    def test(self) -> Frames:
+        """The test clips, on the experiment's device."""
+        return self.data.open("test").to(self.experiment.device)
+
+
+def opened(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequence[str] = ()) -> Opened:
+    """The finished run of an id, of the beginning of one, or of a folder.
+
+    Args:
+        overrides: of keys of the evaluation and the deployment, KEY=VALUE.
+
+    Raises:
+        InputError: where there is none, an override is of its training, or its data is not what it was
+            trained and tested on.
+    """
+    run = find_run(outputs, name)
+    experiment = replace(build_experiment(config_of(run, overrides)), device=device(device_name))
+    if trained_by(run.config) != trained_by(experiment.config):
+        words = ", ".join(overrides)
+        raise InputError(f"{words}: changes the training; allowed are keys of evaluation and export")
+    data = experiment.data.prepare()
+    if data.digest != run.manifest["data"]:
+        root = experiment.data.source.root
+        raise InputError(f"run {run.id}: its data has changed since (data.root={root})")
+    return Opened(run, experiment, data)
+
+
+def clip_of(test: Frames, name: str) -> Tensor:
+    """All frames (N, 252) of a test clip. Raises InputError where there is none of that name."""
+    return test.clip(clip_index(test, name))
+
+
+def clip_index(test: Frames, name: str) -> int:
+    """The place of a test clip. Raises InputError, which lists them, where there is none of that name."""
+    if name not in test.names:
+        raise InputError(f"--clip {name}: no such test clip; allowed are {', '.join(test.names)}")
+    return test.names.index(name)

@@ -1,0 +1,163 @@
+"""From a sweep file to its plan: every arm composed, checked and given its run's identity.
+
+Composing takes a moment an arm, so a plan is kept and found again while the sweep, the configs and the
+data are what they were.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from memmlp.common.errors import InputError
+from memmlp.common.files import read_json, write_json
+from memmlp.config.shipped import shipped
+from memmlp.sweep.plan import Entry, Plan, Task, unique
+from memmlp.sweep.spec import Arm, Sweep, load_sweep
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from memmlp.pipeline.experiment import Experiment
+
+
+def find_sweep(name: str) -> Sweep:
+    """The sweep of a path, of a shipped file's name, or of a table's number."""
+    if name.endswith((".yaml", ".yml")) or "/" in name:
+        return load_sweep(Path(name))
+    folder = shipped("sweeps")
+    stem = f"table{int(name):02d}" if name.isdecimal() else name
+    path = folder / f"{stem}.yaml"
+    if not path.is_file():
+        known = ", ".join(sorted(file.stem for file in folder.glob("*.yaml")))
+        raise InputError(f"sweep '{name}': no such sweep; allowed are a path ending in .yaml, or {known}")
+    return load_sweep(path)
+
+
+def sweep_folder(sweep: Sweep, outputs: Path) -> Path:
+    """Where a sweep with its command line's overrides keeps its plan and its workers' logs."""
+    key = f"-{digest(sweep.extra)[:8]}" if sweep.extra else ""
+    return outputs / "sweeps" / f"{sweep.name}{key}"
+
+
+def planned(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
+    """The plan of a sweep; with `prepare` its data is brought into being first.
+
+    Entries whose data is not prepared have no identity yet and are left out. Raises InputError, naming arm
+    and key, where a config is wrong.
+    """
+    path = sweep_folder(sweep, outputs) / "planned.json"
+    stamp = _stamp(sweep, outputs)
+    kept = read_json(path)
+    if kept.get("stamp") == stamp and all(_fresh(data) for data in kept["data"]):
+        return Plan.load(path.with_name("plan.json"))
+    plan, data = _plan(sweep, outputs, prepare)
+    plan.save(path.with_name("plan.json"))
+    write_json(path, {"stamp": stamp if data is not None else None, "data": data or []})
+    _remember(sweep, plan, path.with_name("entries.json"))
+    return plan
+
+
+def orphans(sweep: Sweep, plan: Plan) -> list[Entry]:
+    """Runs of earlier versions of the sweep that were begun: of labels gone, or with another config now."""
+    recorded = read_json(sweep_folder(sweep, plan.outputs) / "entries.json").get("entries", [])
+    labels = {arm.label for arm in sweep.arms}
+    now = {(entry.label, entry.seed): entry.id for entry in plan.entries}
+    used = set(now.values())
+    entries = [Entry(entry["label"], entry["seed"], entry["id"]) for entry in recorded]
+    return [
+        entry
+        for entry in entries
+        if entry.id not in used
+        and plan.run_of(entry).manifest
+        and (entry.label not in labels or now.get((entry.label, entry.seed), entry.id) != entry.id)
+    ]
+
+
+def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[str, Any]] | None]:
+    """The plan, and what it relies on of the data; None where some is not prepared."""
+    cells: list[tuple[Entry, list[Task]]] = []
+    data: dict[str, dict[str, Any]] = {}
+    complete = True
+    for arm in sweep.runnable():
+        for seed, experiment in _experiments(sweep, arm, outputs):
+            known = _data_digest(experiment, prepare, data)
+            complete &= known is not None
+            if known is not None:
+                found = tasks_of(experiment, known)
+                cells.append((Entry(arm.label, seed, found[-1].id, found[-1].stages), found))
+    cells.sort(key=lambda cell: sweep.seeds.index(cell[0].seed))  # a half-done sweep has every arm
+    tasks = unique(task for _, found in cells for task in found)
+    plan = Plan(sweep.name, outputs, tuple(entry for entry, _ in cells), tasks)
+    return plan, list(data.values()) if complete else None
+
+
+def _experiments(sweep: Sweep, arm: Arm, outputs: Path) -> Iterable[tuple[int, Experiment]]:
+    """The checked experiments of an arm, seed by seed."""
+    from memmlp.config.build import build_experiment
+    from memmlp.config.compose import composed
+
+    try:
+        cfg = composed(list(sweep.overrides(arm)))
+        for seed in sweep.seeds_of(arm):
+            cfg.seed, cfg.paths.outputs = seed, str(outputs)
+            yield seed, build_experiment(cfg)
+    except InputError as error:
+        raise InputError(f"sweep {sweep.name}, arm '{arm.label}': {error}") from None
+
+
+def tasks_of(experiment: Experiment, data: str) -> list[Task]:
+    """The runs of an experiment on prepared data of that digest, the last one its own."""
+    own = experiment.identity(data)
+    above = own.upstream.id if own.upstream else None
+    upstream = [Task(above, "vqvae", experiment.config)] if above else []
+    return [*upstream, Task(own.id, "memmlp", experiment.config, above, experiment.stages, own.what)]
+
+
+def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[str, Any]]) -> str | None:
+    """The digest of the experiment's prepared data; None where it isn't prepared."""
+    config = {"data": experiment.config["data"], "paths": experiment.config["paths"]}
+    key = digest(config)
+    if key not in known:
+        found = experiment.data.prepare().digest if prepare else experiment.data.digest()
+        if found is None:
+            return None
+        known[key] = {"config": config, "digest": found}
+    return known[key]["digest"]
+
+
+def _fresh(data: dict[str, Any]) -> bool:
+    """Whether the data of a kept plan is what it was."""
+    from omegaconf import OmegaConf
+
+    from memmlp.config.motion import build_motion
+
+    cfg: DictConfig = OmegaConf.create(data["config"])
+    try:
+        return build_motion(cfg).digest() == data["digest"]
+    except InputError:
+        return False
+
+
+def _stamp(sweep: Sweep, outputs: Path) -> str:
+    """Digest of all that a plan follows from but the data: sweep, outputs, configs, the package's code."""
+    package = Path(__file__).parent.parent
+    files = [*shipped("conf").rglob("*.yaml"), *package.rglob("*.py")]
+    texts = [(str(file), file.read_text(encoding="utf-8")) for file in sorted(files)]
+    return digest([asdict(sweep), str(outputs), texts])
+
+
+def _remember(sweep: Sweep, plan: Plan, path: Path) -> None:
+    """Add the plan's entries to those that the sweep ever had."""
+    before = read_json(path).get("entries", [])
+    every = {(e["label"], e["seed"], e["id"]): e for e in [*before, *map(asdict, plan.entries)]}
+    write_json(path, {"entries": list(every.values())})
+
+
+def digest(value: Any) -> str:
+    """Of a value made of what JSON holds; of a tree of dataclasses its `asdict`."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()

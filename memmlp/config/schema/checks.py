@@ -1,0 +1,170 @@
+"""What is refused before anything runs, each in a line that names the key."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from memmlp.common.errors import InputError
+from memmlp.config.schema.config import SCHEMAS, Config
+from memmlp.config.schema.network import Reference
+from memmlp.config.schema.training import AGRoLLoss, NoHand, ReferenceLoss, TeacherForcing
+
+
+def check(cfg: DictConfig) -> None:
+    """Refuse, naming the key, a missing value, one out of range, and an impossible combination."""
+    if OmegaConf.get_type(cfg) is not Config:
+        raise InputError(
+            "the config does not start from the schema; its defaults list needs /schema/config@_here_"
+        )
+    for name, value, rule in _values(cfg, ""):
+        if rule is not None and value is not None and not rule.allows(value):
+            raise InputError(f"{name}={_show(value)}: allowed is {rule}")
+    _check_combinations(cfg)
+
+
+def _values(node: DictConfig, prefix: str) -> Iterator[tuple[str, Any, Any]]:
+    """Dotted key, value and rule of every key of a typed node; a key that is not in the schema is refused."""
+    schema: Any = OmegaConf.get_type(node)
+    known = [spec.name for spec in dataclasses.fields(schema)]
+    for extra in sorted(set(map(str, node)) - set(known)):
+        raise InputError(unknown_key(prefix + extra, known))
+    for spec in dataclasses.fields(schema):
+        name = prefix + spec.name
+        value = _value(node, spec.name, name)
+        if isinstance(value, DictConfig):
+            yield from _values(value, f"{name}.")
+        else:
+            yield name, value, spec.metadata.get("rule")
+
+
+def unknown_key(name: str, keys: Sequence[str]) -> str:
+    """The line about a dotted key that is not among a node's."""
+    own = re.split(r"[./@]", name)[-1]
+    near = difflib.get_close_matches(own, keys, n=1)
+    hint = f"did you mean {near[0]}? " if near else ""
+    fixed = ("name",) if "_target_" in keys else ()  # what an option of a slot is, and is called
+    listed = ", ".join(word for word in keys if not word.startswith("_") and word not in fixed) or "none"
+    return f"{name}: no such key; {hint}allowed here: {listed}"
+
+
+def _value(node: DictConfig, own: str, name: str) -> Any:
+    if OmegaConf.is_missing(node, own):
+        raise InputError(f"{name}: has no value; give one with {name}=...")
+    try:
+        return node[own]
+    except OmegaConfBaseException as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{name}: {reason}") from None
+
+
+def _show(value: Any) -> str:
+    """A value as it would be typed."""
+    return str(list(value)) if OmegaConf.is_list(value) else str(value)
+
+
+SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "tracker")
+
+
+def _check_names(cfg: DictConfig) -> None:
+    """A component that is not of this package has a name that is not of this package's."""
+    for slot in SLOTS:
+        node = cfg[slot]
+        path = node.get("_target_") if node is not None else None
+        if path and not path.startswith("memmlp.") and f"{slot}_{node.name}" in SCHEMAS:
+            raise InputError(f"{slot}.name={node.name}: allowed for {path} is a name of its own")
+
+
+def _check_combinations(cfg: DictConfig) -> None:
+    """What no key alone can tell."""
+    _check_names(cfg)
+    if cfg.optim.final_lr > cfg.optim.lr:
+        raise InputError(f"optim.final_lr={cfg.optim.final_lr}: allowed is at most optim.lr={cfg.optim.lr}")
+    if _is(cfg.model, Reference):
+        _check_reference(cfg)
+    else:
+        _check_slots(cfg)
+    if (cfg.vqvae.epochs is None) == (cfg.vqvae.steps is None):
+        given = f"vqvae.epochs={cfg.vqvae.epochs}, vqvae.steps={cfg.vqvae.steps}"
+        raise InputError(f"{given}: allowed is one of them, and null for the other")
+    split = cfg.data.split
+    held_out = split.val + (split.test if isinstance(split.get("test"), float) else 0)
+    if held_out >= 1:
+        raise InputError(f"data.split.val={split.val}: allowed is less than what data.split.test leaves of 1")
+
+
+def _is(node: DictConfig, schema: type) -> bool:
+    """Whether a group's option is of a schema."""
+    kind = OmegaConf.get_type(node)
+    return kind is not None and issubclass(kind, schema)
+
+
+def _check_reference(cfg: DictConfig) -> None:
+    """A network without slots, a history of its own or positions has nothing set that is about them."""
+    name = cfg.model._target_.rsplit(".", 1)[-1]
+    for group in ("memory", "predictor", "hand"):
+        if cfg[group] is not None:
+            raise InputError(f"{group}: {name} has none; allowed is a command line without {group}=...")
+    if not _is(cfg.loss, ReferenceLoss):
+        raise InputError(f"loss: weights of Mem-MLP's terms, which {name} has not; allowed is its own loss")
+    if not _is(cfg.rollout, TeacherForcing):
+        raise InputError(f"rollout: {name} has no history of its own; allowed is rollout=teacher_forcing")
+    if cfg.evaluation.ik != "off":
+        raise InputError(
+            f"evaluation.ik={cfg.evaluation.ik} needs positions, and {name} has rotations alone: "
+            "allowed is evaluation.ik=off"
+        )
+    if cfg.model.width % cfg.model.get("heads", 1):
+        raise InputError(
+            f"model.heads={cfg.model.heads}: allowed is a divisor of model.width={cfg.model.width}"
+        )
+    steps = cfg.model.get("diffusion_steps", 1)
+    if cfg.model.get("sampling_steps", 1) > steps:
+        raise InputError(
+            f"model.sampling_steps={cfg.model.sampling_steps}: allowed is up to model.diffusion_steps={steps}"
+        )
+
+
+def _check_foreign_loss(cfg: DictConfig, predictor: str) -> None:
+    """AGRoL's loss is of rotations alone, and so may be that of a network that makes nothing else."""
+    if not _is(cfg.loss, AGRoLLoss):
+        raise InputError("loss: that of a reference network; allowed is loss=uncertainty or loss=manual")
+    if not predictor.startswith("RotationOnly") or not _is(cfg.hand, NoHand):
+        raise InputError(
+            "loss=agrol is of rotations alone: allowed is predictor=rotation_only with hand=off, "
+            "or loss=uncertainty or loss=manual"
+        )
+
+
+def _check_slots(cfg: DictConfig) -> None:
+    """What stands in Mem-MLP's slots goes together."""
+    layers = list(cfg.memory.get("layers", []))
+    if layers and max(layers) > cfg.model.depth:
+        raise InputError(f"memory.layers={layers}: allowed is up to model.depth={cfg.model.depth}")
+    predictor = cfg.predictor._target_.rsplit(".", 1)[-1]
+    if _is(cfg.loss, ReferenceLoss):
+        _check_foreign_loss(cfg, predictor)
+    if cfg.hand._target_.endswith("HandPosition") and predictor.startswith("RotationOnly"):
+        raise InputError(
+            "hand=position needs the positions of predictor=two_branch: allowed is hand=fk or hand=off"
+        )
+    if predictor.endswith("Memory") and not layers:
+        raise InputError(
+            "predictor with memory blocks needs a memory, and memory=none is none: "
+            "allowed is another memory, predictor=two_branch or predictor=rotation_only"
+        )
+    if cfg.evaluation.ik != "off" and predictor.startswith("RotationOnly"):
+        raise InputError(
+            f"evaluation.ik={cfg.evaluation.ik} needs the positions of predictor=two_branch: "
+            "allowed is evaluation.ik=off"
+        )
+    if "streams" in cfg.rollout and cfg.rollout.streams < cfg.optim.batch:
+        raise InputError(
+            f"rollout.streams={cfg.rollout.streams}: allowed is at least optim.batch={cfg.optim.batch}"
+        )

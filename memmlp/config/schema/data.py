@@ -1,0 +1,97 @@
+"""The schemas of conf/data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Optional
+
+from memmlp.config.schema.rules import (
+    EachOf,
+    Existing,
+    Text,
+    at_least,
+    called,
+    fraction,
+    key,
+    one_of,
+    positive,
+    target,
+)
+
+# OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
+# The fields' helpers make dataclass fields, not shared defaults.
+# ruff: noqa: UP045, RUF009
+
+
+@dataclass
+class SeededSplit:
+    name: str = called("seeded")
+    _target_: str = target("memmlp.motion.splits.SeededSplit")
+    test: float = fraction()
+    val: float = fraction()
+    seed: int = at_least(0)
+    groups: list[str] = key(EachOf(empty=True))
+
+
+@dataclass
+class ListSplit:
+    name: str = called("lists")
+    _target_: str = target("memmlp.motion.splits.ListSplit")
+    folder: str = key(Existing("folder"))
+    val: float = fraction()
+    seed: int = at_least(0)
+    groups: list[str] = key(EachOf(empty=True))
+
+
+@dataclass
+class SubsetSplit:
+    name: str = called("subsets")
+    _target_: str = target("memmlp.motion.splits.SubsetSplit")
+    train: list[str] = key(EachOf())
+    test: list[str] = key(EachOf())
+    val: float = fraction()
+    seed: int = at_least(0)
+    groups: list[str] = key(EachOf(empty=True))
+
+
+@dataclass
+class Synth:
+    minutes: float = positive()
+    seed: int = at_least(0)
+
+
+@dataclass
+class Data:
+    name: str = key(Text())
+    body: str = key(Existing("file", ("builtin",)))
+    min_frames: int = at_least(2)
+    strict: bool = key()
+    weighting: str = one_of("frames", "clips")
+
+
+@dataclass
+class SynthData(Data):
+    root: str = key(Text())
+    synth: Synth = field(default_factory=Synth)
+    split: SeededSplit = field(default_factory=SeededSplit)
+
+
+@dataclass
+class SeededData(Data):
+    root: str = key(Existing("folder"))
+    synth: Optional[Synth] = None
+    split: SeededSplit = field(default_factory=SeededSplit)
+
+
+@dataclass
+class ListData(Data):
+    root: str = key(Existing("folder"))
+    synth: Optional[Synth] = None
+    split: ListSplit = field(default_factory=ListSplit)
+
+
+@dataclass
+class SubsetData(Data):
+    root: str = key(Existing("folder"))
+    synth: Optional[Synth] = None
+    split: SubsetSplit = field(default_factory=SubsetSplit)

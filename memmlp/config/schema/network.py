@@ -1,0 +1,180 @@
+"""The schemas of what makes a network: conf/frame, model, predictor, memory and vqvae."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Optional, Union
+
+from omegaconf import MISSING
+
+from memmlp.config.schema.rules import (
+    EachOf,
+    Text,
+    Within,
+    at_least,
+    called,
+    fraction,
+    key,
+    one_of,
+    positive,
+    target,
+)
+
+# OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
+# The fields' helpers make dataclass fields, not shared defaults.
+# ruff: noqa: UP007, UP045, RUF009
+
+
+@dataclass
+class Frame:
+    coordinates: str = one_of("heading", "head_relative", "world")
+    normalize: bool = key()
+
+
+@dataclass
+class Model:
+    name: str = called("mem_mlp")
+    frames: int = at_least(2)
+    width: int = at_least(1)
+    depth: int = at_least(1)
+
+
+@dataclass
+class Reference(Model):
+    """A network without slots: it leaves memory, predictor and hand empty."""
+
+    name: str = key(Text())
+    _target_: str = MISSING
+    _partial_: bool = True
+
+
+@dataclass
+class AGRoLMLP(Reference):
+    name: str = called("agrol_mlp")
+    _target_: str = target("memmlp.networks.baselines.agrol.AGRoLMLP")
+
+
+@dataclass
+class AGRoLDiffusion(Reference):
+    name: str = called("agrol_diffusion")
+    _target_: str = target("memmlp.networks.baselines.agrol.AGRoLDiffusion")
+    width: int = at_least(2)
+    diffusion_steps: int = at_least(1)
+    sampling_steps: int = at_least(1)
+    noise_seed: int = at_least(0)
+
+
+@dataclass
+class AvatarPoser(Reference):
+    name: str = called("avatar_poser")
+    _target_: str = target("memmlp.networks.baselines.avatar_poser.AvatarPoser")
+    heads: int = at_least(1)
+    feedforward: int = at_least(1)
+    dropout: float = fraction()
+
+
+@dataclass
+class Predictor:
+    name: str = key(Text())
+    _target_: str = MISSING
+    _partial_: bool = True
+    depth: int = at_least(0)
+
+
+@dataclass
+class TwoBranch(Predictor):
+    name: str = called("two_branch")
+    _target_: str = target("memmlp.networks.predictor.TwoBranch")
+
+
+@dataclass
+class RotationOnly(Predictor):
+    name: str = called("rotation_only")
+    _target_: str = target("memmlp.networks.predictor.RotationOnly")
+
+
+@dataclass
+class TwoBranchMemory(Predictor):
+    name: str = called("two_branch_memory")
+    _target_: str = target("memmlp.networks.predictor.TwoBranchMemory")
+    depth: int = at_least(1)
+
+
+@dataclass
+class RotationOnlyMemory(Predictor):
+    name: str = called("rotation_only_memory")
+    _target_: str = target("memmlp.networks.predictor.RotationOnlyMemory")
+    depth: int = at_least(1)
+
+
+@dataclass
+class Memory:
+    name: str = key(Text())
+    _target_: str = MISSING
+    _partial_: bool = True
+
+
+@dataclass
+class NoMemory(Memory):
+    name: str = called("none")
+    _target_: str = target("memmlp.networks.memory.NoMemory")
+
+
+@dataclass
+class NoCodesMemory(Memory):
+    name: str = called("no_codes")
+    _target_: str = target("memmlp.networks.memory.NoCodesMemory")
+    layers: list[int] = key(EachOf(Within(1)))
+    width: int = at_least(1)
+    shift: str = one_of("frame", "window")
+    history: str = one_of("first", "latest")
+    fusion: str = one_of("residual", "plain")
+    blend: Union[int, float, str] = key(Within(0, 1, words=("sampled",)))
+
+
+@dataclass
+class CodeMemory(NoCodesMemory):
+    name: str = called("vq")
+    _target_: str = target("memmlp.networks.memory.CodeMemory")
+
+
+@dataclass
+class JointCodeMemory(NoCodesMemory):
+    name: str = called("vq_joint")
+    _target_: str = target("memmlp.networks.memory.JointCodeMemory")
+
+
+@dataclass
+class RecurrentMemory(Memory):
+    layers: list[int] = key(EachOf(Within(1)))
+    width: int = at_least(1)
+    fusion: str = one_of("residual", "plain")
+
+
+@dataclass
+class LSTMMemory(RecurrentMemory):
+    name: str = called("lstm")
+    _target_: str = target("memmlp.networks.memory.LSTMMemory")
+
+
+@dataclass
+class GRUMemory(RecurrentMemory):
+    name: str = called("gru")
+    _target_: str = target("memmlp.networks.memory.GRUMemory")
+
+
+@dataclass
+class VQVAE:
+    codes: int = at_least(1)
+    width: int = at_least(1)
+    encoder_depth: int = at_least(0)
+    decoder_depth: int = at_least(0)
+    commitment: float = at_least(0)
+    decay: float = key(Within(0, 1, strict=True))
+    codebook: str = one_of("ema", "gradient")
+    seed: int = key(Within(0, 2**63 - 1))
+    epochs: Optional[float] = positive()
+    steps: Optional[int] = at_least(1)
+    batch: int = at_least(1)
+    lr: float = positive()
+    weight_decay: float = at_least(0)

@@ -1,0 +1,62 @@
+"""What a worker of a sweep does with a task: build its experiment and bring its run to its end."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from memmlp.common.errors import InputError
+from memmlp.sweep.plan import Plan, Task
+from memmlp.sweep.worker import Cancelled, Presence, directed
+from memmlp.sweep.worker import work as work_on
+
+if TYPE_CHECKING:
+    from memmlp.pipeline.experiment import Experiment
+
+
+def work(path: str, threads: int, controller: str) -> None:
+    """Take tasks of the plan in that file while its controller's process lives."""
+    work_on(Path(path), partial(perform, Path(path), threads), lambda: Presence.of(Path(controller)))
+
+
+def work_alone(path: str) -> None:
+    """Take tasks of the plan in that file until none is left, whether or not a sweep's controller stays."""
+    work_on(Path(path), partial(perform, Path(path), 0), lambda: directed(Path(path)))
+
+
+def perform(path: Path, threads: int, plan: Plan, task: Task) -> None:
+    """Bring the task's run to its end; Cancelled if the plan no longer wants it.
+
+    threads: of torch, where the config leaves them open; 0 for torch's choice.
+    """
+    import torch
+    from omegaconf import OmegaConf
+
+    from memmlp.config.build import build_experiment
+    from memmlp.pipeline.run import codes_run, run
+
+    experiment = build_experiment(OmegaConf.create(dict(task.config)))
+    check_identity(experiment, task)
+    if chosen := experiment.config["threads"] or threads:
+        torch.set_num_threads(chosen)
+    if task.kind == "vqvae":
+        codes_run(experiment, experiment.data.prepare())
+    else:
+        run(experiment, partial(check_wanted, path, task.id))
+
+
+def check_identity(experiment: Experiment, task: Task) -> None:
+    """Raise InputError where this code takes the task's config for another run than the plan does."""
+    from memmlp.config.plan import tasks_of
+
+    digest = experiment.data.prepare().digest
+    if task.key not in {found.key for found in tasks_of(experiment, digest)}:
+        raise InputError(f"run {task.id}: the data or the code changed since the sweep began; start it again")
+
+
+def check_wanted(path: Path, run_id: str, step: int, values: dict[str, float]) -> None:
+    """Raise Cancelled once the plan in that file has given the run up, or all of its runs."""
+    plan = Plan.load(path)
+    if run_id in plan.cancelled or plan.stopped:
+        raise Cancelled(f"run {run_id} was cancelled at step {step}")

@@ -1,0 +1,105 @@
+"""ONNX of one streaming step with its state explicit.
+
+Inputs: `sparse` (1, 54), the world features of the newest frame (order: memmlp.motion.body), and `state.*`,
+all zeros for a fresh start. Outputs: `rotation6d` (1, 22, 6) local rotations, `position` (1, 22, 3) metres in
+the world, and the new `state.*` under the same names with the suffix `.next`.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import warnings
+from pathlib import Path
+
+import onnx
+import torch
+from torch import Tensor, nn
+
+from memmlp import __version__
+from memmlp.deploy.parity import deterministic
+from memmlp.motion.body import FEATURES, FPS, JOINTS, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
+from memmlp.networks.streaming import Stream
+from memmlp.networks.window_model import WindowModel
+
+OPSET = 18
+
+
+class StreamStep(nn.Module):
+    """One step of the live stream with flat inputs and outputs."""
+
+    def __init__(self, model: WindowModel | Stream):
+        super().__init__()
+        self.model = model
+        self.names = list(model.initial_state(1))
+
+    def forward(self, sparse: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        """sparse (1, 54) and the state -> rotation6d (1, 22, 6), position (1, 22, 3), the new state."""
+        motion, new = self.model.advance(sparse[:, None], dict(zip(self.names, state, strict=True)), 1)
+        last = motion[:, -1]
+        rotation = last[:, ROTATION].unflatten(-1, (N_JOINTS, 6))
+        position = last[:, POSITION].unflatten(-1, (N_JOINTS, 3))
+        return rotation, position, *(new[name] for name in self.names)
+
+
+def export(model: WindowModel | Stream, path: Path, run_id: str) -> None:
+    """Write the model's streaming step, on the CPU in float32, as one ONNX file with its metadata."""
+    step = StreamStep(model.cpu().eval())
+    names = [f"state.{name}" for name in step.names]
+    save(
+        step,
+        (torch.zeros(1, SPARSE_DIM), *model.initial_state(1).values()),
+        ["sparse", *names],
+        ["rotation6d", "position", *(f"{name}.next" for name in names)],
+        path,
+        metadata(model, run_id),
+    )
+
+
+def save(
+    step: nn.Module,
+    arguments: tuple[Tensor, ...],
+    inputs: list[str],
+    outputs: list[str],
+    path: Path,
+    meta: dict[str, str],
+) -> None:
+    """Write a step with named flat inputs and outputs as one ONNX file, atomically."""
+    quiet = logging.getLogger("torch.onnx")
+    level = quiet.level
+    quiet.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings(), deterministic(step):
+            warnings.simplefilter("ignore")  # the exporter's own deprecations are no news to our users
+            program = torch.onnx.export(
+                step,
+                arguments,
+                input_names=inputs,
+                output_names=outputs,
+                opset_version=OPSET,
+                dynamo=True,
+                verbose=False,
+            )
+    finally:
+        quiet.setLevel(level)
+    assert program is not None
+    graph = program.model_proto
+    onnx.helper.set_model_props(graph, meta)
+    temporary = path.with_name(path.name + ".tmp")
+    onnx.save(graph, temporary)
+    temporary.replace(path)
+
+
+def metadata(model: WindowModel | Stream, run_id: str) -> dict[str, str]:
+    """What a program needs to know to drive the file."""
+    return {
+        "joints": json.dumps(JOINTS),
+        "parents": json.dumps(PARENTS),
+        "rest": json.dumps(model.frame.rest.tolist()),
+        "branches": json.dumps(sorted(model.branches)),
+        "fps": str(FPS),
+        "T": str(model.frames),
+        "features": FEATURES,
+        "memmlp_version": __version__,
+        "run_id": run_id,
+    }

@@ -1,0 +1,153 @@
+"""How long one streaming step takes on a CPU, and how much work it is."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Hashable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from onnx import TensorProto, helper
+from torch.utils.flop_counter import FlopCounterMode
+
+from memmlp.deploy.session import OnnxStream
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.networks.streaming import Stream
+from memmlp.networks.window_model import WindowModel
+
+WARM_UP = 30
+SETTLING = 3
+Key = TypeVar("Key", bound=Hashable)
+REFERENCE_SHAPE = (41, 512, 8)  # rows, width, layers: 86 M multiply-adds of plain matrix products
+
+
+def measure(path: Path, steps: int = 200) -> dict[str, Any]:
+    """Median and p95 milliseconds a step of an exported file, one thread, beside the reference network.
+
+    The two are timed in turn, step by step, in the same minute, so that machines can be compared by the
+    ratio. `steps` is at least 200.
+    """
+    stream, reference = OnnxStream(path), reference_session()
+    sparse = np.zeros((1, SPARSE_DIM), np.float32)
+    rows = {"input": np.ones(REFERENCE_SHAPE[:2], np.float32)}
+    ours, theirs = [], []
+    for step in range(WARM_UP + max(steps, 200)):
+        start = time.perf_counter()
+        stream.step(sparse)
+        middle = time.perf_counter()
+        reference.run(None, rows)
+        if step >= WARM_UP:
+            ours.append(middle - start)
+            theirs.append(time.perf_counter() - middle)
+    return {
+        **_milliseconds("", ours),
+        **_milliseconds("reference_", theirs),
+        "ratio_to_reference": float(np.median(ours) / np.median(theirs)),
+        "steps": len(ours),
+        "threads": 1,
+    }
+
+
+def interleaved(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, np.ndarray]:
+    """Seconds (rounds, steps) a step of each exported file, one thread, the files in turn in each round.
+
+    A file's first steps of a round, in which the caches fill, do not count.
+    """
+    streams = {key: OnnxStream(path) for key, path in paths.items()}
+    seconds = {key: np.zeros((rounds, steps)) for key in paths}
+    sparse = np.random.default_rng(0).standard_normal((1, SPARSE_DIM), np.float32)
+    for index in range(rounds):
+        for key, stream in streams.items():
+            for step in range(-SETTLING, steps):
+                start = time.perf_counter()
+                stream.step(sparse)
+                if step >= 0:
+                    seconds[key][index, step] = time.perf_counter() - start
+    return seconds
+
+
+def profile(path: Path, steps: int = 100) -> list[tuple[str, str, float, float]]:
+    """Where a step's time goes: operation, shape of its first input, times a step, microseconds each.
+
+    The median of each, by ONNX Runtime's own profile, which adds one or two microseconds to each; the
+    costliest first.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        stream = OnnxStream(path, profile=Path(folder) / "profile")
+        for _ in range(WARM_UP + steps):
+            stream.step(np.zeros((1, SPARSE_DIM), np.float32))
+        events = json.loads(Path(stream.session.end_profiling()).read_text())
+    found: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for event in events:
+        if event.get("cat") == "Node" and event["name"].endswith("kernel_time"):
+            shapes = [next(iter(shape.values())) for shape in event["args"].get("input_type_shape", [])]
+            found[event["args"]["op_name"], str(shapes[0]) if shapes else ""].append(event["dur"])
+    rows = [(*key, len(us) / (WARM_UP + steps), float(np.median(us))) for key, us in found.items()]
+    return sorted(rows, key=lambda row: -row[2] * row[3])
+
+
+def size(model: WindowModel, step: WindowModel | Stream, path: Path) -> dict[str, Any]:
+    """Parameters, MACs and FLOPs of the network, which the papers count, MACs of the step, the file's bytes.
+
+    A FLOP is a multiplication or an addition of the matrix products, a MAC one of each.
+
+    Args:
+        model: the network as it was trained. step: what was exported of it. path: that file.
+    """
+    multiplied = macs(model.cpu().eval())
+    return {
+        "parameters": model.count_parameters(),
+        "parameters_with_vqvae": sum(p.numel() for p in model.parameters()),
+        "macs": multiplied,
+        "flops": 2 * multiplied,
+        "step_macs": macs(step.cpu().eval()),
+        "onnx_bytes": path.stat().st_size,
+    }
+
+
+@torch.no_grad()
+def macs(model: WindowModel | Stream) -> int:
+    """Multiply-adds of the matrix products of one streaming step."""
+    with FlopCounterMode(display=False) as counter:
+        model.advance(torch.zeros(1, 1, SPARSE_DIM), model.initial_state(1), 1)
+    return counter.get_total_flops() // 2
+
+
+def reference_session() -> onnxruntime.InferenceSession:
+    """A fixed stack of matrix products and ReLUs, the same for ever, as a yardstick for machines."""
+    rows, width, layers = REFERENCE_SHAPE
+    weight = np.random.default_rng(0).standard_normal((width, width), np.float32) / np.sqrt(width)
+    nodes, name = [], "input"
+    for layer in range(layers):
+        nodes.append(helper.make_node("MatMul", [name, "weight"], [f"product{layer}"]))
+        nodes.append(helper.make_node("Relu", [f"product{layer}"], [f"hidden{layer}"]))
+        name = f"hidden{layer}"
+    value = helper.make_tensor_value_info
+    graph = helper.make_graph(
+        nodes,
+        "reference",
+        [value("input", TensorProto.FLOAT, [rows, width])],
+        [value(name, TensorProto.FLOAT, [rows, width])],
+        [onnx.numpy_helper.from_array(weight.astype(np.float32), "weight")],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    return onnxruntime.InferenceSession(
+        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+    )
+
+
+def _milliseconds(prefix: str, seconds: list[float]) -> dict[str, float]:
+    """Median and 95th percentile in milliseconds."""
+    return {
+        f"{prefix}median_ms": 1000 * float(np.median(seconds)),
+        f"{prefix}p95_ms": 1000 * float(np.percentile(seconds, 95)),
+    }

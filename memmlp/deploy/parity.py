@@ -1,0 +1,69 @@
+"""The proof that an ONNX file computes what the network does: both stream a whole clip."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from memmlp.common.progress import track
+from memmlp.deploy.session import OnnxStream
+from memmlp.motion.body import ROTATION, SPARSE_DIM
+from memmlp.networks.memory import Blend
+from memmlp.networks.window_model import WindowModel
+
+TOLERANCE = 1e-4
+
+
+@contextmanager
+def deterministic(model: nn.Module) -> Iterator[None]:
+    """No draws, which torch and ONNX Runtime could not share: a sampled m (reading 7) is its mean."""
+    sampled = [module for module in model.modules() if isinstance(module, Blend) and module.sampled]
+    values = [blend.value for blend in sampled]
+    try:
+        for blend in sampled:
+            blend.value = Blend.MEAN
+        yield
+    finally:
+        for blend, value in zip(sampled, values, strict=True):
+            blend.value = value
+
+
+@torch.no_grad()
+def parity(model: WindowModel, path: Path, clip: Tensor) -> float:
+    """Largest difference between torch and ONNX Runtime, each with its own history, over a clip (N, 252).
+
+    A network without a position branch: its positions are compared with those that follow from the same
+    rotations. Where 6D columns are almost parallel, which an untrained network makes now and then, a
+    difference between rotations within float32's rounding would come out a hundredfold.
+    """
+    model, clip = model.cpu().eval(), clip.cpu()
+    made, found = in_torch(model, clip), streamed(OnnxStream(path), clip)
+    if "position" not in model.branches:
+        exact = copy.deepcopy(model.frame).double()
+        positions = exact.pose(found.double(), clip[:, :SPARSE_DIM].double())
+        made = torch.cat([made[:, ROTATION], positions.flatten(1)], 1)
+    return float((made - found).abs().max())
+
+
+@torch.no_grad()
+def in_torch(model: WindowModel, clip: Tensor) -> Tensor:
+    """Motion (N, 198) in the world that the network streams of a clip's inputs (N, 252 or 54)."""
+    state, made = model.initial_state(1), []
+    with deterministic(model):
+        for sparse in track(clip[:, None, None, :SPARSE_DIM], "check"):
+            motion, state = model.advance(sparse, state)
+            made.append(motion[0, -1])
+    return torch.stack(made)
+
+
+def streamed(stream: OnnxStream, clip: Tensor) -> Tensor:
+    """Motion (N, 198) in the world that a fresh stream makes of a clip's inputs (N, 252)."""
+    stream.reset()
+    outputs = [stream.step(sparse) for sparse in clip[:, None, :SPARSE_DIM].numpy()]
+    return torch.tensor(np.stack([np.concatenate([r.ravel(), p.ravel()]) for r, p in outputs]))

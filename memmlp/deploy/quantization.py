@@ -1,0 +1,117 @@
+"""int8 of an exported stream, by ONNX Runtime's static quantisation, and what it costs in accuracy.
+
+Weights have a scale for each output and seven bits, since CPUs without VNNI add products of eight in
+sixteen and overflow. Activations have eight bits and one scale, from training clips streamed through the
+network. What stands at the network's ends stays in float32 (`Stream.ends`): the stem's input has
+outliers, and the heads' rounding would be seen as jitter.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+from torch import Tensor
+
+from memmlp.deploy.parity import streamed
+from memmlp.deploy.session import OnnxStream
+from memmlp.evaluation.modes import rotations_report
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.normalizer import Frame
+
+MAX_GROWTH = 0.01
+"""Of MPJPE, up to which int8 may stand for float32."""
+
+CALIBRATION_CLIPS, CALIBRATION_FRAMES, CALIBRATION_EVERY = 40, 400, 20
+TEST_FRAMES = 20_000  # that accuracy is measured on, at most
+
+
+class Calibration(CalibrationDataReader):
+    """Inputs and states of a stream of the middle of each clip (N, 252), every twentieth frame of it."""
+
+    def __init__(self, path: Path, clips: Sequence[Tensor]):
+        self.samples = _samples(OnnxStream(path), clips[:CALIBRATION_CLIPS])
+
+    def get_next(self) -> dict[str, np.ndarray] | None:  # type: ignore[override]
+        """The next sample, None at the end."""
+        return next(self.samples, None)  # type: ignore[arg-type]
+
+
+def _samples(stream: OnnxStream, clips: Sequence[Tensor]) -> Iterator[dict[str, np.ndarray]]:
+    for clip in clips:
+        stream.reset()
+        start = max(len(clip) - CALIBRATION_FRAMES, 0) // 2
+        for index, sparse in enumerate(clip[start : start + CALIBRATION_FRAMES, None, :SPARSE_DIM].numpy()):
+            if index % CALIBRATION_EVERY == CALIBRATION_EVERY - 1:
+                yield {"sparse": sparse, **stream.state}
+            stream.step(sparse)
+
+
+def quantise(source: Path, path: Path, ends: Sequence[str], clips: Sequence[Tensor]) -> None:
+    """Write the int8 form of an exported stream.
+
+    Args:
+        source: of a streaming graph, float32. path: the file to write.
+        ends: names of the stream's modules that stay in float32.
+        clips: training clips (N, 252) for the activations' ranges.
+    """
+    temporary, quiet = path.with_name(path.name + ".tmp"), logging.getLogger()
+    level = quiet.level
+    quiet.setLevel(logging.ERROR)  # it advises a preparation that torch's exporter has done
+    try:
+        quantize_static(
+            source,
+            temporary,
+            Calibration(source, clips),
+            quant_format=QuantFormat.QDQ,
+            nodes_to_quantize=_inner_layers(onnx.load(source), ends),
+            op_types_to_quantize=["Gemm", "MatMul"],
+            per_channel=True,
+            reduce_range=True,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+            extra_options={"OpTypesToExcludeOutputQuantization": ["Gemm", "MatMul"]},
+        )
+        temporary.replace(path)
+    finally:
+        quiet.setLevel(level)
+        temporary.unlink(missing_ok=True)
+
+
+def _inner_layers(graph: onnx.ModelProto, ends: Sequence[str]) -> list[str]:
+    """Names of the nodes that multiply by a layer's weight, those at the ends left out."""
+    weights = {tensor.name for tensor in graph.graph.initializer}
+    kept = tuple(f"model.{end}." for end in ends)
+    return [
+        node.name
+        for node in graph.graph.node
+        if node.op_type in ("Gemm", "MatMul")
+        and node.input[1] in weights
+        and node.input[1].startswith("model.")
+        and not node.input[1].startswith(kept)
+    ]
+
+
+def accuracy(path: Path, frame: Frame, clips: Sequence[Tensor]) -> dict[str, float]:
+    """Means over clips (N, 252) of the rotation branch's metrics, streamed in ONNX Runtime.
+
+    At most 20,000 frames of them are streamed, of each clip the same share.
+    """
+    stream, share = OnnxStream(path), min(1.0, TEST_FRAMES / sum(map(len, clips)))
+    rows = []
+    for clip in clips:
+        truth = clip[: max(int(share * len(clip)), 2)]
+        rows.append(rotations_report(frame, streamed(stream, truth), truth))
+    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+
+
+def compared(exact: Path, quantised: Path, frame: Frame, clips: Sequence[Tensor]) -> dict[str, Any]:
+    """What int8 costs: metrics of both on test clips, MPJPE's growth, and whether it may be the default."""
+    before, after = (accuracy(path, frame, clips) for path in (exact, quantised))
+    growth = after["MPJPE"] / before["MPJPE"] - 1
+    return {"fp32": before, "int8": after, "growth": growth, "default": growth <= MAX_GROWTH}

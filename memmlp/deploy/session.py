@@ -1,0 +1,108 @@
+"""An exported step in ONNX Runtime on one thread: arrays bound once, the state carried. Needs no torch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+from memmlp.common.errors import InputError
+
+Arrays = dict[str, np.ndarray]
+STATE, NEXT = "state.", ".next"
+
+
+class OnnxStream:
+    """An ONNX file whose inputs `state.*` are fed by its outputs `state.*.next`.
+
+    A step writes the new state beside the old one, and the two change places, so that nothing is allocated
+    or copied.
+
+    Args:
+        path: the ONNX file. profile: where ONNX Runtime's profile goes, if anywhere: the start of the path.
+
+    Attributes:
+        inputs: the other inputs, to be written before a step. outputs: the other outputs of the last step,
+            overwritten by the next.
+
+    Raises:
+        InputError: for a file that is missing, does not run, or has not the form of such a step.
+    """
+
+    def __init__(self, path: Path, profile: Path | None = None):
+        self.path = path
+        self.session = open_session(path, profile)
+        self._check()
+        given = {i.name: np.zeros(i.shape, np.float32) for i in self.session.get_inputs()}
+        self.inputs = {name: array for name, array in given.items() if not name.startswith(STATE)}
+        self._state = {name: array for name, array in given.items() if name.startswith(STATE)}
+        self._other = {name: np.zeros_like(array) for name, array in self._state.items()}
+        made = {o.name: o.shape for o in self.session.get_outputs() if not o.name.endswith(NEXT)}
+        self.outputs = {name: np.zeros(shape, np.float32) for name, shape in made.items()}
+        self._binding = self._bound(self._state, self._other)
+        self._other_binding = self._bound(self._other, self._state)
+
+    def _check(self) -> None:
+        """Refuse a file of other inputs and outputs."""
+        inputs = {i.name: i.shape for i in self.session.get_inputs()}
+        outputs = {o.name: o.shape for o in self.session.get_outputs()}
+        ends = [*self.session.get_inputs(), *self.session.get_outputs()]
+        arrays = all(e.type == "tensor(float)" and all(isinstance(n, int) for n in e.shape) for e in ends)
+        states = {f"{name}{NEXT}": shape for name, shape in inputs.items() if name.startswith(STATE)}
+        if not arrays or any(outputs.get(name) != shape for name, shape in states.items()):
+            raise InputError(f"{self.path}: no network of memmlp's; allowed is what memmlp export writes")
+
+    @property
+    def state(self) -> Arrays:
+        """The state as it stands, a copy."""
+        return {name: array.copy() for name, array in self._state.items()}
+
+    def reset(self) -> None:
+        """A fresh start: zeros."""
+        for array in self._state.values():
+            array[:] = 0
+
+    def peek(self) -> None:
+        """A step whose new state is not kept."""
+        self.session.run_with_iobinding(self._binding)
+
+    def advance(self) -> None:
+        """A step from `inputs` to `outputs`."""
+        self.peek()
+        self._state, self._other = self._other, self._state
+        self._binding, self._other_binding = self._other_binding, self._binding
+
+    def step(self, *given: np.ndarray) -> list[np.ndarray]:
+        """A step with inputs and outputs in the file's order: for scope `network`, sparse (1, 54) ->
+        rotation6d (1, 22, 6) and position (1, 22, 3)."""
+        for array, value in zip(self.inputs.values(), given, strict=True):
+            array[:] = value
+        self.advance()
+        return [array.copy() for array in self.outputs.values()]
+
+    def _bound(self, old: Arrays, new: Arrays) -> onnxruntime.IOBinding:
+        """A step from one set of state arrays to the other."""
+        binding = self.session.io_binding()
+        for name, array in {**self.inputs, **old}.items():
+            binding.bind_input(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
+        following = {name + NEXT: array for name, array in new.items()}
+        for name, array in {**self.outputs, **following}.items():
+            binding.bind_output(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
+        return binding
+
+
+def open_session(path: Path, profile: Path | None = None) -> onnxruntime.InferenceSession:
+    """An ONNX file in ONNX Runtime on one thread. Raises InputError where it is none."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; allowed: what memmlp export writes, or a run's folder")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    if profile is not None:
+        options.enable_profiling, options.profile_file_prefix = True, str(profile)
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its own kinds of error have no common name
+        raise InputError(
+            f"{path}: no ONNX file that runs here ({' '.join(str(error).split())[:120]})"
+        ) from error

@@ -1,0 +1,64 @@
+"""The field's metrics (brief definitions beside each), as pure functions per clip. Lower is better.
+
+Positions (N, 22, 3) are metres in the world at 60 Hz; rotations (N, 22, 3, 3) are local, the root's global.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from memmlp.motion.body import FPS, HANDS, LOWER, ROOT, UPPER
+from memmlp.motion.geometry import geodesic_angle, matrix_to_axis_angle
+
+POSITION_GROUPS = {"Hand PE": HANDS, "Upper PE": UPPER, "Lower PE": LOWER, "Root PE": (ROOT,)}
+
+
+def mpjre(predicted: Tensor, truth: Tensor) -> Tensor:
+    """AGRoL's MPJRE, degrees: mean |difference of the 63 axis-angle components| of joints 1-21.
+
+    Each difference is wrapped to [-pi, pi]. It is no angle: a 5 degree error reads 2.5 to 3.2.
+    """
+    difference = matrix_to_axis_angle(predicted[:, 1:]) - matrix_to_axis_angle(truth[:, 1:])
+    wrapped = torch.remainder(difference + math.pi, 2 * math.pi) - math.pi
+    return torch.rad2deg(wrapped.abs().mean())
+
+
+def geodesic(predicted: Tensor, truth: Tensor) -> Tensor:
+    """Mean angle between predicted and true local rotations of joints 1-21, degrees."""
+    return torch.rad2deg(geodesic_angle(predicted[:, 1:], truth[:, 1:]).mean())
+
+
+def position_error(predicted: Tensor, truth: Tensor, joints: tuple[int, ...] | None = None) -> Tensor:
+    """Mean distance over frames and the given joints (all 22 by default), cm."""
+    distance = (predicted - truth).norm(dim=-1)
+    return 100 * (distance if joints is None else distance[:, list(joints)]).mean()
+
+
+def velocity_error(predicted: Tensor, truth: Tensor) -> Tensor:
+    """Mean norm of the difference of frame-to-frame velocities (MPJVE), cm/s; NaN under 2 frames."""
+    return 100 * FPS * (predicted.diff(dim=0) - truth.diff(dim=0)).norm(dim=-1).mean()
+
+
+def jitter(positions: Tensor) -> Tensor:
+    """Mean norm of the third difference of position, 10^2 m/s^3; NaN under 4 frames."""
+    return positions.diff(n=3, dim=0).norm(dim=-1).mean() * FPS**3 / 100
+
+
+def positions_report(predicted: Tensor, truth: Tensor) -> dict[str, float]:
+    """The position metrics of one clip."""
+    report = {"MPJPE": position_error(predicted, truth)}
+    report |= {name: position_error(predicted, truth, group) for name, group in POSITION_GROUPS.items()}
+    report |= {
+        "MPJVE": velocity_error(predicted, truth),
+        "Jitter": jitter(predicted),
+        "GT Jitter": jitter(truth),
+    }
+    return {name: float(value) for name, value in report.items()}
+
+
+def rotations_report(predicted: Tensor, truth: Tensor) -> dict[str, float]:
+    """The rotation metrics of one clip."""
+    return {"MPJRE": float(mpjre(predicted, truth)), "geodesic": float(geodesic(predicted, truth))}

@@ -1,0 +1,176 @@
+"""Evaluation in the two modes of the field, all clips side by side in one batch.
+
+`stream` is live use: one frame at a time, the network's own history, the last frame of each window kept.
+`window` is AGRoL's: non-overlapping windows whose T frames all count; the tail window is shifted back and
+its overlap dropped. A network that recalls the window which ended one frame before is led through each
+window frame by frame, so that it recalls what it was trained on: in one call it would get the window of T
+frames ago. What it shows of a window is its last call's output.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from memmlp.common.progress import track
+from memmlp.evaluation import metrics
+from memmlp.evaluation.ik import IK, NoIK
+from memmlp.motion.body import N_JOINTS, POSITION, ROTATION, SPARSE_DIM
+from memmlp.motion.dataset import Frames
+from memmlp.motion.geometry import sixd_to_matrix
+from memmlp.motion.normalizer import Frame
+from memmlp.networks.memory import State
+
+
+class Network(Protocol):
+    """What can be evaluated: Mem-MLP, or anything that moves in time as it does."""
+
+    frame: Frame
+    frames: int
+
+    @property
+    def shift(self) -> int:
+        """Frames by which its own past, which it sees, ends before the newest; 0 without one."""
+
+    def initial_state(self, batch: int = 1) -> State:
+        """A fresh start."""
+
+    def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
+        """New inputs (B, n, 54) -> motion (B, newest or T, 198) in the world, and the new state."""
+
+
+def stream(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
+    """Motion (N, 198) in the world of clips' frames (N, 252), frame by frame."""
+    return frame_by_frame(network, clips, 1)
+
+
+def window(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
+    """Motion (N, 198) in the world of clips' frames (N, 252), by non-overlapping windows."""
+    if 0 < network.shift < network.frames:
+        return frame_by_frame(network, clips, network.frames)
+    return window_by_window(network, clips)
+
+
+@torch.no_grad()
+def frame_by_frame(network: Network, clips: Sequence[Tensor], size: int) -> list[Tensor]:
+    """Motion (N, 198) of clips (N, 252), of each `size` frames (and those left) as the last call made it."""
+    order = sorted(range(len(clips)), key=lambda i: -len(clips[i]))
+    lengths = [len(clips[i]) for i in order]
+    inputs = torch.nn.utils.rnn.pad_sequence([clips[i][:, :SPARSE_DIM] for i in order], batch_first=True)
+    motion = inputs.new_zeros(*inputs.shape[:2], POSITION.stop)
+    state = network.initial_state(len(clips))
+    active = len(clips)
+    for t in track(range(lengths[0]), "stream"):
+        while lengths[active - 1] <= t:  # the clips are sorted: those that ended are the last ones
+            active -= 1
+            state = {name: tensor[:active] for name, tensor in state.items()}
+        since = t - t % size
+        output, state = network.advance(inputs[:active, t : t + 1], state, t + 1 - since)
+        motion[:active, since : t + 1] = output[:, since - t - 1 :]  # over what earlier calls made
+    return [motion[order.index(i), : len(clip)] for i, clip in enumerate(clips)]
+
+
+@torch.no_grad()
+def window_by_window(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
+    """Motion (N, 198) of clips (N, 252), T new frames at each call."""
+    size = network.frames
+    padded = [_at_least(clip[:, :SPARSE_DIM], size) for clip in clips]
+    order = sorted(range(len(clips)), key=lambda i: -len(padded[i]))
+    motion = [clip.new_zeros(len(clip), POSITION.stop) for clip in padded]
+    state = network.initial_state(len(clips))
+    for start in range(0, len(padded[order[0]]), size):
+        order = [i for i in order if len(padded[i]) > start]
+        state = {name: tensor[: len(order)] for name, tensor in state.items()}
+        begin = [min(start, len(padded[i]) - size) for i in order]
+        inputs = torch.stack([padded[i][b : b + size] for i, b in zip(order, begin, strict=True)])
+        output, state = network.advance(inputs, state)
+        for i, b, result in zip(order, begin, output, strict=True):
+            motion[i][start : b + size] = result[start - b :]
+    return [whole[-len(clip) :] for whole, clip in zip(motion, clips, strict=True)]
+
+
+MODES: dict[str, Callable[[Network, Sequence[Tensor]], list[Tensor]]] = {"window": window, "stream": stream}
+
+
+def evaluate(
+    network: Network, frames: Frames, modes: Sequence[str], batch: int, ik: IK | None = None
+) -> dict[str, Any]:
+    """Metrics of a split: `{"mean": {mode: {branch: {metric: value}}}, "clips": [...]}`.
+
+    The mean is over clips of each clip's mean over frames. At most `batch` clips stand side by side. What
+    `ik` makes of the two branches is a branch more.
+    """
+    clips = frames.clips()
+    rows: list[dict[str, Any]] = [
+        {"name": name, "group": group, "frames": len(clip)}
+        for name, group, clip in zip(frames.names, frames.groups, clips, strict=True)
+    ]
+    for mode in modes:
+        for row, clip, motion in zip(rows, clips, predict(network, clips, mode, batch), strict=True):
+            row[mode] = clip_report(network.frame, motion, clip, ik)
+    return {"mean": {mode: _mean([row[mode] for row in rows]) for mode in modes}, "clips": rows}
+
+
+def predict(network: Network, clips: Sequence[Tensor], mode: str, batch: int) -> list[Tensor]:
+    """Motion (N, 198) of each clip (N, 252), at most `batch` clips side by side."""
+    groups = [clips[i : i + batch] for i in range(0, len(clips), batch)]
+    return [motion for group in groups for motion in MODES[mode](network, group)]
+
+
+def clip_report(
+    frame: Frame, motion: Tensor, truth: Tensor, ik: IK | None = None
+) -> dict[str, dict[str, float]]:
+    """Metrics of both branches and of what `ik` makes of them, for motion (N, 198) and truth (N, 252)."""
+    sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
+    position = metrics.positions_report(joint_positions(motion), joint_positions(target))
+    report = {"rotation": rotations_report(frame, motion, truth), "position": position}
+    solved = (ik or NoIK()).solutions(frame, motion, sparse)
+    return report | {name: rotations_report(frame, result, truth) for name, result in solved.items()}
+
+
+def rotations_report(frame: Frame, motion: Tensor, truth: Tensor) -> dict[str, float]:
+    """Metrics of the rotations of motion (N, 198), their joints by forward kinematics; truth (N, 252)."""
+    sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
+    report = metrics.rotations_report(local_rotations(motion), local_rotations(target))
+    return report | metrics.positions_report(frame.pose(motion, sparse), joint_positions(target))
+
+
+def local_rotations(motion: Tensor) -> Tensor:
+    """Rotation matrices (N, 22, 3, 3) of motion (N, 198)."""
+    return sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6)))
+
+
+def joint_positions(motion: Tensor) -> Tensor:
+    """Positions (N, 22, 3) of motion (N, 198), metres, world."""
+    return motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
+
+
+def chunks(frames: Frames, length: int, least: int) -> list[Tensor]:
+    """A split's clips cut into pieces of `length` frames, those under `least` left out unless alone."""
+    pieces = [piece for clip in frames.clips() for piece in clip.split(length)]
+    return [p for p in pieces if len(p) >= least] or pieces
+
+
+@torch.no_grad()
+def quick_stream(network: Network, pieces: Sequence[Tensor]) -> dict[str, float]:
+    """Stream-mode means over pieces of clips: for validation during training."""
+    motions = stream(network, pieces)
+    mean = _mean([clip_report(network.frame, m, p) for m, p in zip(motions, pieces, strict=True)])
+    return {f"{branch} {name}": value for branch, values in mean.items() for name, value in values.items()}
+
+
+def _at_least(sparse: Tensor, size: int) -> Tensor:
+    """Inputs (N, 54), the first repeated in front up to `size` frames."""
+    return torch.cat([sparse[:1].expand(max(size - len(sparse), 0), -1), sparse])
+
+
+def _mean(rows: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+    """Mean over clips of each branch's metrics; a clip too short for a metric does not count in it."""
+    first = rows[0]
+    return {
+        branch: {name: float(torch.tensor([row[branch][name] for row in rows]).nanmean()) for name in values}
+        for branch, values in first.items()
+    }

@@ -1,0 +1,47 @@
+"""A network's predictions as files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from memmlp.evaluation import modes
+from memmlp.evaluation.ik import IK
+from memmlp.evaluation.stage import Evaluation
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.dataset import Frames
+from memmlp.motion.normalizer import Frame
+from memmlp.networks.window_model import WindowModel
+
+
+def save_predictions(evaluation: Evaluation, model: WindowModel, test: Frames, folder: Path) -> None:
+    """Write `<folder>/<mode>/<clip>.npz` for every test clip: positions (N, 22, 3) and rotations."""
+    clips = test.clips()
+    for mode in evaluation.modes:
+        motions = modes.predict(model, clips, mode, evaluation.batch)
+        for name, clip, motion in zip(test.names, clips, motions, strict=True):
+            path = folder / mode / f"{name}.npz"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.savez(path, allow_pickle=False, **prediction_arrays(model.frame, clip, motion, evaluation.ik))
+
+
+def prediction_arrays(frame: Frame, clip: Tensor, motion: Tensor, ik: IK) -> dict[str, np.ndarray]:
+    """What a prediction file holds: metres in the world, local rotation matrices, float32.
+
+    `predicted_positions` are those of the rotation branch by forward kinematics, the head on its tracker;
+    what inverse kinematics makes of the branches follows as `combined_positions` and `combined_rotations`.
+    """
+    sparse, truth = clip[:, :SPARSE_DIM], clip[:, SPARSE_DIM:]
+    arrays = {
+        "predicted_positions": frame.pose(motion, sparse),
+        "predicted_positions_of_position_branch": modes.joint_positions(motion),
+        "true_positions": modes.joint_positions(truth),
+        "predicted_rotations": modes.local_rotations(motion),
+        "true_rotations": modes.local_rotations(truth),
+    }
+    for name, solved in ik.solutions(frame, motion, sparse).items():
+        arrays[f"{name}_positions"] = frame.pose(solved, sparse)
+        arrays[f"{name}_rotations"] = modes.local_rotations(solved)
+    return {name: tensor.cpu().numpy() for name, tensor in arrays.items()}

@@ -1,0 +1,52 @@
+"""The stage that evaluates a trained network on the test clips."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from memmlp.evaluation import modes
+from memmlp.evaluation.ik import IK
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.dataset import Frames
+from memmlp.networks.window_model import WindowModel
+
+PICTURE_FRAMES = 600  # the picture shows the first 10 s of the first test clip
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How a network is evaluated.
+
+    Attributes:
+        modes: "stream", "window". batch: clips side by side, at most.
+        ik: inverse kinematics, whose branch comes beside the network's. seed: of a blend that is sampled.
+    """
+
+    modes: Sequence[str]
+    batch: int
+    ik: IK
+    seed: int
+
+    def report(self, model: WindowModel, test: Frames, mode: str) -> dict[str, Any]:
+        """The metrics in a mode: `{"mean": {branch: {metric: value}}, "clips": [...]}`, a row a clip."""
+        torch.manual_seed(self.seed)  # the modes are alike in whatever order they are made
+        found = modes.evaluate(model, test, [mode], self.batch, self.ik)
+        rows = [{key: row[key] for key in ("name", "group", "frames")} | row[mode] for row in found["clips"]]
+        return {"mean": found["mean"][mode], "clips": rows}
+
+
+def picture(model: WindowModel, test: Frames, path: Path) -> None:
+    """Draw the start of the first test clip, streamed."""
+    from memmlp.render.figure import poses_png  # with matplotlib: half a second that planning needs not
+
+    device = model.frame.rest.device
+    clip = test.clip(0)[:PICTURE_FRAMES].to(device)
+    motion = modes.stream(model, [clip])[0]
+    predicted = model.frame.pose(motion, clip[:, :SPARSE_DIM])
+    truth = modes.joint_positions(clip[:, SPARSE_DIM:])
+    poses_png(path, truth.cpu().numpy(), predicted.cpu().numpy(), test.names[0])

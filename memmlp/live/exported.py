@@ -1,0 +1,53 @@
+"""An exported network and what its file tells of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from memmlp.common.errors import InputError
+from memmlp.deploy.session import OnnxStream
+from memmlp.live.rotations import Skeleton
+from memmlp.motion.body import FEATURES
+
+NEEDED = ("joints", "parents", "rest", "fps", "T", "branches", "features")
+AGAIN = "export it again with memmlp export RUN --out FILE.onnx"
+
+
+class Network(OnnxStream):
+    """An ONNX file of scope `network`. Raises InputError where a file is none, or lacks what must be known.
+
+    Attributes:
+        sparse: input (1, 54), to be written before a step.
+        rotation6d, position: outputs (22, 6) and (22, 3) of the last step, overwritten by the next.
+        skeleton, fps, frames, branches: joints, tree and rest pose; frames per second; T; what is learned.
+    """
+
+    def __init__(self, path: Path):
+        super().__init__(path)
+        self._read(self.session.get_modelmeta().custom_metadata_map)
+        self.sparse = self.inputs["sparse"]
+        self.rotation6d, self.position = self.outputs["rotation6d"][0], self.outputs["position"][0]
+
+    def _read(self, meta: dict[str, str]) -> None:
+        """What the metadata tell."""
+        if "tracker_positions" in self.inputs:
+            raise InputError(f"{self.path}: an ONNX file of scope full; allowed here is one of scope network")
+        if "sparse" not in self.inputs or "fps" not in meta:
+            raise InputError(f"{self.path}: no network of memmlp's; allowed is what memmlp export writes")
+        missing = [key for key in NEEDED if key not in meta]
+        if missing:
+            raise InputError(f"{self.path}: an older file, without {', '.join(missing)} in it; {AGAIN}")
+        if meta["features"] != FEATURES:
+            raise InputError(f"{self.path}: its inputs are not those of this version of memmlp; {AGAIN}")
+        try:
+            rest = np.array(json.loads(meta["rest"]), np.float64)
+            self.skeleton = Skeleton(json.loads(meta["joints"]), json.loads(meta["parents"]), rest)
+            self.fps, self.frames = float(meta["fps"]), int(meta["T"])
+            self.branches = frozenset(json.loads(meta["branches"]))
+        except (ValueError, TypeError, LookupError):
+            raise InputError(f"{self.path}: its metadata are damaged; {AGAIN}") from None
+        if not 1 <= self.fps <= 1000:
+            raise InputError(f"{self.path}: fps={self.fps:g} in its metadata, which are damaged; {AGAIN}")

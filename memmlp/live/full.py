@@ -1,0 +1,162 @@
+"""The whole way from trackers to a body as one ONNX file, for programs without Python (`--scope full`).
+
+Inputs: `tracker_positions` (1, 3, 3), metres, and `tracker_rotations` (1, 3, 3, 3), matrices, of head, left
+and right wrist, one frame at 60 Hz; and `state.*`, all zeros for a fresh start. Outputs: `rotations`
+(1, 22, 3, 3), local matrices, the root's global; `positions` (1, 22, 3), metres, by forward kinematics, the
+head on its tracker; `joints` (1, 22, 3), metres, the network's own positions; and the new `state.*` under the
+same names with the suffix `.next`. All in the frame of reference that was chosen (memmlp.live.spaces).
+Trackers that are lost, other rates and gaps (memmlp.live.trackers) are the caller's: NaN in is NaN out.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from memmlp.deploy.export import metadata, save
+from memmlp.deploy.parity import in_torch
+from memmlp.deploy.session import OnnxStream
+from memmlp.live.rotations import Skeleton
+from memmlp.live.spaces import Space, space_of
+from memmlp.motion.body import (
+    HEAD,
+    JOINTS,
+    N_JOINTS,
+    PARENTS,
+    POSITION,
+    ROTATION,
+    SPARSE_ANGULAR_VELOCITY,
+    SPARSE_DIM,
+    SPARSE_POSITION,
+    SPARSE_ROTATION,
+    SPARSE_VELOCITY,
+)
+from memmlp.motion.features import sparse_features
+from memmlp.motion.geometry import sixd_to_matrix
+from memmlp.motion.normalizer import Frame
+from memmlp.networks.streaming import Stream
+from memmlp.networks.window_model import WindowModel
+
+TRACKERS = ("tracker_positions", "tracker_rotations")
+OUTPUTS = ("rotations", "positions", "joints")
+OWN = {"seen": (1, 1), "positions": (1, 3, 3), "rotations": (1, 3, 3, 3)}
+"""States beside the network's: whether there was a frame, and its trackers in AMASS' world."""
+
+
+class FullStep(nn.Module):
+    """One frame, from trackers to joints, with flat inputs and outputs.
+
+    Args:
+        model: the network, as it was trained or as its live stream.
+        space: of what goes in and comes out.
+    """
+
+    world: Tensor
+    body: Tensor
+    offsets: Tensor
+
+    def __init__(self, model: WindowModel | Stream, space: Space):
+        super().__init__()
+        self.model = model
+        self.names = list(model.initial_state(1))
+        self.register_buffer("world", torch.tensor(space.world, dtype=torch.float32))
+        self.register_buffer("body", torch.tensor(space.body, dtype=torch.float32))
+        skeleton = Skeleton(JOINTS, PARENTS, model.frame.rest.double().cpu().numpy())
+        self.ancestors = [torch.tensor(ancestor) for ancestor in skeleton.ancestors]
+        self.register_buffer("offsets", torch.tensor(skeleton.offsets, dtype=torch.float32)[None, ..., None])
+
+    def initial_state(self) -> dict[str, Tensor]:
+        """A fresh start: zeros."""
+        own = {f"trackers.{name}": torch.zeros(shape) for name, shape in OWN.items()}
+        return own | self.model.initial_state(1)
+
+    def forward(self, positions: Tensor, rotations: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        """The inputs of the module's docstring in their order -> its outputs in theirs."""
+        seen, last_positions, last_rotations = state[: len(OWN)]
+        positions = positions @ self.world.T
+        rotations = self.world @ rotations * self.body
+        past = seen > 0
+        sparse = sparse_features(
+            torch.cat([torch.where(past[..., None, None], last_rotations, rotations), rotations]),
+            torch.cat([torch.where(past[..., None], last_positions, positions), positions]),
+        )
+        before = dict(zip(self.names, state[len(OWN) :], strict=True))
+        motion, after = self.model.advance(sparse[:, None], before, 1)
+        # A first frame has no velocity: it is shown, but is not part of the network's past, as in training.
+        kept = [after[name] * seen.view(-1, *[1] * (after[name].ndim - 1)) for name in self.names]
+        return *self.posed(motion[:, -1], positions[:, 0]), seen.clamp_min(1), positions, rotations, *kept
+
+    def posed(self, motion: Tensor, head: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Rotations, positions and joints, in the space, of world motion (1, 198) with the head at (1, 3)."""
+        local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6)))
+        reached = self.reached(local)
+        positions = reached + (head - reached[:, HEAD])[:, None]
+        joints = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
+        root = self.world.T @ local[:, :1] * self.body
+        turned = torch.cat([root, local[:, 1:] * torch.outer(self.body, self.body)], 1)
+        return turned, positions @ self.world, joints @ self.world
+
+    def reached(self, local: Tensor) -> Tensor:
+        """Positions (1, 22, 3) relative to the root, as `Skeleton.positions`: few operations, large ones."""
+        bottom = torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(1, N_JOINTS, 1, 4)
+        transforms = torch.cat([torch.cat([local, self.offsets], -1), bottom], -2)
+        transforms = torch.cat([transforms, torch.eye(4).expand(1, 1, 4, 4)], 1)
+        for ancestor in self.ancestors:
+            transforms = transforms[:, ancestor] @ transforms
+        return transforms[:, :N_JOINTS, :3, 3]
+
+
+def export_full(model: WindowModel | Stream, path: Path, run_id: str, space: str = "amass") -> None:
+    """Write the whole step, on the CPU in float32, as one ONNX file with its metadata.
+
+    Raises InputError for an unknown space.
+    """
+    step = FullStep(model.cpu().eval(), space_of(space)).eval()
+    state = step.initial_state()
+    names = [f"state.{name}" for name in state]
+    save(
+        step,
+        (torch.zeros(1, 3, 3), torch.eye(3).expand(1, 3, 3, 3), *state.values()),
+        [*TRACKERS, *names],
+        [*OUTPUTS, *(f"{name}.next" for name in names)],
+        path,
+        metadata(model, run_id) | {"scope": "full", "space": space},
+    )
+
+
+def trackers_of(frames: Tensor) -> tuple[Tensor, Tensor]:
+    """Positions (N + 1, 3, 3) and rotations (N + 1, 3, 3, 3) of the trackers of frames (N, 252 or 54).
+
+    The first is the one before the first frame, by that frame's velocities.
+    """
+    sixd = frames[:, SPARSE_ROTATION].unflatten(-1, (3, 6))
+    turned = sixd_to_matrix(frames[:1, SPARSE_ANGULAR_VELOCITY].unflatten(-1, (3, 6)))
+    rotations, positions = sixd_to_matrix(sixd), frames[:, SPARSE_POSITION].unflatten(-1, (3, 3))
+    velocity = frames[:1, SPARSE_VELOCITY].unflatten(-1, (3, 3))
+    before = rotations[:1] @ turned.transpose(-1, -2)
+    return torch.cat([positions[:1] - velocity, positions]), torch.cat([before, rotations])
+
+
+def full_parity(model: WindowModel, path: Path, clip: Tensor, space: str = "amass") -> float:
+    """Largest difference between torch and the file, each with its own history, over a clip (N, 252).
+
+    Torch goes the way of evaluation: the features of the same trackers, the network, `Frame.pose`.
+    """
+    model, there, stream = model.cpu().eval(), space_of(space), OnnxStream(path)
+    positions, rotations = trackers_of(clip[:, :SPARSE_DIM].cpu())
+    given = [there.positions_out(positions.numpy()), there.rotations_out(rotations.numpy())]
+    sparse = sparse_features(rotations, positions)
+    made = [stream.step(*(part[index : index + 1] for part in given)) for index in range(len(positions))]
+    found = [np.concatenate(parts) for parts in zip(*made[1:], strict=True)]
+    expected = _expected(model.frame, in_torch(model, sparse), sparse, there)
+    return float(np.max([np.abs(a - b).max() for a, b in zip(expected, found, strict=True)]))
+
+
+def _expected(frame: Frame, motion: Tensor, sparse: Tensor, space: Space) -> list[np.ndarray]:
+    """Rotations, positions and joints in a space, of world motion (N, 198) at inputs (N, 54)."""
+    local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6))).numpy()
+    positions = [frame.pose(motion, sparse), motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))]
+    return [space.pose_out(local), *(space.positions_out(part.numpy()) for part in positions)]

@@ -1,0 +1,238 @@
+"""Where tracker poses come from: a clip that is played, or packets that arrive on this machine."""
+
+from __future__ import annotations
+
+import errno
+import math
+import socket
+import time
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from memmlp.common.errors import InputError
+from memmlp.live.player.packets import Packet, Parse, Trackers
+from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
+from memmlp.live.spaces import Space
+from memmlp.live.trackers import Tracked, between
+from memmlp.motion.body import (
+    FPS,
+    MOTION_DIM,
+    N_JOINTS,
+    POSITION,
+    SPARSE_DIM,
+    SPARSE_POSITION,
+    SPARSE_ROTATION,
+)
+
+HOST = "127.0.0.1"
+WAIT = 0.25  # seconds that `read` waits at most
+PAUSE = 1.0  # seconds without a sample between two rounds of a clip: the stream begins anew
+LARGEST = 65_536  # bytes of a datagram
+FORGOTTEN = 10_000  # numbers left out that are no lost packets but another sender
+
+
+class Sample(NamedTuple):
+    """What a source gives: the trackers at a time (seconds), and how many samples were lost before it."""
+
+    time: float
+    trackers: Trackers
+    dropped: int = 0
+
+
+class Source(Protocol):
+    """Tracker poses, one sample after the other.
+
+    Attributes:
+        name: in words. space: frame of reference of its poses.
+        malformed: how many packets were none.
+    """
+
+    name: str
+    space: str
+    malformed: int
+
+    def read(self) -> Sample | None:
+        """The next sample; None where none came within `WAIT` seconds."""
+
+    def truth(self, time: float) -> np.ndarray | None:
+        """True joints (22, 3), metres, at a time; None where they are not known."""
+
+    def close(self) -> None:
+        """Let go of what it holds."""
+
+
+class Clip:
+    """A clip of tracker poses and true joints, at any time.
+
+    Args:
+        name: of the clip. frames: [X | Theta] (N, 252) at 60 Hz, world (`memmlp.motion.body`).
+    """
+
+    def __init__(self, name: str, frames: np.ndarray):
+        self.name = name
+        frames = np.asarray(frames, np.float64)
+        self.positions = frames[:, SPARSE_POSITION].reshape(-1, 3, 3)
+        self.rotations = sixd_to_matrix(frames[:, SPARSE_ROTATION].reshape(-1, 6)).reshape(-1, 3, 3, 3)
+        self.joints = frames[:, SPARSE_DIM : SPARSE_DIM + MOTION_DIM][:, POSITION].reshape(-1, N_JOINTS, 3)
+        self.seconds = (len(frames) - 1) / FPS
+
+    def trackers(self, time: float) -> Trackers:
+        """Position and quaternion xyzw of head, left and right wrist at a time, between frames."""
+        first, _ = self._place(time)
+        a, b = (Tracked(i / FPS, self.positions[i], self.rotations[i]) for i in (first, first + 1))
+        sample = between(a, b, time)
+        head, left, right = zip(sample.positions, matrix_to_quaternion(sample.rotations), strict=True)
+        return head, left, right
+
+    def truth(self, time: float) -> np.ndarray:
+        """Joints (22, 3), metres, world, at a time."""
+        first, weight = self._place(time)
+        return self.joints[first] + weight * (self.joints[first + 1] - self.joints[first])
+
+    def _place(self, time: float) -> tuple[int, float]:
+        """The frame before a time, and how far on to the next one it is."""
+        first = min(max(int(time * FPS), 0), len(self.joints) - 2)
+        return first, time * FPS - first
+
+
+def in_space(trackers: Trackers, space: Space) -> Trackers:
+    """Trackers of AMASS' world, positions and quaternions xyzw, in a space."""
+    positions, rotations = (np.stack(part) for part in zip(*filter(None, trackers), strict=True))
+    matrices = space.rotations_out(quaternion_to_matrix(rotations))
+    head, left, right = zip(space.positions_out(positions), matrix_to_quaternion(matrices), strict=True)
+    return head, left, right
+
+
+class ClipSource:
+    """A clip as a headset would send it: at a rate, in real time, over and over.
+
+    A sample that is due while the last one is still being worked on is dropped, as a device's would be.
+
+    Args:
+        clip: what is played. hz: samples a second. rounds: how often; endlessly by default.
+        clock, sleep: of the machine.
+    """
+
+    space = "amass"
+    malformed = 0
+
+    def __init__(
+        self,
+        clip: Clip,
+        hz: float,
+        rounds: float = math.inf,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ):
+        self.clip, self.hz, self.name = clip, float(hz), f"{clip.name} at {hz:g} Hz"
+        self.count = int(clip.seconds * hz + 1e-9) + 1  # samples of a round
+        self.rounds, self.clock, self.sleep = rounds, clock, sleep
+        self.next = 0
+        self.began: float | None = None
+
+    @property
+    def over(self) -> bool:
+        """Whether all rounds are played."""
+        return self.next >= self.rounds * self.count
+
+    def read(self) -> Sample | None:
+        """The sample that is due; waits for it."""
+        now = self.clock()
+        self.began = now if self.began is None else self.began
+        due = int((now - self.began) * self.hz + 1e-6)
+        dropped = max(due - self.next, 0)
+        index = self.next + dropped
+        self.sleep(max(self.began + index / self.hz - now, 0))
+        self.next = index + 1
+        turn, step = divmod(index, self.count)
+        return Sample(turn * self.round + step / self.hz, self.clip.trackers(step / self.hz), dropped)
+
+    @property
+    def round(self) -> float:
+        """Seconds from one round's beginning to the next one's."""
+        return (self.count - 1) / self.hz + PAUSE
+
+    def truth(self, time: float) -> np.ndarray:
+        """True joints (22, 3), metres, AMASS' world."""
+        return self.clip.truth(time % self.round)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class PacketSource:
+    """Packets that arrive at a UDP port of this machine (127.0.0.1).
+
+    Args:
+        name: in words. port: 0 for any free one. parse: a datagram's packet. space: frame of reference.
+
+    Raises:
+        InputError: where the port is taken.
+    """
+
+    def __init__(self, name: str, port: int, parse: Parse, space: str):
+        self.parse, self.space, self.malformed = parse, space, 0
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.settimeout(WAIT)
+        bound(self.socket, port)
+        self.port = self.socket.getsockname()[1]
+        self.name = f"{name} packets on port {self.port}"
+        self.last: int | None = None
+
+    def read(self) -> Sample | None:
+        """The next packet; what is none is counted and passed over."""
+        try:
+            datagram = self.socket.recv(LARGEST)
+        except TimeoutError:
+            return None
+        try:
+            packet = self.parse(datagram)
+        except ValueError:
+            self.malformed += 1
+            return None
+        arrival = time.monotonic() if packet.time is None else packet.time
+        return Sample(arrival, packet.trackers, self._dropped(packet))
+
+    def _dropped(self, packet: Packet) -> int:
+        """How many samples are missing between the last packet's number and this one's."""
+        last, self.last = self.last, packet.seq
+        if last is None or packet.seq is None:
+            return 0
+        missing = packet.seq - last - 1
+        return missing if 0 < missing < FORGOTTEN else 0
+
+    def truth(self, time: float) -> None:
+        """Nobody knows."""
+
+    def close(self) -> None:
+        """Give the port back."""
+        self.socket.close()
+
+
+def bound(listener: socket.socket, port: int) -> None:
+    """Bind a socket to a port of this machine alone. Raises InputError where it is taken."""
+    try:
+        listener.bind((HOST, port))
+    except OSError as error:
+        listener.close()
+        if error.errno not in (errno.EADDRINUSE, errno.EACCES):
+            raise
+        raise InputError(
+            f"port {port}: taken, or not allowed; allowed is another one, 1024 to 65535"
+        ) from None
+
+
+def send(source: ClipSource, port: int, pack: Callable[[Packet], bytes], space: Space) -> int:
+    """Send a clip's samples, in a space, to a UDP port of this machine until its rounds are over.
+
+    Returns how many were sent.
+    """
+    sent = 0
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        while not source.over and (sample := source.read()) is not None:
+            trackers = in_space(sample.trackers, space)
+            sender.sendto(pack(Packet(trackers, sample.time, source.next - 1)), (HOST, port))
+            sent += 1
+    return sent

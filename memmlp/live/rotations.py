@@ -1,0 +1,115 @@
+"""Rotations and forward kinematics on NumPy arrays, for one frame at a time. Quaternions are x, y, z, w.
+
+`memmlp.motion.geometry` has the same on torch tensors; here is what a live stream needs, without torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+# With q the outer product of a quaternion (x, y, z, w) with itself, flattened, its matrix is q @ _MATRIX,
+# flattened, and back q is (m @ _MATRIX.T + identity) / 4.
+_MATRIX: np.ndarray = np.zeros((4, 4, 3, 3))
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    _MATRIX[_i, _i, [0, 1, 2], [0, 1, 2]] = -1
+    _MATRIX[_i, _i, _i, _i] = 1
+    _MATRIX[3, 3, _i, _i] = 1
+    _MATRIX[[_i, _j], [_j, _i], _i, _j] = _MATRIX[[_i, _j], [_j, _i], _j, _i] = 1
+    _MATRIX[[_k, 3], [3, _k], _i, _j], _MATRIX[[_k, 3], [3, _k], _j, _i] = -1, 1
+_MATRIX = _MATRIX.reshape(16, 9)
+_IDENTITY = np.eye(4).reshape(16)
+
+
+def quaternion_to_matrix(quaternion: np.ndarray) -> np.ndarray:
+    """Unit quaternions (..., 4) xyzw -> (..., 3, 3)."""
+    outer = quaternion[..., :, None] * quaternion[..., None, :]
+    return (outer.reshape(*quaternion.shape[:-1], 16) @ _MATRIX).reshape(*quaternion.shape[:-1], 3, 3)
+
+
+def matrix_to_quaternion(matrix: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) -> unit quaternions (n, 4) xyzw, w not negative; accurate at every angle.
+
+    A row of the quaternion's outer product with itself is the quaternion, scaled; the row of the largest
+    component is well conditioned.
+    """
+    outer = (matrix.reshape(-1, 9) @ _MATRIX.T + _IDENTITY).reshape(-1, 4, 4)
+    pivot = np.einsum("nii->ni", outer).argmax(1)
+    quaternion = outer[np.arange(len(outer)), pivot]
+    quaternion /= np.sqrt(np.einsum("ni,ni->n", quaternion, quaternion))[:, None]
+    quaternion[quaternion[:, 3] < 0] *= -1
+    return quaternion
+
+
+def turned_by(matrix: np.ndarray, share: np.ndarray | float) -> np.ndarray:
+    """Rotations (n, 3, 3) about the same axes by a share (n,) or one of their angles (0 to pi)."""
+    quaternion = matrix_to_quaternion(matrix)
+    vector, w = quaternion[:, :3], quaternion[:, 3]
+    sine = np.sqrt(np.einsum("ni,ni->n", vector, vector))
+    half = share * np.arctan2(sine, w)
+    scale = np.where(sine > 1e-9, np.sin(half) / np.maximum(sine, 1e-9), share)
+    return quaternion_to_matrix(np.concatenate([vector * scale[:, None], np.cos(half)[:, None]], 1))
+
+
+def slerp(a: np.ndarray, b: np.ndarray, weight: float) -> np.ndarray:
+    """Rotations (n, 3, 3) on the shortest way from a (weight 0) to b (1); beyond 1 it goes on."""
+    return a @ turned_by(a.swapaxes(-1, -2) @ b, weight)
+
+
+def sixd_to_matrix(sixd: np.ndarray) -> np.ndarray:
+    """(n, 6) -> (n, 3, 3) by Gram-Schmidt, as `memmlp.motion.geometry.sixd_to_matrix`."""
+    columns = np.empty((3, 5, len(sixd)), sixd.dtype)  # x y z x y, so that a cross product takes slices
+    columns[:2, :3] = sixd.T.reshape(2, 3, -1)
+    first, second = columns[:2, :3]
+    first /= np.sqrt(_dot(first, first))
+    second -= _dot(first, second) * first
+    second /= np.sqrt(_dot(second, second))
+    columns[:2, 3:] = columns[:2, :2]
+    a, b, third = columns
+    third[:3] = a[1:4] * b[2:5] - a[2:5] * b[1:4]
+    return columns[:, :3].transpose(2, 1, 0)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(3, n) and (3, n) -> (n,)."""
+    return np.add.reduce(a * b, 0)
+
+
+class Skeleton:
+    """Joints, their tree and their rest pose; forward kinematics of one frame.
+
+    Every joint's transform is multiplied by that of its ancestor 1, 2, 4, ... joints above, so that a tree of
+    depth 8 takes three batched products.
+
+    Args:
+        joints: names (J). parents: indices (J), -1 of the root, which is the first.
+        rest: rest positions (J, 3), metres, SMPL's body frame.
+
+    Attributes:
+        tracked: indices of head, left and right wrist. offsets: (J, 3) metres from the parent, 0 of the root.
+        ancestors: for each joint and one more above the root (J + 1), who is 1, 2, 4, ... above it.
+    """
+
+    def __init__(self, joints: Sequence[str], parents: Sequence[int], rest: np.ndarray):
+        self.joints, self.rest = tuple(joints), rest
+        self.tracked = [self.joints.index(name) for name in ("head", "left_wrist", "right_wrist")]
+        count = len(self.joints)
+        parent = np.array([*parents, -1])
+        parent[parent < 0] = count  # above the root stands the identity, its own parent
+        self.ancestors = [parent]
+        while (self.ancestors[-1] != count).any():
+            self.ancestors.append(self.ancestors[-1][self.ancestors[-1]])
+        self.ancestors.pop()
+        self.offsets = np.zeros((count, 3))
+        self.offsets[1:] = rest[1:] - rest[parent[1:count]]
+        self._transforms = np.tile(np.eye(4, dtype=np.float32), (count + 1, 1, 1))
+        self._transforms[:count, :3, 3] = self.offsets
+
+    def positions(self, local: np.ndarray) -> np.ndarray:
+        """Positions (J, 3), metres, relative to the head, of local rotations (J, 3, 3), the root's global."""
+        transforms = self._transforms
+        transforms[:-1, :3, :3] = local
+        for ancestor in self.ancestors:
+            transforms = transforms.take(ancestor, 0) @ transforms
+        return transforms[:-1, :3, 3] - transforms[self.tracked[0], :3, 3]

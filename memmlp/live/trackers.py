@@ -1,0 +1,253 @@
+"""Samples of three trackers, each at its own time -> frames at the network's rate, and their features.
+
+The policy, in this order:
+
+- A **lost** hand is held at its last pose as seen from the head: it goes with it and turns with its heading.
+  A lost head stays where it was. Before its first sample a tracker is held at the T-pose of a person under
+  the head (at the origin before the head's first). When it returns, the difference is let go over `RECOVERY`
+  seconds instead of at once, which the network would take for a fast movement.
+- **Frames** lie on a grid of 1 / fps from the first sample on. One is made as soon as a sample at or after
+  its time is in, between the samples beside it (positions linearly, rotations by slerp): no sample of the
+  future is waited for, and a pose is at most one frame older than the newest sample. A slower tracker gives
+  several frames at once, a faster one none at some samples; the rate may change at any time.
+- A sample that is not newer than the last one is **ignored**.
+- After a **gap** (no sample for longer than `GAP` seconds, or a clock that was set back by more) everything
+  begins anew.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from memmlp.live.rotations import Skeleton, slerp, turned_by
+from memmlp.motion.body import (
+    SPARSE_ANGULAR_VELOCITY,
+    SPARSE_DIM,
+    SPARSE_POSITION,
+    SPARSE_ROTATION,
+    SPARSE_VELOCITY,
+)
+
+GAP = 0.5  # seconds
+RECOVERY = 0.2  # seconds
+EARLY = 5e-4  # seconds by which a frame may be ahead of its sample: times rounded to milliseconds still count
+SAME = 1e-6  # seconds: a sample this near to a frame is the frame
+
+NOBODY = (False, False, False)
+UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # SMPL's body frame (Y up) stands in AMASS' world
+
+
+Lost = tuple[bool, ...]  # of head, left and right wrist
+
+
+class Tracked(NamedTuple):
+    """Head, left and right wrist at a time: positions (3, 3), metres, rotations (3, 3, 3), AMASS' world."""
+
+    time: float
+    positions: np.ndarray
+    rotations: np.ndarray
+
+
+def between(a: Tracked, b: Tracked, time: float) -> Tracked:
+    """The trackers at a time, from the samples before and after it."""
+    weight = (time - a.time) / (b.time - a.time)
+    positions = a.positions + weight * (b.positions - a.positions)
+    return Tracked(time, positions, slerp(a.rotations, b.rotations, weight))
+
+
+def t_pose(skeleton: Skeleton, place: np.ndarray, heading: float) -> Tracked:
+    """The three joints of a person in T-pose whose head is at `place` (3,), in AMASS' world.
+
+    heading: radians to the left of looking along -Y, where the person's left is +X.
+    """
+    turn = about_vertical(heading) @ UPRIGHT
+    rest = skeleton.rest[skeleton.tracked]
+    return Tracked(0.0, place + (rest - rest[0]) @ turn.T, np.tile(turn, (3, 1, 1)))
+
+
+def about_vertical(angle: float) -> np.ndarray:
+    """The rotation (3, 3) about AMASS' Z by an angle, radians."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def heading_of(rotation: np.ndarray) -> float:
+    """Heading (radians, as in `t_pose`) of a joint's global rotation (3, 3): the twist about the vertical."""
+    upright = rotation @ UPRIGHT.T
+    return float(np.arctan2(upright[1, 0] - upright[0, 1], upright[0, 0] + upright[1, 1]))
+
+
+class Hold:
+    """Lost trackers at their last poses, and their smooth return.
+
+    Args:
+        skeleton: whose T-pose stands for a tracker that was never there.
+        recovery: seconds in which a tracker that returns is brought to where it is; 0 to jump.
+    """
+
+    def __init__(self, skeleton: Skeleton, recovery: float = RECOVERY):
+        self.skeleton, self.recovery = skeleton, recovery
+        self.reset()
+
+    def reset(self) -> None:
+        """Nothing was seen yet."""
+        self.last: Tracked | None = None
+        self.lost: Lost = NOBODY
+        self.settled = -np.inf  # when the last one that returned is where it is
+        self.returned = np.full(3, -np.inf)  # when, each; the difference is let go from there on
+        self.shift, self.turn = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1))
+
+    def __call__(self, sample: Tracked, lost: Lost) -> Tracked:
+        """The sample with the lost trackers filled in, and those that return on their way."""
+        last = self.last or self._first(sample, lost)
+        returning = [was and not is_lost for was, is_lost in zip(self.lost, lost, strict=True)]
+        self.last, self.lost = sample, lost
+        if any(returning):
+            self._return(returning, last, sample)
+        if sample.time < self.settled:
+            self.last = self._on_their_way(sample)
+        if any(lost):
+            self.last = held(self.last, lost, last)
+        return self.last
+
+    def _first(self, sample: Tracked, lost: Lost) -> Tracked:
+        """The T-pose under the head where it is seen, else at the origin, standing."""
+        if not any(lost):
+            return sample
+        if lost[0]:
+            height = self.skeleton.rest[self.skeleton.tracked[0], 1] - self.skeleton.rest[:, 1].min()
+            return t_pose(self.skeleton, np.array([0.0, 0.0, height]), 0.0)
+        return t_pose(self.skeleton, sample.positions[0], heading_of(sample.rotations[0]))
+
+    def _return(self, which: list[bool], last: Tracked, sample: Tracked) -> None:
+        """Remember how far those that return are from where they were held."""
+        self.returned[which], self.settled = last.time, last.time + self.recovery
+        self.shift[which] = (last.positions - sample.positions)[which]
+        self.turn[which] = (last.rotations @ sample.rotations.swapaxes(1, 2))[which]
+
+    def _on_their_way(self, sample: Tracked) -> Tracked:
+        """The sample with what is left of the differences."""
+        left = np.clip(1 - (sample.time - self.returned) / self.recovery, 0, 1)
+        positions = sample.positions + left[:, None] * self.shift
+        return Tracked(sample.time, positions, turned_by(self.turn, left) @ sample.rotations)
+
+
+def held(sample: Tracked, lost: Lost, last: Tracked) -> Tracked:
+    """The sample with the lost trackers where they last were as seen from the head."""
+    positions, rotations = sample.positions.copy(), sample.rotations.copy()
+    if lost[0]:
+        positions[0], rotations[0] = last.positions[0], last.rotations[0]
+    turn = about_vertical(heading_of(rotations[0]) - heading_of(last.rotations[0]))
+    hands = [index for index in (1, 2) if lost[index]]
+    positions[hands] = positions[0] + (last.positions[hands] - last.positions[0]) @ turn.T
+    rotations[hands] = turn @ last.rotations[hands]
+    return Tracked(sample.time, positions, rotations)
+
+
+class Taken(NamedTuple):
+    """What a sample brought: the frames that are due, and whether they begin anew."""
+
+    frames: list[Tracked]
+    restarted: bool
+
+
+class Grid:
+    """Samples -> frames at 1 / fps from the first sample on.
+
+    Args:
+        fps: frames per second. gap: seconds without a sample after which frames begin anew.
+    """
+
+    def __init__(self, fps: float, gap: float = GAP):
+        self.fps, self.gap = fps, gap
+        self.reset()
+
+    def reset(self) -> None:
+        """The next sample is the first."""
+        self.last: Tracked | None = None
+        self.origin, self.count = 0.0, 0
+
+    @property
+    def next(self) -> float:
+        """The time of the next frame."""
+        return self.origin + self.count / self.fps
+
+    def restarts(self, time: float) -> bool:
+        """Whether a sample at that time begins anew."""
+        return self.last is None or abs(time - self.last.time) > self.gap
+
+    def is_old(self, time: float) -> bool:
+        """Whether a sample at that time is not newer than the last one."""
+        return self.last is not None and -self.gap <= time - self.last.time <= 0
+
+    def take(self, sample: Tracked) -> list[Tracked]:
+        """The frames that are due with a sample newer than the last one."""
+        if self.last is None:
+            self.origin, self.last = sample.time, sample
+        frames = []
+        while (time := self.next) <= sample.time + EARLY:
+            same = abs(time - sample.time) <= SAME
+            frames.append(sample if same else between(self.last, sample, time))
+            self.count += 1
+        self.last = sample
+        return frames
+
+
+class Trackers:
+    """Samples of three trackers -> frames at the network's rate, by the policy above.
+
+    Args:
+        skeleton: the network's. fps: its frames per second.
+    """
+
+    def __init__(self, skeleton: Skeleton, fps: float):
+        self.hold, self.grid = Hold(skeleton), Grid(fps)
+
+    def reset(self) -> None:
+        """A fresh start."""
+        self.hold.reset()
+        self.grid.reset()
+
+    def take(self, time: float | None, positions: np.ndarray, rotations: np.ndarray, lost: Lost) -> Taken:
+        """The frames that are due with a sample.
+
+        Args:
+            time: seconds; None for that of the next frame, which is then exactly this sample.
+            positions, rotations: (3, 3) and (3, 3, 3), AMASS' world. lost: which of them do not count.
+        """
+        if time is None:
+            time = self.grid.next
+        if self.grid.is_old(time):
+            return Taken([], False)
+        restarted = self.grid.restarts(time)
+        if restarted:
+            self.reset()
+        sample = self.hold(Tracked(time, positions, rotations), lost)
+        return Taken(self.grid.take(sample), restarted)
+
+
+class Features:
+    """The network's 54 inputs, frame by frame, as `memmlp.motion.features.sparse_features`."""
+
+    def __init__(self) -> None:
+        self.last: Tracked | None = None
+
+    def reset(self) -> None:
+        """The next frame has no velocity."""
+        self.last = None
+
+    def write(self, frame: Tracked, sparse: np.ndarray) -> None:
+        """Write the inputs of a frame into sparse (54,)."""
+        last = self.last or frame
+        positions, rotations = frame.positions, frame.rotations
+        turned = last.rotations.swapaxes(1, 2) @ rotations
+        sparse[SPARSE_ROTATION] = rotations.swapaxes(1, 2)[:, :2].reshape(-1)
+        sparse[SPARSE_ANGULAR_VELOCITY] = turned.swapaxes(1, 2)[:, :2].reshape(-1)
+        sparse[SPARSE_POSITION] = positions.reshape(-1)
+        sparse[SPARSE_VELOCITY] = (positions - last.positions).reshape(-1)
+        self.last = frame
+
+
+assert SPARSE_VELOCITY.stop == SPARSE_DIM

@@ -1,0 +1,106 @@
+"""The body and every convention of the project, stated once: joints, tree, feature layout.
+
+Frames of reference: motion lives in AMASS' world (Z up, metres). A rest pose lives in SMPL's body
+frame (Y up, the person faces +Z, left is +X, T-pose), and the root's rotation carries the one to the
+other. A body joint's rotation is local, relative to its parent; the root's is global.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from memmlp.common.errors import InputError
+
+FPS = 60  # frames per second of everything after `memmlp.motion.clip.resample`
+
+JOINTS = (
+    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle",
+    "right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head",
+    "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
+)  # fmt: skip
+PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
+N_JOINTS = len(JOINTS)
+
+ROOT, HEAD, LEFT_WRIST, RIGHT_WRIST = 0, 15, 20, 21
+TRACKED = (HEAD, LEFT_WRIST, RIGHT_WRIST)  # the three sensors, in the order of the input
+HANDS = (LEFT_WRIST, RIGHT_WRIST)
+LOWER = (0, 1, 2, 4, 5, 7, 8, 10, 11)  # AGRoL and SAGE count the root as lower body
+UPPER = (3, 6, 9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21)
+
+# One frame of input, X (54): AvatarPoser's and AGRoL's order, feature-major over TRACKED.
+SPARSE_DIM = 54
+SPARSE_ROTATION = slice(0, 18)  # global rotation, 6D x 3
+SPARSE_ANGULAR_VELOCITY = slice(18, 36)  # R[t-1]^-1 R[t], 6D x 3
+SPARSE_POSITION = slice(36, 45)  # global position, metres
+SPARSE_VELOCITY = slice(45, 54)  # p[t] - p[t-1], metres per frame
+FEATURES = (
+    "joints head, left_wrist, right_wrist; 0:18 global rotation 6D, 18:36 R[t-1]^-1 R[t] 6D, "
+    "36:45 global position m, 45:54 p[t]-p[t-1] m/frame; 6D = first two columns; world Z up"
+)
+
+# One frame of motion, Theta (198).
+MOTION_DIM = 198
+ROTATION = slice(0, 132)  # local rotations of the 22 joints, 6D
+POSITION = slice(132, 198)  # global positions of the 22 joints, metres
+
+# One frame of a prepared cache: X, then Theta.
+FRAME_DIM = SPARSE_DIM + MOTION_DIM
+
+# An adult of 1.72 m in T-pose. Segment lengths follow the usual anthropometric fractions of stature
+# (Drillis & Contini 1966, in Winter, "Biomechanics and Motor Control of Human Movement"), shoulders
+# and hips are taken at the joint centres. The pelvis is the origin.
+_REST = {
+    "pelvis": (0.0, 0.0, 0.0),
+    "left_hip": (0.085, -0.085, -0.005),
+    "spine1": (0.0, 0.105, -0.015),
+    "left_knee": (0.095, -0.505, 0.005),
+    "spine2": (0.0, 0.235, -0.020),
+    "left_ankle": (0.095, -0.925, -0.025),
+    "spine3": (0.0, 0.290, -0.005),
+    "left_foot": (0.115, -0.980, 0.095),
+    "neck": (0.0, 0.500, -0.030),
+    "left_collar": (0.080, 0.405, -0.025),
+    "head": (0.0, 0.590, 0.010),
+    "left_shoulder": (0.180, 0.435, -0.040),
+    "left_elbow": (0.455, 0.430, -0.055),
+    "left_wrist": (0.710, 0.430, -0.055),
+}
+
+
+def builtin_rest_joints() -> np.ndarray:
+    """Rest positions (22, 3) of the built-in adult skeleton, metres, SMPL's body frame, pelvis at 0."""
+
+    def rest(name: str) -> tuple[float, float, float]:
+        if name.startswith("right_"):
+            x, y, z = _REST["left_" + name.removeprefix("right_")]
+            return -x, y, z
+        return _REST[name]
+
+    return np.array([rest(name) for name in JOINTS])
+
+
+def load_rest_joints(body: str | Path) -> np.ndarray:
+    """Rest positions (22, 3), metres, of `builtin` or of an SMPL-H `model.npz` with zero betas.
+
+    Only `J_regressor @ v_template` is needed: no mesh is skinned. Raises InputError for a file that is
+    no such model.
+    """
+    if str(body) == "builtin":
+        return builtin_rest_joints()
+    path = Path(body)
+    if not path.is_file():
+        raise InputError(f"data.body: {path} is not a file; allowed: builtin, or an SMPL-H model.npz")
+    try:
+        with np.load(path, allow_pickle=False) as model:
+            joints = np.asarray(model["J_regressor"] @ model["v_template"], dtype=np.float64)
+            parents = np.asarray(model["kintree_table"])[0, :N_JOINTS].astype(np.int64)
+    except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"data.body: {path} is no SMPL-H model.npz ({error})") from error
+    if joints.ndim != 2 or joints.shape[0] < N_JOINTS or joints.shape[1] != 3:
+        raise InputError(f"data.body: {path} gives joints of shape {joints.shape}, not (>= 22, 3)")
+    if not np.isfinite(joints).all() or tuple(parents[1:]) != PARENTS[1:]:
+        raise InputError(f"data.body: {path} has not SMPL's tree of 22 body joints")
+    return joints[:N_JOINTS]

@@ -1,0 +1,348 @@
+"""BVH text -> joints, channels and, by forward kinematics, global rotations and positions.
+
+Everything here is in the file's own units and axes. A joint's rotation is the product of its rotation
+channels in the file's order (Z X Y means Rz Rx Ry, on column vectors, degrees in the file); its position
+channels, where it has any, stand in place of the OFFSET's numbers.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from memmlp.common.errors import InputError
+from memmlp.motion.clip import FRAME_RATE_RANGE
+
+AXES = "XYZ"
+CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in AXES)
+END = ".end"  # an end site's name is its joint's and this
+LIMIT = 1e6  # of any number in the file, in its units or degrees
+MAX_JOINTS = 1000
+MAX_BYTES = 2**30
+RATE_DIGITS = 1e-4  # relative: 1 / 0.00833333 s is 120 Hz, as the header has no more digits
+
+
+@dataclass(frozen=True)
+class EndSite:
+    """The tip of a chain: its name (`<joint>.end`), its joint's index and its offset (3,) from it."""
+
+    name: str
+    parent: int
+    offset: np.ndarray
+
+
+@dataclass(frozen=True)
+class Bvh:
+    """A BVH file. Its nodes are its J joints, each after its parent, and then its E end sites.
+
+    Attributes:
+        path: where it was read, for messages.
+        names: joint names, J, no two alike.
+        parents: index of each joint's parent, J; the root's is -1.
+        offsets: joint minus parent in the zero pose (J, 3).
+        channels: each joint's channels in the file's order, of `CHANNELS`.
+        ends: end sites, E.
+        frame_time: seconds.
+        values: channel values (N, C), degrees and the file's unit.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    offsets: np.ndarray
+    channels: tuple[tuple[str, ...], ...]
+    ends: tuple[EndSite, ...]
+    frame_time: float
+    values: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """Names of the J joints and E end sites."""
+        return self.names + tuple(end.name for end in self.ends)
+
+    @property
+    def node_parents(self) -> tuple[int, ...]:
+        """Parents of the J joints and E end sites."""
+        return self.parents + tuple(end.parent for end in self.ends)
+
+    @property
+    def fps(self) -> float:
+        """Frames per second; a whole number where the header's few digits mean one."""
+        rate = 1 / self.frame_time
+        return float(round(rate)) if abs(rate - round(rate)) <= RATE_DIGITS * rate else rate
+
+    def zero_pose(self) -> np.ndarray:
+        """Positions (J+E, 3) of the nodes with all rotations zero, the root at the origin."""
+        offsets = np.concatenate([self.offsets, *(end.offset[None] for end in self.ends)])
+        positions = np.zeros_like(offsets)
+        for node, parent in enumerate(self.node_parents[1:], start=1):
+            positions[node] = positions[parent] + offsets[node]
+        return positions
+
+    def kinematics(self) -> tuple[np.ndarray, np.ndarray]:
+        """Global rotations (N, J+E, 3, 3) and positions (N, J+E, 3); an end site turns with its joint."""
+        rotations = np.empty((len(self.nodes), len(self), 3, 3))
+        positions = np.empty((len(self.nodes), len(self), 3))
+        for joint, parent in enumerate(self.parents):
+            above = rotations[parent] if joint else np.eye(3)
+            values = self._joint_values(joint)
+            positions[joint] = np.einsum("...ij,...j->...i", above, self._shift(joint, values))
+            positions[joint] += positions[parent] if joint else 0.0
+            rotations[joint] = above
+            for name, angles in zip(self.channels[joint], np.radians(values).T, strict=True):
+                if name.endswith("rotation"):
+                    _turn(rotations[joint], AXES.index(name[0]), angles)
+        for node, end in enumerate(self.ends, start=len(self.names)):
+            rotations[node] = rotations[end.parent]
+            positions[node] = positions[end.parent] + rotations[end.parent] @ end.offset
+        return rotations.swapaxes(0, 1), positions.swapaxes(0, 1)
+
+    def _joint_values(self, joint: int) -> np.ndarray:
+        """The values (N, c) of a joint's channels."""
+        first = sum(map(len, self.channels[:joint]))
+        return self.values[:, first : first + len(self.channels[joint])]
+
+    def _shift(self, joint: int, values: np.ndarray) -> np.ndarray:
+        """A joint's position (N, 3) in its parent's frame."""
+        shift = np.tile(self.offsets[joint], (len(values), 1))
+        for name, column in zip(self.channels[joint], values.T, strict=True):
+            if name.endswith("position"):
+                shift[:, AXES.index(name[0])] = column
+        return shift
+
+
+def _turn(rotations: np.ndarray, axis: int, angles: np.ndarray) -> None:
+    """Multiply rotations (N, 3, 3), in place and on the right, by turns of (N,) radians about an axis."""
+    second, third = (axis + 1) % 3, (axis + 2) % 3
+    sine, cosine = np.sin(angles)[:, None], np.cos(angles)[:, None]
+    a, b = rotations[:, :, second].copy(), rotations[:, :, third].copy()
+    rotations[:, :, second] = cosine * a + sine * b
+    rotations[:, :, third] = cosine * b - sine * a
+
+
+def read_bvh(path: Path) -> Bvh:
+    """Read a BVH file; line ends, blanks and letter case of keywords may vary, nothing else.
+
+    Raises InputError, naming the file and where it helps the line, for anything damaged: braces, numbers,
+    counts, names, channels, an absurd frame time, more than 1000 joints, text that is none.
+    """
+    lines = _lines(path)
+    start = next((n for n, line in enumerate(lines) if line.strip().upper() == b"MOTION"), None)
+    if start is None:
+        raise InputError(f"{path}: no MOTION line, so truncated or no BVH; allowed: HIERARCHY, then MOTION")
+    hierarchy = _Hierarchy(_Words(path, lines[:start]))
+    frame_time, values = _motion(path, lines, start + 1, sum(map(len, hierarchy.channels)))
+    return Bvh(
+        path=path,
+        names=tuple(hierarchy.names),
+        parents=tuple(hierarchy.parents),
+        offsets=np.array(hierarchy.offsets),
+        channels=tuple(hierarchy.channels),
+        ends=tuple(hierarchy.ends),
+        frame_time=frame_time,
+        values=values,
+    )
+
+
+def _lines(path: Path) -> list[bytes]:
+    """The file's lines, whatever ends them (LF, CRLF or CR)."""
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: too large; allowed: a BVH of at most {MAX_BYTES >> 20} MiB")
+        return path.read_bytes().splitlines()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); allowed: a BVH file") from error
+
+
+def _fail(path: Path, line: int, wrong: str, allowed: str) -> NoReturn:
+    raise InputError(f"{path}: line {line}: {wrong}; allowed: {allowed}")
+
+
+def _number(word: str) -> float:
+    """A number as BVH has it; NaN for everything else (Python alone would take `1_0` or `Infinity`)."""
+    try:
+        return float(word) if re.fullmatch(r"[-+.0-9eE]+", word) else float("nan")
+    except ValueError:
+        return float("nan")
+
+
+def _show(word: str) -> str:
+    """A word of the file for a message: one line, short."""
+    return repr(word)[:40]
+
+
+class _Words:
+    """The words of the hierarchy, one after the other, and the line of the last."""
+
+    def __init__(self, path: Path, lines: list[bytes]) -> None:
+        self.path = path
+        self.line = 1
+        self._words = self._split(lines)
+
+    def _split(self, lines: list[bytes]) -> Iterator[str]:
+        for self.line, line in enumerate(lines, start=1):
+            try:
+                text = line.decode("utf-8-sig" if self.line == 1 else "utf-8")
+            except UnicodeDecodeError as error:
+                self.fail(f"byte {line[error.start]:#04x} is no text", "UTF-8")
+            yield from text.replace("{", " { ").replace("}", " } ").split()
+
+    def fail(self, wrong: str, allowed: str) -> NoReturn:
+        _fail(self.path, self.line, wrong, allowed)
+
+    def next(self, allowed: str) -> str:
+        """The next word, of which `allowed` says what it may be."""
+        word = next(self._words, None)
+        return word if word is not None else self.fail("the hierarchy ends before its time", allowed)
+
+    def expect(self, *keywords: str) -> str:
+        """The next word, which must be one of the keywords, in capitals."""
+        word = self.next(" or ".join(keywords))
+        return word.upper() if word.upper() in keywords else self.fail(_show(word), " or ".join(keywords))
+
+    def offset(self) -> np.ndarray:
+        """Three numbers."""
+        return np.array([self._coordinate() for _ in range(3)])
+
+    def _coordinate(self) -> float:
+        allowed = f"three numbers up to {LIMIT:g} in size after OFFSET"
+        word = self.next(allowed)
+        return _number(word) if abs(_number(word)) <= LIMIT else self.fail(_show(word), allowed)
+
+    def channels(self) -> tuple[str, ...]:
+        """A count and as many different channels."""
+        allowed = f"0 to {len(CHANNELS)} and as many different ones of {', '.join(CHANNELS)} after CHANNELS"
+        count = self.next(allowed)
+        if count not in map(str, range(len(CHANNELS) + 1)):
+            self.fail(_show(count), allowed)
+        names = tuple(self.next(allowed).capitalize() for _ in range(int(count)))
+        wrong = next((name for name in names if name not in CHANNELS or names.count(name) > 1), None)
+        return names if wrong is None else self.fail(_show(wrong), allowed)
+
+    def finish(self) -> None:
+        """There must be no further word."""
+        word = next(self._words, None)
+        if word is not None:
+            self.fail(_show(word), "MOTION after the root's last }")
+
+
+@dataclass
+class _Hierarchy:
+    """The joints as they are read, without recursion; `open` are those whose } is still to come."""
+
+    words: _Words
+    names: list[str] = field(default_factory=list)
+    parents: list[int] = field(default_factory=list)
+    offsets: list[np.ndarray] = field(default_factory=list)
+    channels: list[tuple[str, ...]] = field(default_factory=list)
+    ends: list[EndSite] = field(default_factory=list)
+    open: list[int] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.words.expect("HIERARCHY")
+        self.words.expect("ROOT")
+        self._joint()
+        while self.open:
+            keyword = self.words.expect("JOINT", "END", "}")
+            if keyword == "JOINT":
+                self._joint()
+            elif keyword == "END":
+                self._end()
+            else:
+                self.open.pop()
+        self.words.finish()
+
+    def _joint(self) -> None:
+        """`name { OFFSET x y z CHANNELS n ...`, its children still to come."""
+        if len(self.names) == MAX_JOINTS:
+            self.words.fail("one joint more", f"up to {MAX_JOINTS} joints")
+        self.names.append(self._new_name(self.words.next("a joint's name")))
+        self.parents.append(self.open[-1] if self.open else -1)
+        self.open.append(len(self.names) - 1)
+        self.words.expect("{")
+        self.words.expect("OFFSET")
+        self.offsets.append(self.words.offset())
+        self.words.expect("CHANNELS")
+        self.channels.append(self.words.channels())
+
+    def _end(self) -> None:
+        """`Site { OFFSET x y z }`, after `End`."""
+        joint = self.open[-1]
+        name = self._new_name(self.names[joint] + END)
+        for keyword in ("SITE", "{", "OFFSET"):
+            self.words.expect(keyword)
+        self.ends.append(EndSite(name, joint, self.words.offset()))
+        self.words.expect("}")
+
+    def _new_name(self, name: str) -> str:
+        if name in ("{", "}") or name in self.names or any(name == end.name for end in self.ends):
+            self.words.fail(f"name {_show(name)}", "a name for each joint, and no name (or end site) twice")
+        return name
+
+
+def _motion(path: Path, lines: list[bytes], start: int, width: int) -> tuple[float, np.ndarray]:
+    """Frame time and values (N, width) from the lines after MOTION, of which blank ones do not count."""
+    rows = [(number, line) for number, line in enumerate(lines[start:], start + 1) if line.strip()]
+    if len(rows) < 2 or width == 0:
+        _fail(path, start, "no motion", "channels, Frames:, Frame Time: and the frames")
+    frames = _header(path, *rows[0], "Frames:")
+    if not re.fullmatch(r"0*[1-9]\d{0,8}", frames, re.ASCII):
+        _fail(path, rows[0][0], f"Frames: {_show(frames)}", "a whole number from 1")
+    low, high = FRAME_RATE_RANGE
+    seconds = _number(word := _header(path, *rows[1], "Frame Time:"))
+    if not 1 / high <= seconds <= 1 / low:
+        _fail(path, rows[1][0], f"Frame Time: {_show(word)}", f"{1 / high:g} to {1 / low:g} s")
+    if len(rows) - 2 != int(frames):
+        wrong = f"Frames: {int(frames)}, but {len(rows) - 2} lines of values follow"
+        _fail(path, rows[0][0], wrong, "one line for each frame")
+    return seconds, _values(path, rows[2:], width)
+
+
+def _header(path: Path, number: int, line: bytes, key: str) -> str:
+    """The value of `key: value`, of which case and blanks may vary."""
+    text = line.decode("latin-1").strip()
+    pattern = key.replace(" ", r"\s*").replace(":", r"\s*:\s*(\S+)")
+    match = re.fullmatch(pattern, text, re.IGNORECASE)
+    return match[1] if match else _fail(path, number, _show(text), f"{key} and one number")
+
+
+def _values(path: Path, rows: list[tuple[int, bytes]], width: int) -> np.ndarray:
+    """The numbers (N, width) of the frames' lines."""
+    values = np.empty((len(rows), width))
+    for row, (number, line) in zip(values, rows, strict=True):
+        words = line.split()
+        if len(words) != width:
+            _fail(path, number, f"{len(words)} values", f"{width}, one for each channel")
+        try:
+            row[:] = float("nan") if b"_" in line else list(map(float, words))
+        except ValueError:
+            row[:] = float("nan")
+    good = np.abs(values) <= LIMIT
+    if not good.all():
+        number, line = rows[good.all(1).argmin()]
+        texts = line.decode("latin-1").split()
+        wrong = next((text for text in texts if not abs(_number(text)) <= LIMIT), texts[0])
+        _fail(path, number, _show(wrong), f"numbers up to {LIMIT:g} in size")
+    return values
+
+
+def find_bvh(source: Path) -> dict[Path, Path]:
+    """BVH files of a folder (or one file), sorted, by their path below it. Raises InputError for none."""
+    if not source.exists():
+        raise InputError(f"{source}: no such file or folder; allowed: BVH files")
+    top = source if source.is_dir() else source.parent
+    paths = sorted(source.rglob("*")) if source.is_dir() else [source]
+    files = {
+        path.relative_to(top): path for path in paths if path.suffix.lower() == ".bvh" and path.is_file()
+    }
+    if not files:
+        raise InputError(f"{source}: no BVH file found; allowed: a .bvh file, or a folder with some in it")
+    return files

@@ -1,0 +1,135 @@
+"""A prepared cache as tensors: segments for training, whole clips for evaluation, and the sampler."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from memmlp.common.errors import InputError
+from memmlp.motion.body import FRAME_DIM
+from memmlp.motion.prepare import Manifest
+from memmlp.motion.splits import PARTS
+
+WEIGHTINGS = ("frames", "clips")
+
+
+class Frames:
+    """All clips of one split, one after the other.
+
+    Attributes:
+        frames: [X | Theta] (F, 252), float32, world.
+        starts, lengths: of the clips (C,), int64, on the device of `frames`.
+        names: of the clips.
+        groups: of the clips, what belongs together having one name; by default each clip is its own.
+    """
+
+    def __init__(
+        self,
+        frames: Tensor,
+        starts: Tensor,
+        lengths: Tensor,
+        names: list[str],
+        groups: list[str] | None = None,
+    ):
+        self.frames, self.starts, self.lengths, self.names = frames, starts, lengths, names
+        self.groups = groups or list(names)
+
+    @classmethod
+    def open(cls, cache: Path, split: str) -> Frames:
+        """A split of a prepared cache, memory-mapped; `.to(device)` holds it on a device.
+
+        Raises InputError where the cache is unfinished or damaged, or the split has no clip.
+        """
+        if split not in PARTS:
+            raise InputError(f"data: no split {split!r}; allowed: {', '.join(PARTS)}")
+        clips = Manifest.load(cache).part(split)
+        if not clips:
+            raise InputError(f"{cache}: no {split} clips; prepare the data with a {split} part")
+        frames = _map(cache / f"{split}.npy")
+        if frames.shape != (sum(clip.length for clip in clips), FRAME_DIM):
+            raise InputError(f"{cache}: {split}.npy is not the manifest's array; prepare the data again")
+        starts = torch.tensor([clip.start for clip in clips])
+        lengths = torch.tensor([clip.length for clip in clips])
+        return cls(frames, starts, lengths, [clip.name for clip in clips], [clip.group for clip in clips])
+
+    def to(self, device: torch.device | str) -> Frames:
+        """The same frames on a device."""
+        tensors = (self.frames.to(device), self.starts.to(device), self.lengths.to(device))
+        return Frames(*tensors, list(self.names), list(self.groups))
+
+    def __len__(self) -> int:
+        """Number of clips."""
+        return len(self.names)
+
+    def segments(self, clip: Tensor, end: Tensor, length: int) -> Tensor:
+        """The `length` frames up to and including frame `end` of each clip.
+
+        Before a clip's start its first frame repeats, as in the warm-up of a live stream.
+
+        Args:
+            clip: indices of clips (B,).
+            end: frames of those clips (B,), 0 <= end < lengths[clip].
+
+        Returns:
+            (B, length, 252).
+        """
+        device = self.frames.device
+        back = torch.arange(1 - length, 1, device=device)
+        frame = (end.to(device)[:, None] + back).clamp_min(0)
+        return self.frames[self.starts[clip.to(device)][:, None] + frame]
+
+    def clip(self, index: int) -> Tensor:
+        """All frames (N, 252) of a clip."""
+        start, length = int(self.starts[index]), int(self.lengths[index])
+        return self.frames[start : start + length]
+
+    def clips(self) -> list[Tensor]:
+        """All frames (N, 252) of each clip, not copied."""
+        return [self.clip(index) for index in range(len(self.names))]
+
+
+class WindowSampler:
+    """Random windows; a draw depends on seed and step alone, so a sampler's position is the step.
+
+    A window of a clip is named by its last frame. Every window can be drawn, the clip's last included; a
+    clip shorter than the window has one, which ends at its last frame.
+
+    Args:
+        frames: the clips.
+        batch: windows a draw.
+        window: frames a window.
+        seed: of the draws.
+        weighting: "frames": every window of the split is equally likely; "clips": every clip is.
+    """
+
+    def __init__(self, frames: Frames, batch: int, window: int, seed: int, weighting: str = "frames"):
+        if weighting not in WEIGHTINGS:
+            raise InputError(f"data.weighting: {weighting!r}; allowed: {', '.join(WEIGHTINGS)}")
+        self.batch, self.seed, self.device = batch, seed, frames.frames.device
+        lengths = frames.lengths.cpu().numpy()
+        self.first_end = np.minimum(window, lengths) - 1
+        self.windows = np.maximum(lengths - window + 1, 1)
+        weights = self.windows if weighting == "frames" else np.ones_like(self.windows)
+        self.bounds = np.cumsum(weights)
+
+    def draw(self, step: int) -> tuple[Tensor, Tensor]:
+        """Clips (B,) and the last frames (B,) of their windows, int64, on the frames' device."""
+        random = np.random.Generator(np.random.Philox(key=[self.seed, step]))
+        clip = np.searchsorted(self.bounds, random.integers(0, self.bounds[-1], self.batch), side="right")
+        end = self.first_end[clip] + random.integers(0, self.windows[clip])
+        return torch.from_numpy(clip).to(self.device), torch.from_numpy(end).to(self.device)
+
+
+def _map(path: Path) -> Tensor:
+    """A memory-mapped .npy as a tensor, to be read only."""
+    try:
+        array = np.lib.format.open_memmap(path, mode="r")
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not a readable array ({error}); prepare the data again") from error
+    with warnings.catch_warnings():  # torch has no read-only tensors and says so
+        warnings.simplefilter("ignore", UserWarning)
+        return torch.from_numpy(array)

@@ -1,0 +1,98 @@
+"""Rotations and forward kinematics, on torch tensors of any leading shape and floating type.
+
+A rotation matrix acts on column vectors. "6D" is its first two columns, one after the other (Zhou et
+al. 2019, as every code base of the field has it). Angles are radians.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from memmlp.motion.body import PARENTS
+
+
+def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
+    """(..., 3) -> (..., 3, 3), Rodrigues' formula; smooth through angle 0."""
+    square = (axis_angle * axis_angle).sum(-1, keepdim=True)
+    small = square < 1e-8
+    angle = torch.where(small, torch.ones_like(square), square).sqrt()
+    sine = torch.where(small, 1 - square / 6, angle.sin() / angle)[..., None]
+    cosine = torch.where(small, 0.5 - square / 24, (1 - angle.cos()) / angle.square())[..., None]
+    x, y, z = axis_angle.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    identity = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
+    return identity + sine * cross + cosine * (cross @ cross)
+
+
+def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
+    """(..., 3, 3) -> (..., 3) of norm at most pi; accurate at 0 and near pi (by quaternion)."""
+    m = matrix
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    # Four forms of the same quaternion (scaled); the one with the largest pivot is well conditioned.
+    forms = torch.stack(
+        [
+            torch.stack([1 + xx + yy + zz, wx, wy, wz], -1),
+            torch.stack([wx, 1 + xx - yy - zz, xy, xz], -1),
+            torch.stack([wy, xy, 1 - xx + yy - zz, yz], -1),
+            torch.stack([wz, xz, yz, 1 - xx - yy + zz], -1),
+        ],
+        -2,
+    )
+    pivot = forms.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    index = pivot[..., None, None].expand(*pivot.shape, 1, 4)
+    quaternion = F.normalize(forms.gather(-2, index).squeeze(-2), dim=-1)
+    quaternion = torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+    vector = quaternion[..., 1:]
+    sine = vector.norm(dim=-1, keepdim=True)
+    angle = 2 * torch.atan2(sine, quaternion[..., :1])
+    scale = torch.where(sine < 1e-7, torch.full_like(sine, 2.0), angle / sine.clamp_min(1e-7))
+    return vector * scale
+
+
+def matrix_to_sixd(matrix: Tensor) -> Tensor:
+    """(..., 3, 3) -> (..., 6): the first column, then the second."""
+    return torch.cat([matrix[..., :, 0], matrix[..., :, 1]], -1)
+
+
+def sixd_to_matrix(sixd: Tensor) -> Tensor:
+    """(..., 6) -> (..., 3, 3) by Gram-Schmidt; any 6 numbers give a rotation."""
+    first = F.normalize(sixd[..., :3], dim=-1)
+    second = sixd[..., 3:]
+    second = F.normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
+    return torch.stack([first, second, torch.linalg.cross(first, second, dim=-1)], -1)
+
+
+def geodesic_angle(a: Tensor, b: Tensor) -> Tensor:
+    """Angle (...) in [0, pi] between rotations (..., 3, 3); accurate at 0 and at pi."""
+    relative = a.transpose(-1, -2) @ b
+    skew = torch.stack(
+        [
+            relative[..., 2, 1] - relative[..., 1, 2],
+            relative[..., 0, 2] - relative[..., 2, 0],
+            relative[..., 1, 0] - relative[..., 0, 1],
+        ],
+        -1,
+    )
+    trace = relative.diagonal(dim1=-2, dim2=-1).sum(-1)
+    return torch.atan2(skew.norm(dim=-1), trace - 1)
+
+
+def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
+    """Global rotations (..., 22, 3, 3) and positions (..., 22, 3) of the joints.
+
+    Args:
+        local: local rotations (..., 22, 3, 3), the root's global.
+        root: position of the root joint (..., 3), metres, world.
+        rest: rest positions (22, 3), metres; only the offsets between joint and parent count.
+    """
+    rotations, positions = [local[..., 0, :, :]], [root]
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        offset = rest[joint] - rest[parent]
+        positions.append(positions[parent] + rotations[parent] @ offset)
+        rotations.append(rotations[parent] @ local[..., joint, :, :])
+    return torch.stack(rotations, -3), torch.stack(positions, -2)

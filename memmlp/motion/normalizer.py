@@ -1,0 +1,104 @@
+"""From the world to the network's space and back: coordinates and z-scores."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from memmlp.motion.body import (
+    FRAME_DIM,
+    HEAD,
+    MOTION_DIM,
+    N_JOINTS,
+    ROTATION,
+    SPARSE_DIM,
+    SPARSE_POSITION,
+)
+from memmlp.motion.coordinates import World
+from memmlp.motion.geometry import forward_kinematics, sixd_to_matrix
+
+
+class Frame(nn.Module):
+    """World <-> network space: the choice of coordinates, and z-scores where statistics are given.
+
+    Args:
+        coordinates: World(), HeadRelative() or Heading().
+        rest: rest positions (22, 3), metres, for forward kinematics.
+        mean, std: statistics (252,) of frames [X | Theta] in the chosen coordinates.
+    """
+
+    MIN_STD = 1e-3  # a constant feature stays constant instead of becoming noise
+
+    rest: Tensor
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, coordinates: World, rest: Tensor, mean: Tensor, std: Tensor):
+        super().__init__()
+        self.coordinates = coordinates
+        self.register_buffer("rest", rest.float())
+        self.register_buffer("mean", mean.float())
+        self.register_buffer("std", std.float().clamp_min(self.MIN_STD))
+
+    @classmethod
+    def raw(cls, coordinates: World, rest: Tensor) -> Frame:
+        """The frame without normalisation."""
+        return cls(coordinates, rest, torch.zeros(FRAME_DIM), torch.ones(FRAME_DIM))
+
+    @classmethod
+    def fit(cls, coordinates: World, rest: Tensor, frames: Tensor, chunk: int = 65536) -> Frame:
+        """The frame with the z-scores of training frames (F, 252), read chunk by chunk."""
+        plain = cls.raw(coordinates, rest).to(frames.device)
+        count = len(frames)
+        total = torch.zeros(FRAME_DIM, dtype=torch.float64, device=frames.device)
+        for part in frames.split(chunk):
+            total += plain.encode(part).double().sum(0)
+        mean = total / count
+        square = torch.zeros_like(total)
+        for part in frames.split(chunk):
+            square += (plain.encode(part).double() - mean).square().sum(0)
+        return cls(coordinates, rest.cpu(), mean.cpu(), (square / count).sqrt().cpu())
+
+    def place(self, sparse: Tensor) -> Tensor:
+        """Where (..., 3 or 5) the local coordinates of inputs (..., 54) lie."""
+        return self.coordinates.place(sparse)
+
+    def encode(self, frames: Tensor) -> Tensor:
+        """World frames [X | Theta] (..., 252) -> network space (..., 252)."""
+        sparse, motion = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:]
+        place = self.place(sparse)
+        return torch.cat([self.encode_sparse(sparse, place), self.encode_motion(motion, place)], -1)
+
+    def encode_sparse(self, sparse: Tensor, place: Tensor) -> Tensor:
+        """World inputs (..., 54) -> network space (..., 54)."""
+        return (self.coordinates.sparse_in(sparse, place) - self.mean[:SPARSE_DIM]) / self.std[:SPARSE_DIM]
+
+    def encode_motion(self, motion: Tensor, place: Tensor) -> Tensor:
+        """World motion (..., 198) -> network space (..., 198)."""
+        return (self.coordinates.motion_in(motion, place) - self.mean[SPARSE_DIM:]) / self.std[SPARSE_DIM:]
+
+    def decode_motion(self, motion: Tensor, place: Tensor) -> Tensor:
+        """Network space (..., 198) -> world motion (..., 198)."""
+        return self.coordinates.motion_out(motion * self.std[SPARSE_DIM:] + self.mean[SPARSE_DIM:], place)
+
+    def pose(self, motion: Tensor, sparse: Tensor) -> Tensor:
+        """Joint positions (..., 22, 3), metres, world, from the rotations of world motion (..., 198).
+
+        Forward kinematics, translated so that the head stands where its tracker says (field.md).
+        """
+        local = sixd_to_matrix(motion[..., ROTATION].unflatten(-1, (N_JOINTS, 6)))
+        _, positions = forward_kinematics(local, torch.zeros_like(sparse[..., :3]), self.rest)
+        head = sparse[..., SPARSE_POSITION][..., :3]
+        return positions + (head - positions[..., HEAD, :]).unsqueeze(-2)
+
+    def posed(self, rotation: Tensor, sparse: Tensor) -> Tensor:
+        """World motion (..., 198) of rotations (..., 132) in network space at world inputs (..., 54).
+
+        The positions follow from the rotations (`pose`), without gradient.
+        """
+        motion = F.pad(rotation, (0, MOTION_DIM - ROTATION.stop))
+        world = self.decode_motion(motion, self.place(sparse))
+        with torch.no_grad():
+            positions = self.pose(world, sparse).flatten(-2)
+        return torch.cat([world[..., ROTATION], positions], -1)

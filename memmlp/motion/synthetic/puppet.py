@@ -1,0 +1,248 @@
+"""A person driven by feet, pelvis, trunk, gaze and hands; two-bone inverse kinematics finds the joints.
+
+Directions of the body are SMPL's: x left, y up, z forward. Angles about them are (pitch, yaw, roll):
+positive leans forward, turns left, leans to the right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d
+from scipy.spatial.transform import Rotation
+
+from memmlp.motion.body import JOINTS, N_JOINTS, builtin_rest_joints
+from memmlp.motion.synthetic.curves import Array, smooth, smooth_below, soft_minimum
+from memmlp.motion.synthetic.steps import Feet
+
+REST = builtin_rest_joints()
+INDEX = {name: joint for joint, name in enumerate(JOINTS)}
+SIDES = (("left", 1.0), ("right", -1.0))
+ANKLE_HEIGHT = 0.075  # metres above the floor, foot flat
+HEEL = np.array([0.0, -ANKLE_HEIGHT, -0.05])  # from the ankle to the heel's contact
+STRETCH = 0.993  # a leg that carries is no longer than this part of its full length
+SPINE_SHARES = {"spine1": 0.3, "spine2": 0.3, "spine3": 0.4}
+LEG_POLE, ARM_POLE = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])  # knee and elbow in T-pose
+
+
+@dataclass
+class Puppet:
+    """What the person does, over N frames; metres, radians.
+
+    Attributes:
+        fps: frames per second.
+        heading: direction (N,) the body faces: 0 is world +X, pi/2 is +Y.
+        pelvis: position (N, 3) of the root, world; lowered where a standing leg would not reach.
+        settle: seconds over which it is lowered.
+        tilt: rotation vector (N, 3) of the pelvis against the heading.
+        spine: rotation vector (N, 3) of the chest against the pelvis.
+        gaze: (pitch, yaw) (N, 2) of the head against the heading.
+        feet: the feet.
+        hands: wrists (N, 2, 3) from the shoulders at rest: outward, up, forward in the turned, upright trunk.
+        wrists: rotation vectors (N, 2, 3) of the left wrist, and of the right as its mirror image.
+    """
+
+    fps: float
+    heading: Array
+    pelvis: Array
+    settle: float
+    tilt: Array
+    spine: Array
+    gaze: Array
+    feet: Feet
+    hands: Array
+    wrists: Array
+
+
+def solve(puppet: Puppet) -> tuple[Array, Array]:
+    """Axis-angle poses (N, 22, 3), radians, and root positions (N, 3), metres, world."""
+    pelvis = facing(puppet.heading) * Rotation.from_rotvec(puppet.tilt)
+    root = _root(puppet, pelvis)
+    local = {"pelvis": pelvis}
+    for side in (0, 1):
+        local |= _leg(puppet, side, pelvis, root)
+    chest, spine = _spine(puppet, pelvis)
+    local |= spine | _head(puppet, chest)
+    for side in (0, 1):
+        local |= _arm(puppet, side, chest)
+    poses = np.zeros((len(root), N_JOINTS, 3))
+    for name, rotation in local.items():
+        poses[:, INDEX[name]] = rotation.as_rotvec()
+    return poses, root
+
+
+def facing(yaw: Array) -> Rotation:
+    """From the body's axes to the world for a person upright who faces `yaw` (N,)."""
+    upright = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0])
+    return Rotation.from_rotvec(np.outer(yaw + np.pi / 2, [0.0, 0.0, 1.0])) * upright
+
+
+def two_bone(
+    start: Array,
+    target: Array,
+    pole: Array,
+    upper: Array,
+    lower: Array,
+    rest_pole: Array,
+    free: Array | float,
+) -> tuple[Rotation, Rotation]:
+    """Global rotations (N) of two bones that go from `start` to `target`.
+
+    Args:
+        start, target: positions (N, 3); a target out of reach is approached as far as the bones go.
+        pole: directions (N, 3) to which the joint between the bones points.
+        upper, lower: bones (3,) in the rest pose.
+        rest_pole: direction (3,) to which that joint points in the rest pose.
+        free: in [0, 1] (N,): how early a limb that is to be stretched slows down; 0 reaches exactly.
+    """
+    a, b = float(np.linalg.norm(upper)), float(np.linalg.norm(lower))
+    span = np.linalg.norm(target - start, axis=-1, keepdims=True)
+    along = (target - start) / span
+    reach = np.maximum(_within(span, a + b, free), 0.28 * (a + b))
+    across = _unit(pole - (pole * along).sum(-1, keepdims=True) * along)
+    cosine = (a * a + reach * reach - b * b) / (2 * a * reach)
+    middle = a * (cosine * along + np.sqrt(1 - cosine * cosine) * across)
+    hinge = np.cross(across, along)
+    return (
+        _carry(upper, np.cross(rest_pole, upper), middle, hinge),
+        _carry(lower, np.cross(rest_pole, lower), reach * along - middle, hinge),
+    )
+
+
+def ankles(feet: Feet, side: int) -> tuple[Array, Rotation]:
+    """Position (N, 3), world, of an ankle and the foot's global rotation (N)."""
+    name = SIDES[side][0]
+    ball = _bone(f"{name}_ankle", f"{name}_foot")
+    heel_up, toe_up = _pitch(feet.heel[:, side]), _pitch(-feet.toe[:, side])
+    moved = ball - heel_up.apply(ball) + HEEL - toe_up.apply(HEEL) + [0.0, ANKLE_HEIGHT, 0.0]
+    flat = facing(feet.yaw[:, side])
+    return feet.ground[:, side] + flat.apply(moved), flat * heel_up * toe_up
+
+
+def _root(puppet: Puppet, pelvis: Rotation) -> Array:
+    """The root (N, 3), lowered where a leg would else be stretched out that carries or is about to."""
+    wanted = puppet.pelvis[:, 2]
+    ceiling = wanted + 0.3
+    frames = round(puppet.settle * puppet.fps)
+    for side, (name, _) in enumerate(SIDES):
+        hip = pelvis.apply(_bone("pelvis", f"{name}_hip"))
+        away = ankles(puppet.feet, side)[0] - puppet.pelvis - hip
+        length = STRETCH * _length(f"{name}_hip", f"{name}_knee", f"{name}_ankle")
+        height = np.sqrt(np.maximum(length**2 - (away[:, :2] ** 2).sum(-1), 0.0))
+        limit = wanted + away[:, 2] + height
+        carries = _near(puppet.feet.planted[:, side], frames // 2)
+        ceiling = np.where(carries, np.minimum(ceiling, limit), ceiling)
+    root = puppet.pelvis.copy()
+    root[:, 2] = soft_minimum(wanted, smooth_below(ceiling, frames), 0.01)
+    return root
+
+
+def _leg(puppet: Puppet, side: int, pelvis: Rotation, root: Array) -> dict[str, Rotation]:
+    """Local rotations of hip, knee, ankle and foot; the knee points where pelvis and foot point."""
+    name, sign = SIDES[side]
+    ankle, foot = ankles(puppet.feet, side)
+    frames = round(puppet.settle * puppet.fps) // 2
+    pole = pelvis.apply([0.1 * sign, 0, 1.0]) + facing(puppet.feet.yaw[:, side]).apply([0, 0, 1.0])
+    thigh, shin = two_bone(
+        root + pelvis.apply(_bone("pelvis", f"{name}_hip")),
+        ankle,
+        pole,
+        _bone(f"{name}_hip", f"{name}_knee"),
+        _bone(f"{name}_knee", f"{name}_ankle"),
+        LEG_POLE,
+        smooth(1.0 - _near(puppet.feet.planted[:, side], frames), frames),
+    )
+    return {
+        f"{name}_hip": pelvis.inv() * thigh,
+        f"{name}_knee": thigh.inv() * shin,
+        f"{name}_ankle": shin.inv() * foot,
+        f"{name}_foot": _pitch(-0.5 * puppet.feet.heel[:, side]),
+    }
+
+
+def _spine(puppet: Puppet, pelvis: Rotation) -> tuple[Rotation, dict[str, Rotation]]:
+    """The chest's global rotation, and the local ones that share the bend."""
+    local = {name: Rotation.from_rotvec(share * puppet.spine) for name, share in SPINE_SHARES.items()}
+    chest = pelvis
+    for rotation in local.values():
+        chest = chest * rotation
+    return chest, local
+
+
+def _head(puppet: Puppet, chest: Rotation) -> dict[str, Rotation]:
+    """Neck and head share the turn from the chest to the gaze."""
+    gaze = facing(puppet.heading + puppet.gaze[:, 1]) * _pitch(puppet.gaze[:, 0])
+    half = Rotation.from_rotvec(0.5 * (chest.inv() * gaze).as_rotvec())
+    return {"neck": half, "head": half}
+
+
+def _arm(puppet: Puppet, side: int, chest: Rotation) -> dict[str, Rotation]:
+    """Local rotations of collar, shoulder, elbow and wrist; the collar goes some way with the hand."""
+    name, sign = SIDES[side]
+    shoulder = _bone("spine3", f"{name}_collar"), _bone(f"{name}_collar", f"{name}_shoulder")
+    bones = _bone(f"{name}_shoulder", f"{name}_elbow"), _bone(f"{name}_elbow", f"{name}_wrist")
+    hand = puppet.hands[:, side] / _length(f"{name}_shoulder", f"{name}_elbow", f"{name}_wrist")
+    raised, forward = 0.11 * (1 + hand[:, 1]).clip(0) ** 2, 0.2 * hand[:, 2]
+    collar = chest * Rotation.from_rotvec(sign * np.stack([np.zeros_like(raised), -forward, raised], -1))
+    trunk = facing(puppet.heading + puppet.tilt[:, 1] + puppet.spine[:, 1])
+    mirror = np.array([sign, 1.0, 1.0])
+    start = chest.apply(shoulder[0]) + collar.apply(shoulder[1])
+    target = chest.apply(sum(shoulder)) + trunk.apply(puppet.hands[:, side] * mirror)
+    pole = trunk.apply(_elbow(hand) * mirror)
+    upper, lower = two_bone(start, target, pole, *bones, ARM_POLE, 0.0)
+    return {
+        f"{name}_collar": chest.inv() * collar,
+        f"{name}_shoulder": collar.inv() * upper,
+        f"{name}_elbow": upper.inv() * lower,
+        f"{name}_wrist": Rotation.from_rotvec(puppet.wrists[:, side] * [1.0, sign, sign]),
+    }
+
+
+def _elbow(hand: Array) -> Array:
+    """Where the elbow points (N, 3): back while the hand (N, 3) hangs, down when it is ahead."""
+    ahead = 0.5 + 0.5 * np.tanh(2.0 * (hand[:, 2] - 0.35))
+    return np.stack([np.full_like(ahead, 0.35), -0.9 * ahead, -0.9 * (1.0 - ahead)], -1)
+
+
+def _near(flags: Array, frames: int) -> Array:
+    """Whether (N,) a flag is set within `frames` frames."""
+    return maximum_filter1d(flags, 2 * frames + 1, mode="nearest")
+
+
+def _within(span: Array, full: float, free: Array | float) -> Array:
+    """The distance (N, 1) itself up to STRETCH of the full length, then smoothly to 99.9 % of it at most."""
+    start = (STRETCH - 0.05 * np.reshape(free, (-1, 1))) * full
+    room = 0.999 * full - start
+    return np.where(span < start, span, start + room * np.tanh((span - start) / room))
+
+
+def _carry(rest: Array, rest_hinge: Array, bone: Array, hinge: Array) -> Rotation:
+    """The rotation (N) that takes a bone (3,) and its hinge to those given (N, 3)."""
+    return Rotation.from_matrix(_frame(bone, hinge) @ _frame(rest, rest_hinge).T)
+
+
+def _frame(bone: Array, hinge: Array) -> Array:
+    """Orthonormal axes (..., 3, 3) in columns: bone, hinge, and the third."""
+    first, second = _unit(bone), _unit(hinge)
+    return np.stack([first, second, np.cross(first, second)], -1)
+
+
+def _unit(v: Array) -> Array:
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def _pitch(angle: Array) -> Rotation:
+    """Rotation (N) about the body's x: positive goes forward and down."""
+    return Rotation.from_rotvec(np.outer(angle, [1.0, 0.0, 0.0]))
+
+
+def _bone(parent: str, child: str) -> Array:
+    """Offset (3,) in the rest pose, metres."""
+    return REST[INDEX[child]] - REST[INDEX[parent]]
+
+
+def _length(*chain: str) -> float:
+    """Metres along a chain of joints."""
+    return float(sum(np.linalg.norm(_bone(a, b)) for a, b in pairwise(chain)))

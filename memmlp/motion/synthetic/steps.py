@@ -1,0 +1,75 @@
+"""Feet: where they stand, and how they go from one place to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from memmlp.motion.synthetic.curves import Array, arc, glide, pulse
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of one foot: seconds, metres, radians.
+
+    Attributes:
+        foot: 0 left, 1 right.
+        off, on: when the toes leave the floor and the heel comes back to it.
+        to: place (2,) on the floor below the ankle.
+        yaw: direction of the foot there, world.
+        lift: how high it is carried on the way.
+        heel: angle by which the heel is up when the toes leave.
+        toe: angle by which the toes are up when the heel arrives.
+        push, roll: how long before `off` the heel rises, how long after `on` the toes come down.
+    """
+
+    foot: int
+    off: float
+    on: float
+    to: Array
+    yaw: float
+    lift: float = 0.05
+    heel: float = 0.4
+    toe: float = 0.1
+    push: float = 0.15
+    roll: float = 0.1
+
+
+@dataclass
+class Feet:
+    """Both feet over N frames, left and right.
+
+    Attributes:
+        ground: place (N, 2, 3) of the flat foot, below the ankle, metres, world; z is 0 on the floor.
+        yaw: direction (N, 2), radians, world.
+        heel, toe: angles (N, 2), radians, at least 0: the foot turned about its ball, about its heel.
+        planted: bool (N, 2), ball or heel on the floor.
+    """
+
+    ground: Array
+    yaw: Array
+    heel: Array
+    toe: Array
+    planted: Array
+
+
+def tread(t: Array, places: Array, yaws: Array, steps: Iterable[Step]) -> Feet:
+    """Feet that start at `places` (2, 2) with directions `yaws` (2,) and make the steps, in order of time."""
+    n = len(t)
+    ground = np.zeros((n, 2, 3))
+    ground[:, :, :2] = places
+    feet = Feet(ground, np.tile(yaws, (n, 1)), np.zeros((n, 2)), np.zeros((n, 2)), np.ones((n, 2), bool))
+    place, yaw = np.array(places, float), np.array(yaws, float)
+    for step in steps:
+        foot, off, on = step.foot, step.off, step.on
+        part = glide(t, off, on)
+        ground[:, foot, :2] += part[:, None] * (step.to - place[foot])
+        ground[:, foot, 2] += step.lift * arc(t, off, on)
+        feet.yaw[:, foot] += part * (step.yaw - yaw[foot])
+        feet.heel[:, foot] += step.heel * pulse(t, off - step.push, off, off, off + 0.7 * (on - off))
+        feet.toe[:, foot] += step.toe * pulse(t, on - 0.5 * (on - off), on, on, on + step.roll)
+        feet.planted[:, foot] &= (t <= off) | (t >= on)
+        place[foot], yaw[foot] = step.to, step.yaw
+    return feet

@@ -1,0 +1,37 @@
+"""The memory slot: what the backbone is told of the past, and what is kept for the next call.
+
+A memory gives the backbone its blocks (`block`), turns the buffers of past frames into what those blocks
+see (`recall`), and updates its buffers after the network's output (`remember`). All in network space.
+"""
+
+from memmlp.networks.memory.features import (
+    Blend,
+    MemoryBlock,
+    Past,
+    ProjectedFeature,
+    Projection,
+    Recurred,
+    State,
+)
+from memmlp.networks.memory.own_past import CodeMemory, JointCodeMemory, NoCodesMemory, VQMemory
+from memmlp.networks.memory.recurrent import GRUMemory, LSTMMemory, RecurrentMemory
+from memmlp.networks.memory.slot import Memory, NoMemory
+
+__all__ = [
+    "Blend",
+    "CodeMemory",
+    "GRUMemory",
+    "JointCodeMemory",
+    "LSTMMemory",
+    "Memory",
+    "MemoryBlock",
+    "NoCodesMemory",
+    "NoMemory",
+    "Past",
+    "ProjectedFeature",
+    "Projection",
+    "Recurred",
+    "RecurrentMemory",
+    "State",
+    "VQMemory",
+]

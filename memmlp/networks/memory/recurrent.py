@@ -1,0 +1,162 @@
+"""Recurrent layers in the place of the paper's memory (Table 15)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.utils.flop_counter import register_flop_formula
+
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.networks.memory.features import Past, Recurred, RecurredFeature, State
+from memmlp.networks.memory.slot import FeatureMemory
+from memmlp.networks.vqvae import VQVAE
+
+
+class Recurrence(nn.Module):
+    """LayerNorm of the sparse features, a recurrent layer, SiLU (App. A, reading 19).
+
+    Attributes:
+        kind: the recurrent layer. carried: names of its states, the hidden one first.
+    """
+
+    kind: ClassVar[Callable[..., nn.RNNBase]]
+    carried: ClassVar[tuple[str, ...]]
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.norm = nn.LayerNorm(SPARSE_DIM)
+        self.first = nn.Linear(SPARSE_DIM, width)
+        self.layer = self.kind(SPARSE_DIM, width, batch_first=True)
+
+    def begin(self, sparse: Tensor) -> Tensor:
+        """The hidden state (B, k) that a training window starts from, of the input (B, 54) before it."""
+        return self.first(self.norm(sparse))
+
+    def forward(self, sparse: Tensor, carried: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
+        """Inputs (B, n, 54) and states (B, k) -> features (B, n, k) and the states after them."""
+        with torch.autocast(sparse.device.type, enabled=False):  # not every CPU has an LSTM in bfloat16
+            output, states = self.run(self.norm(sparse), [state.contiguous()[None] for state in carried])
+        return F.silu(output), [state[0] for state in states]
+
+    def run(self, x: Tensor, states: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
+        """The recurrent layer, its states (1, B, k) in a sequence."""
+        raise NotImplementedError
+
+
+@register_flop_formula(torch.ops.aten.mkldnn_rnn_layer)
+def lstm_flops(x: Sequence[int], to_gates: Sequence[int], again: Sequence[int], *shapes, **rest) -> int:
+    """FLOPs of a CPU's LSTM, one operation that the counter does not know, from the shapes of its arguments.
+
+    x is (n, B, inputs), the weights (4 k, inputs) and (4 k, k).
+    """
+    return 2 * x[0] * x[1] * (to_gates[0] * to_gates[1] + again[0] * again[1])
+
+
+class LSTM(Recurrence):
+    """Hidden and cell state."""
+
+    kind = nn.LSTM
+    carried = ("hidden", "cell")
+
+    def run(self, x: Tensor, states: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
+        """The recurrent layer, its states (1, B, k) in a sequence."""
+        return self.layer(x, tuple(states))
+
+
+class GRU(Recurrence):
+    """Hidden state alone."""
+
+    kind = nn.GRU
+    carried = ("hidden",)
+
+    def run(self, x: Tensor, states: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
+        """The recurrent layer, its states (1, B, k) in a sequence."""
+        output, hidden = self.layer(x, states[0])
+        return output, [hidden]
+
+
+class RecurrentMemory(FeatureMemory):
+    """A recurrent layer for each block in place of the paper's memory (Table 15, reading 19).
+
+    It runs once over each frame, so its outputs for the window's older frames are kept beside its states:
+    a stream taken frame by frame is then the same as one taken in larger steps. A training call takes a
+    whole window. With teacher forcing the hidden state starts from the last input before the window,
+    projected, and the cell at zero (`true_state`); else, and in evaluation, states are carried from call to
+    call, zeros at a fresh start.
+
+    Args:
+        layers, width, fusion, hidden, frames, depth: see FeatureMemory; the width is the layer's hidden size.
+    """
+
+    recurrence: ClassVar[type[Recurrence]]
+
+    def __init__(
+        self,
+        layers: Sequence[int],
+        width: int,
+        fusion: str,
+        *,
+        hidden: int,
+        frames: int,
+        depth: int,
+        codes: VQVAE | None = None,
+    ):
+        super().__init__(layers, width, fusion, hidden=hidden, frames=frames, depth=depth)
+        self.recurrences = nn.ModuleList()
+        self.shift = frames
+        self.length = frames - 1
+
+    def feature(self) -> nn.Module:
+        """One more recurrent layer; the module that looks its output up."""
+        self.recurrences.append(self.recurrence(self.width))
+        return RecurredFeature(len(self.recurrences) - 1)
+
+    def initial_state(self, batch: int) -> State:
+        """Zeros: states (B, blocks, k), and features (B, blocks, T - 1, k) of the frames before."""
+        blocks = len(self.recurrences)
+        states = {name: torch.zeros(batch, blocks, self.width) for name in self.recurrence.carried}
+        return states | {"features": torch.zeros(batch, blocks, self.frames - 1, self.width)}
+
+    def true_state(self, sparse: Tensor, motion: Tensor) -> State:
+        """Hidden states from the last of inputs (B, length, 54)."""
+        hidden = torch.stack([layer.begin(sparse[:, -1]) for layer in self._layers()], 1)
+        return {"hidden": hidden.float()}
+
+    def recall(self, sparse: Tensor, state: State, new: int) -> Recurred:
+        """The layers' features, those of the `new` frames made now."""
+        features, states = [], []
+        for index, layer in enumerate(self._layers()):
+            carried = [state[name][:, index] for name in layer.carried]
+            made, after = layer(sparse[:, -new:], carried)
+            features.append(made)
+            states.append(after)
+        window = torch.cat([state["features"], torch.stack(features, 1)], 2)[:, :, -self.frames :]
+        names = self.recurrence.carried
+        carried_on = {
+            name: torch.stack(of, 1) for name, of in zip(names, zip(*states, strict=True), strict=True)
+        }
+        return Recurred(window, carried_on)
+
+    def remember(self, motion: Tensor, past: Past | Recurred | None, state: State, new: int) -> State:
+        """The states after the newest frame, and the features of the last T - 1 frames."""
+        assert isinstance(past, Recurred)
+        return past.carried | {"features": past.features[:, :, 1:]}
+
+    def _layers(self) -> list[Recurrence]:
+        return [layer for layer in self.recurrences if isinstance(layer, Recurrence)]
+
+
+class LSTMMemory(RecurrentMemory):
+    """Table 15's LSTM-MB."""
+
+    recurrence = LSTM
+
+
+class GRUMemory(RecurrentMemory):
+    """Table 15's GRU-MB."""
+
+    recurrence = GRU

@@ -1,0 +1,39 @@
+"""The live stream of a trained network with nothing computed twice: the same numbers, less work.
+
+What depends on one frame alone is computed when the frame enters and carried in the state, and of the last
+layers only what the newest frame needs is computed.
+"""
+
+from __future__ import annotations
+
+from memmlp.common.errors import InputError
+from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP
+from memmlp.networks.baselines.avatar_poser import AvatarPoser
+from memmlp.networks.mem_mlp import MemMLP
+from memmlp.networks.streaming.baselines import AGRoLDiffusionStream, AGRoLMLPStream, AvatarPoserStream
+from memmlp.networks.streaming.mem_mlp import MemMLPStream
+from memmlp.networks.streaming.ring import Stream
+from memmlp.networks.window_model import WindowModel
+
+__all__ = ["Stream", "streaming"]
+
+STREAMS: dict[type[WindowModel], type[Stream]] = {
+    MemMLP: MemMLPStream,
+    AvatarPoser: AvatarPoserStream,
+    AGRoLMLP: AGRoLMLPStream,
+    AGRoLDiffusion: AGRoLDiffusionStream,
+}
+
+
+def streaming(model: WindowModel) -> Stream:
+    """The live stream of a trained network, which itself stays as it is.
+
+    Raises InputError where there is none: where estimates of past frames change at each step
+    (`memory.history=latest`), nothing can be carried.
+    """
+    if not model.settled:
+        raise InputError(
+            "memory.history=latest: its estimates change at each step, which no streaming graph can carry; "
+            "allowed is export.graph=naive, or memory.history=first"
+        )
+    return STREAMS[type(model)](model)

@@ -1,0 +1,133 @@
+"""Mem-MLP as a live stream: the numbers of `MemMLP.advance` a frame at a time.
+
+The stem's output and, of each memory block, the share that its memory feature has in the block's linear
+layer are computed when a frame enters, with the code-vectors and projections before it, and carried. Only
+the mixing over frames, and what follows it, is left.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from memmlp.motion.body import MOTION_DIM, SPARSE_DIM
+from memmlp.motion.normalizer import Frame
+from memmlp.networks.mem_mlp import MemMLP
+from memmlp.networks.memory import State
+from memmlp.networks.predictor import Branch
+from memmlp.networks.streaming.blocks import Converter, Mixing, Step
+from memmlp.networks.streaming.recall import recall
+from memmlp.networks.streaming.ring import Ring, Stream
+from memmlp.networks.window_model import WindowModel
+
+Way = Callable[[Tensor, Tensor], Tensor]
+
+
+class Coordinates(nn.Module):
+    """World <-> network space as matrices: both ways are linear for a given turn, and in cosine and sine.
+
+    Args:
+        frame: whose `encode_sparse` and `decode_motion` these are; the matrices are found by trying.
+    """
+
+    def __init__(self, frame: Frame):
+        super().__init__()
+        self.frame = frame
+        exact = copy.deepcopy(frame).double()
+        turns = exact.place(torch.zeros(1, SPARSE_DIM)).shape[-1] - 3
+        inputs, motions = torch.eye(SPARSE_DIM).double(), torch.eye(MOTION_DIM + 3).double()
+
+        def encode(x: Tensor, turn: Tensor) -> Tensor:
+            return exact.encode_sparse(x, torch.cat([exact.place(x)[..., :3], turn.expand(len(x), -1)], -1))
+
+        def decode(x: Tensor, turn: Tensor) -> Tensor:
+            return exact.decode_motion(
+                x[:, :MOTION_DIM], torch.cat([x[:, MOTION_DIM:], turn.expand(len(x), -1)], -1)
+            )
+
+        self.encoder, self.encoder_bias = (
+            nn.Parameter(p.to(frame.mean)) for p in _matrices(encode, inputs, turns)
+        )
+        self.decoder, self.decoder_bias = (
+            nn.Parameter(p.to(frame.mean)) for p in _matrices(decode, motions, turns)
+        )
+
+    def encode(self, sparse: Tensor, place: Tensor) -> Tensor:
+        """World inputs (1, 54) of a frame whose place is (1, 3 or 5) -> network space (1, 54)."""
+        return _apply(self.encoder, self.encoder_bias, sparse, place)
+
+    def decode(self, motion: Tensor, place: Tensor) -> Tensor:
+        """Network space (1, 198) -> world motion (1, 198)."""
+        return _apply(self.decoder, self.decoder_bias, torch.cat([motion, place[:, :3]], -1), place)
+
+
+def _matrices(way: Way, basis: Tensor, turns: int) -> tuple[Tensor, Tensor]:
+    """Matrices (1 + turns, out, in), offsets (1 + turns, 1, out): the constant, then one a turn's number."""
+    size = basis.shape[-1]
+    tried = [torch.zeros(turns).double(), *torch.eye(turns).double()]
+    offsets = torch.stack([way(torch.zeros(1, size).double(), turn) for turn in tried])
+    matrices = torch.stack([way(basis, turn) - offset for turn, offset in zip(tried, offsets, strict=True)])
+    offsets[1:] -= offsets[:1]
+    matrices[1:] -= matrices[:1]
+    return matrices.transpose(1, 2), offsets
+
+
+def _apply(matrices: Tensor, offsets: Tensor, x: Tensor, place: Tensor) -> Tensor:
+    """The sum of the matrices' products with x (1, in), each times its turn's number."""
+    parts, out = len(matrices), matrices.shape[1]
+    products = F.linear(x, matrices.reshape(parts * out, -1), offsets.reshape(-1)).view(parts, out)
+    turn = torch.cat([torch.ones_like(place[:, :1]), place[:, 3:]], -1)
+    return turn @ products
+
+
+class MemMLPStream(Stream):
+    """A Mem-MLP as a live stream."""
+
+    ends = ("coordinates", "stem", "predictor.rotation.linear", "predictor.position.linear")
+
+    def build(self, model: WindowModel) -> None:
+        """Make the stream's parts of a copy of the network."""
+        assert isinstance(model, MemMLP)
+        self.coordinates = Coordinates(model.frame)
+        self.stem = model.stem
+        converter = Converter()
+        self.blocks = nn.ModuleList(converter.block(block) for block in model.blocks)
+        self.predictor = model.predictor
+        for name, branch in list(model.predictor.named_children()):
+            assert isinstance(branch, Branch)
+            setattr(self.predictor, name, converter.branch(branch))
+        self.mixing = Mixing(converter.mixes)
+        self.recall = recall(model.memory, converter.features, converter.shared)
+        self.shares = [f"memory.{index}" for index in range(len(converter.shared))]
+
+    def windows(self) -> State:
+        """The stem's outputs and the shares of the window's frames, and what the memory keeps."""
+        memory, window = self.recall.memory, torch.zeros(self.frames, self.stem.out_features)
+        return {
+            "sparse": torch.zeros(1, memory.length, SPARSE_DIM),
+            **{name: window.clone() for name in ("stem", *self.shares)},
+            **memory.initial_state(1),
+        }
+
+    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+        """World inputs (1, 54) and the state -> motion (1, 198) in the world, and what is carried on."""
+        memory = self.recall.memory
+        place = self.frame.place(sparse)
+        encoded = self.coordinates.encode(sparse, place)
+        queue = torch.cat([torch.where(state["count"] > 0, state["sparse"], encoded), encoded[None]], 1)
+        past = memory.recall(queue, state, 1)
+        stem = self.stem(encoded)
+        kept = {"stem": ring.put(state["stem"], stem, stem)}
+        for name, share, before in zip(self.shares, *self.recall(past), strict=True):
+            kept[name] = ring.put(state[name], share, before)
+        h, *shares = kept.values()
+        now = Step(ring.newest, self.mixing(ring.slot), shares)
+        for block in self.blocks:
+            h = block(h, now)
+        motion = self.predictor(h, now, sparse, self.frame, 1)
+        kept |= memory.remember(motion[None], past, state, 1) | {"sparse": queue[:, 1:]}
+        return self.coordinates.decode(motion, place), kept

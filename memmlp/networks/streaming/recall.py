@@ -1,0 +1,168 @@
+"""A memory at one frame: what enters a stream's memory windows at a step."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from memmlp.networks.memory import (
+    Memory,
+    NoCodesMemory,
+    Past,
+    ProjectedFeature,
+    Projection,
+    Recurred,
+    RecurrentMemory,
+    VQMemory,
+)
+from memmlp.networks.streaming.blocks import SharedBlock
+from memmlp.networks.vqvae import VQVAE
+
+Pieces = Sequence[Tensor]
+
+
+class Projections(nn.Module):
+    """The projections that several memory blocks make of one input, at once."""
+
+    def __init__(self, parts: Sequence[Projection]):
+        super().__init__()
+        self.shape = len(parts), parts[0].norm.normalized_shape[0]
+        self.weight = nn.Parameter(torch.cat([part.linear.weight for part in parts]))
+        self.bias = nn.Parameter(torch.cat([part.linear.bias for part in parts]))
+        self.scale = nn.Parameter(torch.stack([part.norm.weight for part in parts]))
+        self.offset = nn.Parameter(torch.stack([part.norm.bias for part in parts]))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(n, size) -> (n, blocks, k)."""
+        y = F.linear(x, self.weight, self.bias).view(-1, *self.shape)
+        return F.silu(F.layer_norm(y, self.shape[1:]) * self.scale + self.offset)
+
+
+class Table(nn.Module):
+    """Those projections of code-vectors, which are few: computed before, looked up by index."""
+
+    def __init__(self, parts: Sequence[Projection], vectors: Tensor):
+        super().__init__()
+        self.projected = nn.Parameter(Projections(parts)(vectors).detach())
+
+    def forward(self, index: Tensor) -> Tensor:
+        """Indices (1,) of code-vectors -> (1, blocks, k)."""
+        return self.projected.index_select(0, index)
+
+
+class Indices(nn.Module):
+    """A VQ-VAE that gives the index of a frame's code-vector in the place of the vector."""
+
+    def __init__(self, codes: VQVAE):
+        super().__init__()
+        self.encoder, self.codebook = codes.encoder, codes.codebook
+
+    def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
+        """(1, 1) for a frame's inputs (1, 1, 54) and motion (1, 1, 198)."""
+        return self.codebook.indices(self.encoder(torch.cat([sparse[0], motion[0]], -1)))[None]
+
+
+class Recall(nn.Module):
+    """What a memory recalls at a step, as the share that it has in each memory block.
+
+    Args:
+        memory: the network's. features: its memory blocks' features. blocks: the stream's memory blocks.
+    """
+
+    def __init__(self, memory: Memory, features: Sequence[Any], blocks: Sequence[SharedBlock]):
+        super().__init__()
+        self.memory = copy.copy(memory)  # over windows of one frame: what each new frame brings in
+        self.memory.frames, self.memory.length = 1, memory.length - memory.frames + 1
+        self.parts = nn.ModuleList(block.feature_part for block in blocks)
+        if features:
+            self.gather(features)
+
+    def gather(self, features: Sequence[Any]) -> None:
+        """Put what gives all blocks' features of one frame at once together."""
+
+    def forward(self, past: Past | Recurred | None) -> tuple[Pieces, Pieces]:
+        """Of the frame that enters, and of those before the first one: (1, d) a block."""
+        if not self.parts:
+            return (), ()
+        z = self.feature(past)
+        shares = self._shares(z)
+        before = self.before(z)
+        return shares, shares if before is z else self._shares(before)
+
+    def feature(self, past: Any) -> Tensor:
+        """The features (1, blocks, k) of the frame that enters."""
+        raise NotImplementedError
+
+    def before(self, first: Tensor) -> Tensor:
+        """Those of the frames before the first one, given the first one's."""
+        return first
+
+    def _shares(self, z: Tensor) -> Pieces:
+        return [part(of) for part, of in zip(self.parts, z.flatten(0, 1).split(1), strict=True)]
+
+
+class OwnPast(Recall):
+    """Of a memory that projects the inputs and the network's own motion."""
+
+    def gather(self, features: Sequence[ProjectedFeature]) -> None:
+        """One feature whose projections are those of all blocks."""
+        self.whole = copy.deepcopy(features[0])
+        for name, child in list(self.whole.named_children()):
+            if isinstance(child, Projection):
+                setattr(self.whole, name, self.projections(name, [getattr(f, name) for f in features]))
+
+    def projections(self, name: str, parts: Sequence[Projection]) -> nn.Module:
+        """All blocks' projections of the input of that name."""
+        return Projections(parts)
+
+    def feature(self, past: Past) -> Tensor:
+        """The features (1, blocks, k) of the frame that enters."""
+        return self.whole(Past(*(part[0] for part in past)))
+
+
+class Coded(OwnPast):
+    """And code-vectors, whose projections are looked up."""
+
+    def gather(self, features: Sequence[ProjectedFeature]) -> None:
+        """One feature whose projections are those of all blocks."""
+        assert isinstance(self.memory, VQMemory)
+        self.vectors = self.memory.codes.codebook.vectors
+        super().gather(features)
+        self.memory._modules = {**self.memory._modules, "codes": Indices(self.memory.codes)}
+
+    def projections(self, name: str, parts: Sequence[Projection]) -> nn.Module:
+        """All blocks' projections of the input of that name."""
+        return Table(parts, self.vectors) if name == "codes" else super().projections(name, parts)
+
+
+class FromRecurrence(Recall):
+    """Of recurrent layers, which have seen nothing before the first frame."""
+
+    def gather(self, features: Sequence[Any]) -> None:
+        """The blocks' layers, by index."""
+        self.layers = [feature.index for feature in features]
+
+    def feature(self, past: Recurred) -> Tensor:
+        """The features (1, blocks, k) of the frame that enters."""
+        return past.features[:, self.layers, -1]
+
+    def before(self, first: Tensor) -> Tensor:
+        """Zeros."""
+        return torch.zeros_like(first)
+
+
+def recall(memory: Memory, features: Sequence[nn.Module], blocks: Sequence[SharedBlock]) -> Recall:
+    """The memory's way of recalling a frame."""
+    ways: dict[type[Memory], type[Recall]] = {
+        VQMemory: Coded,
+        NoCodesMemory: OwnPast,
+        RecurrentMemory: FromRecurrence,
+        Memory: Recall,
+    }
+    way = next(way for kind, way in ways.items() if isinstance(memory, kind))
+    return way(memory, features, blocks)

@@ -1,0 +1,195 @@
+"""An experiment brought to its end: data, VQ-VAE's run, network's run, its evaluations, its deployment.
+
+Each stage has an identity (memmlp.runs.identity), is found where it was made before, and is made where it was
+not.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from memmlp.common.files import read_json, write_json
+from memmlp.evaluation.predictions import save_predictions
+from memmlp.evaluation.stage import picture
+from memmlp.motion.source import Prepared
+from memmlp.pipeline.experiment import Experiment
+from memmlp.runs.identity import Identity, deployment_settings, evaluation_settings
+from memmlp.runs.reports import write_report
+from memmlp.runs.run import Run
+from memmlp.runs.tracking import project_safely
+from memmlp.training.loop import Watch, unwatched
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A run as an experiment asks for it.
+
+    Attributes:
+        made: the stages that were made just now: "training", "evaluation", "deployment".
+        results: mode -> branch -> metric, and "latency".
+    """
+
+    run: Run
+    made: tuple[str, ...]
+    results: dict[str, Any]
+
+
+def run(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
+    """Bring the experiment's run to its end, doing only what is missing.
+
+    `watch` is called after each validation with the step and its values, and may raise to stop the run.
+    """
+    data = experiment.data.prepare()
+    codes = codes_run(experiment, data) if experiment.architecture.uses_codes else None
+    run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
+    with run.lock():
+        if experiment.force:
+            run.reset()
+        made = []
+        if not run.done:
+            train_run(experiment, run, data, codes, watch)
+            made.append("training")
+        made += finish(experiment, run, data)
+        if experiment.predictions is not None:
+            model = experiment.architecture.load(run.model).to(experiment.device)
+            test = data.open("test").to(experiment.device)
+            save_predictions(experiment.evaluation, model, test, experiment.predictions)
+    if made:
+        project_safely(experiment.tracker, run)
+    return Outcome(run, tuple(made), results_of(experiment, run))
+
+
+def finished(
+    experiment: Experiment, run: Run, data: Prepared, again: bool = False
+) -> tuple[dict[str, Any], list[str]]:
+    """What was measured of a trained run as the experiment asks for it, and the stages that were made for it.
+
+    again: evaluate anew what was evaluated before.
+    """
+    with run.lock():
+        if again:
+            evaluate_run(experiment, run, data, experiment.evaluation.modes)
+        made = [*(["evaluation"] if again else []), *finish(experiment, run, data)]
+    if made:
+        project_safely(experiment.tracker, run)
+    return results_of(experiment, run), made
+
+
+def finish(experiment: Experiment, run: Run, data: Prepared) -> list[str]:
+    """Make what is missing of a trained run's evaluations and deployment; the names of the stages made."""
+    made = []
+    missing = [mode for mode, identity in experiment.evaluations.items() if not run.has(identity)]
+    if missing:
+        evaluate_run(experiment, run, data, missing)
+        made.append("evaluation")
+    if not run.has(experiment.deployed):
+        deploy_run(experiment, run, data)
+        made.append("deployment")
+    return made
+
+
+def results_of(experiment: Experiment, run: Run) -> dict[str, Any]:
+    """What was measured of a run as the experiment asks for it: mode -> branch -> metric, and "latency"."""
+    files = {mode: run.evaluation(name) for mode, name in experiment.evaluations.items() if run.has(name)}
+    latency = read_json(run.deployment(experiment.deployed).latency)
+    means = {mode: read_json(path)["mean"] for mode, path in files.items()}
+    return means | ({"latency": latency} if latency else {})
+
+
+def clip_rows(experiment: Experiment, run: Run) -> list[dict[str, Any]]:
+    """Each test clip's name, frames, and metrics by mode and branch, as the experiment asks for them."""
+    rows: dict[str, dict[str, Any]] = {}
+    for mode, name in experiment.evaluations.items():
+        for clip in read_json(run.evaluation(name))["clips"]:
+            facts = {key: value for key, value in clip.items() if not isinstance(value, dict)}
+            branches = {key: value for key, value in clip.items() if isinstance(value, dict)}
+            rows.setdefault(clip["name"], facts)[mode] = branches
+    return list(rows.values())
+
+
+def codes_run(experiment: Experiment, data: Prepared) -> Run:
+    """The finished run of the VQ-VAE that the network uses, trained where it is missing."""
+    identity = experiment.codes_identity(data.digest)
+    assert identity is not None
+    run = Run.of(experiment.outputs, identity.id)
+    with run.lock():
+        if run.done:
+            return run
+        begin(experiment, run, identity, experiment.codes.config)
+        with timed(run, "train"):
+            errors = experiment.codes.train(experiment.architecture, data, run, experiment.device)
+        write_json(run.results_path, {"val": errors})
+        run.finish(("model.safetensors", "results.json"))
+    project_safely(experiment.tracker, run)
+    return run
+
+
+def train_run(
+    experiment: Experiment, run: Run, data: Prepared, codes: Run | None, watch: Watch = unwatched
+) -> None:
+    """Train one network, and mark its run as done."""
+    begin(experiment, run, experiment.identity(data.digest), experiment.config)
+    run.write_manifest({"body": data.manifest.body})
+    run.clear_stages()
+    weights = codes.model if codes else None
+    with timed(run, "train"):
+        experiment.training.train(experiment.architecture, data, weights, run, experiment.device, watch)
+    run.finish(("model.safetensors",))
+
+
+def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequence[str]) -> None:
+    """Evaluate a trained run in some modes, each a file that is there whole or not at all."""
+    run.attempt("evaluation")
+    with timed(run, "evaluate"):
+        model = experiment.architecture.load(run.model).to(experiment.device)
+        test = data.open("test").to(experiment.device)
+        for mode in modes:
+            report = {"mode": mode, "settings": evaluation_settings(experiment.config, mode)}
+            report |= {**experiment.evaluation.report(model, test, mode), **machine(experiment)}
+            write_report(run.evaluation(experiment.evaluations[mode]), report)
+        if not run.picture.exists():
+            picture(model, test, run.picture)
+
+
+def deploy_run(experiment: Experiment, run: Run, data: Prepared) -> None:
+    """Export a trained run, prove the file, and time it."""
+    run.attempt("deployment")
+    with timed(run, "export"):
+        model = experiment.architecture.load(run.model)
+        clips = [data.open(split).clips() for split in ("train", "test")]
+        place = run.deployment(experiment.deployed)
+        record = experiment.deployment.ship(model, place, run.id, *clips)
+        place.finish({"settings": deployment_settings(experiment.config), **record})
+
+
+def begin(experiment: Experiment, run: Run, identity: Identity, config: dict[str, Any]) -> None:
+    """Begin a training: its config, and in its manifest what it is and what it runs on."""
+    above = identity.upstream.id if identity.upstream else None
+    facts = {"recipes": identity.recipes, "what": identity.what, **machine(experiment)}
+    run.begin(identity.kind, config, data=identity.data, upstream=above, **facts)
+
+
+def machine(experiment: Experiment) -> dict[str, Any]:
+    """What can change the last digits of a result: device, graphics processor, threads, precision."""
+    cuda = experiment.device.type == "cuda"
+    return {
+        "device": str(experiment.device),
+        "gpu": torch.cuda.get_device_name(experiment.device) if cuda else None,
+        "threads": torch.get_num_threads(),
+        "precision": experiment.training.optim.precision,
+    }
+
+
+@contextlib.contextmanager
+def timed(run: Run, stage: str) -> Iterator[None]:
+    """Add to the manifest how long a stage took."""
+    started = time.monotonic()
+    yield
+    seconds = run.manifest.get("seconds") or {}
+    run.write_manifest({"seconds": {**seconds, stage: round(time.monotonic() - started, 1)}})

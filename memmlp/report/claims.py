@@ -1,0 +1,93 @@
+"""Hand-written claims of effects in prose, which only the computation may make.
+
+The rule, for each sentence (cells of tables and items of lists are sentences too), once code, addresses and
+comments are taken out of it; a placeholder counts as a number:
+
+1. No number has a star or an interval: `1.47*`, `0.3 [0.1, 0.5]`.
+2. No sentence has a word of comparison or of verdict (`WORDS`) beside a number or the name of a metric.
+   References such as "Table 4" or "Eq. 5" are no numbers.
+3. None has one of `NEVER`, with or without a number.
+
+What is measured is written by a placeholder, which brings the verdict along.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from memmlp.evaluation.units import UNITS
+
+WORDS = (
+    "lose", "loses", "raise", "raises", "raised", "lower", "lowers", "lowered", "higher", "better", "best",
+    "worse", "worst", "smoother", "rougher", "improve", "improves", "improved", "reduces", "reduced",
+    "increases", "increased", "increase", "reduce", "doubles", "halves", "help", "helps", "hurts", "gain",
+    "gains", "holds", "opposite", "equivalent", "drop", "drops", "dropped", "fall", "falls", "fell", "rise",
+    "rises", "rose", "grow", "grows", "grew", "cut", "cuts", "decrease", "decreases", "decreased", "smaller",
+    "smallest", "larger", "largest", "greater", "greatest", "shrinks", "halved", "doubled", "improvement",
+    "reduction", "brings",
+)  # fmt: skip
+NEVER = ("significant", "significantly", "beat", "beats", "lose against", "loses against", "outperforms")
+
+
+def _any(words: Iterable[str]) -> re.Pattern[str]:
+    return re.compile(rf"(?<!\w)({'|'.join(map(re.escape, words))})(?!\w)", re.IGNORECASE)
+
+
+CLAIM, REFUSED, METRIC = _any(WORDS), _any(NEVER), _any(UNITS)
+INTERVAL = re.compile(r"\d\*?\s*\\?\[\s*[+\-\N{MINUS SIGN}]?\d[\d.]*,\s*[+\-\N{MINUS SIGN}]?\d[\d.]*\s*\\?\]")
+STAR = re.compile(r"\d\]?\s?\\?\*(?!\*)")
+NUMBER = re.compile(r"(?<![\w.])[+\-\N{MINUS SIGN}]?\d+([.,]\d+)*(?!\w)")
+REFERENCE = re.compile(
+    r"\b(tables?|eqs?\.|figs?\.|sec\.|commits?|python|seeds?)\s+[\w.]*\d[\w.]*", re.IGNORECASE
+)
+OUTSIDE = re.compile(r"```.*?```|`[^`\n]*`|\{%.*?%\}|\{#.*?#\}|<!--.*?-->|(?<=\])\([^)\s]*\)", re.DOTALL)
+PLACEHOLDER = re.compile(r"\{\{.*?\}\}", re.DOTALL)
+SENTENCE = re.compile(r"(?<=[.!?;])\s+|\n\s*\n|\n(?=\s*([-*]|\d+\.|#+|>)\s)|(?<!\\)\||\n(?=\s*\|)")
+
+
+class Claim(NamedTuple):
+    """A sentence that claims what it must not: its line, its words, and what is wrong with them."""
+
+    line: int
+    sentence: str
+    reason: str
+
+
+def claims(text: str) -> list[Claim]:
+    """The claims of a Markdown text or template."""
+    bare = OUTSIDE.sub(_blank, PLACEHOLDER.sub(lambda found: f"0{_blank(found)[1:]}", text))
+    found = []
+    for start, sentence in _sentences(bare):
+        reason = _reason(sentence)
+        if reason:
+            line = bare.count("\n", 0, start + len(sentence) - len(sentence.lstrip())) + 1
+            found.append(Claim(line, " ".join(sentence.split()), reason))
+    return found
+
+
+def _blank(found: re.Match[str]) -> str:
+    """As many spaces as the match is long, its lines kept."""
+    return re.sub(r"[^\n]", " ", found[0])
+
+
+def _sentences(text: str) -> list[tuple[int, str]]:
+    """The sentences with the places where they begin."""
+    ends = [(found.start(), found.end()) for found in SENTENCE.finditer(text)]
+    starts = [0, *(end for _, end in ends)]
+    stops = [*(start for start, _ in ends), len(text)]
+    return [(start, text[start:stop]) for start, stop in zip(starts, stops, strict=True)]
+
+
+def _reason(sentence: str) -> str | None:
+    """What is wrong with a sentence; None for nothing."""
+    for pattern, what in ((STAR, "a number with a star"), (INTERVAL, "an interval")):
+        if pattern.search(sentence):
+            return what
+    never = REFUSED.search(sentence)
+    if never:
+        return f"'{never[0]}'"
+    word, bare = CLAIM.search(sentence), REFERENCE.sub(" ", sentence)
+    beside = NUMBER.search(bare) or METRIC.search(bare)
+    return f"'{word[0]}' beside '{beside[0]}'" if word and beside else None

@@ -1,0 +1,334 @@
+"""One self-contained HTML page: tables, effects, accuracy against latency, training curves, runs."""
+
+from __future__ import annotations
+
+import html
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import resources
+from typing import Any
+
+from memmlp.report import figures
+from memmlp.report.figures import Curve, Point
+from memmlp.runs.identity import trained_by
+from memmlp.runs.log import Metrics
+from memmlp.sweep.spec import COSTS, Sweep
+from memmlp.tables.distributions import Distribution, distributions
+from memmlp.tables.effects import Runs
+from memmlp.tables.grid import caption
+from memmlp.tables.measured import Measured
+from memmlp.tables.render import as_html
+from memmlp.tables.table import Table
+
+ERROR = "MPJRE"  # of Fig. 1, as Sec. 4.3 has it
+MOST_POINTS = 200  # of a curve
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """A sweep's table and the finished runs behind it, by arm and seed."""
+
+    sweep: Sweep
+    table: Table
+    runs: Mapping[str, Runs]
+
+    @property
+    def title(self) -> str:
+        """The table's caption."""
+        return caption(self.table)
+
+
+class Entry:
+    """A finished run, and the rows it stands in."""
+
+    def __init__(self, measured: Measured):
+        self.measured = measured
+        self.places: list[str] = []
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """The dotted keys of its config that can change a result."""
+        return trained_by(self.measured.run.config) if self.measured.run else {}
+
+
+def page(chapters: Sequence[Chapter], published: Sequence[Point], generated: str, commit: str) -> str:
+    """The page's HTML.
+
+    Args:
+        published: the paper's systems with frames a second and MPJRE.
+        generated: when, in words. commit: of the code that makes the page.
+    """
+    entries = _entries(chapters)
+    sections = [
+        ("tables", "Tables", [as_html(chapter.table) for chapter in chapters]),
+        ("effects", "Effects", _effects(chapters)),
+        ("distributions", "Beyond the mean", _distributions(chapters)),
+        ("accuracy", "Accuracy and latency", _accuracy(chapters, published)),
+        ("training", "Training curves", _training(chapters)),
+        ("latency", "Latency", [_latency(entries)]),
+        ("runs", "Runs", [_runs(entries)]),
+    ]
+    template = resources.files("memmlp.report").joinpath("page.html").read_text(encoding="utf-8")
+    fields = {
+        "title": "Mem-MLP: measured and published",
+        "generated": f"{generated}, code {commit}, {len(entries)} finished runs",
+        "contents": _contents(sections, chapters),
+        "body": "\n".join(_section(*section) for section in sections),
+    }
+    for name, text in fields.items():
+        template = template.replace(f"{{{{{name}}}}}", text)
+    return template
+
+
+def published(accuracies: Sweep, latencies: Sweep) -> list[Point]:
+    """The systems that the paper gives an error and frames a second of; FPS by the beginning of the name."""
+    errors = {arm.label.casefold(): (arm.paper or {}).get(ERROR) for arm in accuracies.arms}
+    points = []
+    for arm in latencies.arms:
+        fps = (arm.paper or {}).get("FPS")
+        error = next((e for label, e in errors.items() if label.startswith(arm.label.casefold())), None)
+        if fps is not None and error is not None:
+            points.append(Point(arm.label, fps, error))
+    return points
+
+
+def _entries(chapters: Sequence[Chapter]) -> list[Entry]:
+    """Each finished run once."""
+    entries: dict[str, Entry] = {}
+    for chapter in chapters:
+        for label, runs in chapter.runs.items():
+            for seed, measured in runs.items():
+                entry = entries.setdefault(measured.id, Entry(measured))
+                entry.places.append(f"{chapter.sweep.name}: {label}, seed {seed}")
+    return list(entries.values())
+
+
+def _section(name: str, title: str, parts: Sequence[str]) -> str:
+    body = "\n".join(parts) or '<p class="empty">Nothing measured yet.</p>'
+    return f'<section id="{name}"><h2>{title}</h2>\n{body}\n</section>'
+
+
+def _contents(sections: Sequence[tuple[str, str, Sequence[str]]], chapters: Sequence[Chapter]) -> str:
+    """The table of contents."""
+    tables = "".join(f'<li><a href="#{_text(c.sweep.name)}">{_text(c.title)}</a></li>' for c in chapters)
+    items = [
+        f'<li><a href="#{name}">{title}</a>{f"<ol>{tables}</ol>" if name == "tables" else ""}</li>'
+        for name, title, _ in sections
+    ]
+    return f"<ol>{''.join(items)}</ol>"
+
+
+def _effects(chapters: Iterable[Chapter]) -> list[str]:
+    """Forest plots."""
+    parts = []
+    for chapter in chapters:
+        svg = figures.forest(chapter.table)
+        if svg:
+            note = (
+                f"Difference from '{chapter.table.reference}', or from the arm's own control, with its 95 % "
+                "interval; filled where it is significant after Holm's correction; the shaded band is the "
+                "smallest effect of interest, the diamond the paper's difference. Left is better."
+            )
+            parts.append(_figure(chapter.title, svg, note))
+    return parts
+
+
+def _distributions(chapters: Iterable[Chapter]) -> list[str]:
+    """Performance profiles, and what a few clips cannot carry away."""
+    parts = []
+    for chapter in chapters:
+        found = distributions(chapter.sweep, chapter.runs, chapter.table.modes[0])
+        if found:
+            svg = figures.profiles(chapter.sweep.name, found)
+            note = (
+                f"{chapter.table.modes[0].capitalize()} mode: the fraction of all runs' test clips whose "
+                "error is at most this; further up and left is better."
+            )
+            parts += [_figure(chapter.title, svg, note), _robust(found)]
+    return parts
+
+
+def _robust(found: Mapping[str, Sequence[Distribution]]) -> str:
+    """Interquartile means and probabilities of improvement, an arm a row."""
+    metrics = list(found)
+    head = ["arm", *(f"{metric}: {what}" for metric in metrics for what in ("IQM", "P(better)"))]
+    rows = [
+        [one.label, *(word for metric in metrics for word in _robust_words(found[metric][place]))]
+        for place, one in enumerate(found[metrics[0]])
+    ]
+    note = (
+        "IQM: the mean of the middle half of all seeds and clips. P(better): how often a run of the arm has "
+        "a smaller error than one of its control on the same clip. Neither is a test."
+    )
+    return _rows(head, rows, note)
+
+
+def _robust_words(one: Distribution) -> tuple[str, str]:
+    better = "-" if one.improvement is None else f"{one.improvement:.2f}"
+    return ("-" if one.middle is None else f"{one.middle:.2f}"), better
+
+
+def _accuracy(chapters: Iterable[Chapter], paper: Sequence[Point]) -> list[str]:
+    """Fig. 1 with what was measured."""
+    ours = {chapter.title: _points(chapter) for chapter in chapters}
+    ours = {title: points for title, points in ours.items() if points}
+    if not ours:
+        return []
+    svg = figures.accuracy(ours, paper, ERROR)
+    note = (
+        f"{ERROR} of the rotation branch in stream mode, mean over seeds, against frames a second of one CPU "
+        "core here (1000 / median ms); one point an arm. The paper's systems ran on a Meta Quest 3, on other "
+        "data, and its frames a second are capped by the display at 72: the two kinds of points share axes, "
+        "not conditions."
+    )
+    return [_figure(f"{ERROR} against frames a second", svg, note)]
+
+
+def _points(chapter: Chapter) -> list[Point]:
+    """An arm's mean frames a second and error."""
+    points = []
+    for label, runs in chapter.runs.items():
+        values = [(run.costs.get("FPS"), run.value("stream", "rotation", ERROR)) for run in runs.values()]
+        known = [(fps, error) for fps, error in values if fps is not None and error is not None]
+        if known:
+            fps, error = (sum(column) / len(known) for column in zip(*known, strict=True))
+            points.append(Point(label, fps, error))
+    return points
+
+
+def _training(chapters: Iterable[Chapter]) -> list[str]:
+    """Loss and validation metrics by step."""
+    parts = []
+    for chapter in chapters:
+        panels = _curves(chapter)
+        if panels:
+            parts.append(
+                _figure(chapter.title, figures.curves(chapter.sweep.name, panels), "One line a run.")
+            )
+    return parts
+
+
+def _curves(chapter: Chapter) -> dict[str, dict[str, list[Curve]]]:
+    """Panels of curves: the loss, and the table's metrics of the rotation branch in validation."""
+    names = [f"rotation {metric}" for metric in chapter.table.metrics if metric not in COSTS]
+    wanted = {("train", "loss"): "training loss"}
+    wanted |= {("val", name): f"validation: {name}" for name in names}
+    logs = {
+        label: [measured.run.metrics() for measured in runs.values() if measured.run]
+        for label, runs in chapter.runs.items()
+    }
+    panels: dict[str, dict[str, list[Curve]]] = {}
+    for (phase, name), title in wanted.items():
+        arms = {label: [_curve(log, phase, name) for log in found] for label, found in logs.items()}
+        arms = {label: [c for c in found if len(c.steps) > 1] for label, found in arms.items()}
+        if any(arms.values()):
+            panels[title] = {label: found for label, found in arms.items() if found}
+    return panels
+
+
+def _curve(log: Sequence[Metrics], phase: str, name: str) -> Curve:
+    """A value's course, thinned out evenly where it is long."""
+    points = [
+        (entry.step, entry.values[name]) for entry in log if entry.phase == phase and name in entry.values
+    ]
+    stride = max(len(points) // MOST_POINTS, 1)
+    points = points[::-stride][::-1]
+    return Curve([step for step, _ in points], [value for _, value in points])
+
+
+def _latency(entries: Sequence[Entry]) -> str:
+    """Time, work and size of each run's streaming step."""
+    if not entries:
+        return ""
+    head = (
+        "run",
+        "median ms",
+        "p95 ms",
+        "x reference",
+        "parameters",
+        "MMAC",
+        "ONNX MB",
+        "processor",
+        "rows of tables",
+    )
+    rows = []
+    for entry in entries:
+        values = entry.measured.latency
+        numbers = [
+            _number(values, key, scale, form)
+            for key, scale, form in (
+                ("median_ms", 1, ".2f"), ("p95_ms", 1, ".2f"), ("ratio_to_reference", 1, ".2f"),
+                ("parameters", 1, ",.0f"), ("macs", 1e6, ".1f"), ("onnx_bytes", 1e6, ".2f"),
+            )
+        ]  # fmt: skip
+        rows.append([entry.measured.id, *numbers, entry.measured.origin.hardware, "; ".join(entry.places)])
+    return _rows(
+        head, rows, "One streaming step on one CPU core; the reference is a fixed stack of matrix products."
+    )
+
+
+def _number(values: Mapping[str, float], key: str, scale: float, form: str) -> str:
+    return format(values[key] / scale, form) if key in values else "-"
+
+
+def _runs(entries: Sequence[Entry]) -> str:
+    """The runs, and what their configs differ in from the commonest value of each key."""
+    if not entries:
+        return ""
+    common = _common([entry.config for entry in entries])
+    rows = []
+    for entry in entries:
+        run, origin = entry.measured.run, entry.measured.origin
+        manifest = run.manifest if run else {}
+        seconds = manifest.get("seconds")
+        minutes = f"{sum(seconds.values()) / 60:.1f}" if isinstance(seconds, dict) else "-"
+        keys = sorted({*entry.config, *common})
+        differing = [f"{k}={entry.config.get(k, '-')}" for k in keys if entry.config.get(k) != common.get(k)]
+        code = origin.code + (" + changes" if origin.changed else "")
+        when = str(manifest.get("started", "-"))[:16].replace("T", " ")
+        row = [entry.measured.id, when, minutes, code, origin.data, "; ".join(differing) or "-"]
+        rows.append([*row, "; ".join(entry.places)])
+    head = (
+        "run",
+        "started",
+        "minutes",
+        "code",
+        "data",
+        "config, where it is not the commonest",
+        "rows of tables",
+    )
+    return _rows(head, rows, "")
+
+
+def _common(configs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The commonest value of every key."""
+    common = {}
+    for key in {key for config in configs for key in config}:
+        values = Counter(repr(config.get(key)) for config in configs)
+        word = values.most_common(1)[0][0]
+        common[key] = next(config.get(key) for config in configs if repr(config.get(key)) == word)
+    return common
+
+
+def _rows(head: Sequence[str], rows: Sequence[Sequence[str]], note: str) -> str:
+    """A plain table of words, with a note above."""
+    top = "".join(f'<th scope="col">{_text(word)}</th>' for word in head)
+    body = "".join(f"<tr>{_row(row)}</tr>" for row in rows)
+    table = f'<table class="plain"><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>'
+    return f'<p>{_text(note)}</p><div class="scroll">{table}</div>'
+
+
+def _row(words: Sequence[str]) -> str:
+    cells = "".join(f"<td>{_text(word)}</td>" for word in words[1:])
+    return f'<th scope="row"><code>{_text(words[0])}</code></th>{cells}'
+
+
+def _figure(title: str, svg: str, note: str) -> str:
+    caption = f"<figcaption>{_text(note)}</figcaption>"
+    return f'<figure><h3>{_text(title)}</h3><div class="scroll">{svg}</div>{caption}</figure>'
+
+
+def _text(text: str) -> str:
+    return html.escape(text)

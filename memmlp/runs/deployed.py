@@ -1,0 +1,50 @@
+"""What a run was shipped as: the folder of a deployment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from memmlp.common.files import file_digest, now, read_json, write_json
+from memmlp.runs.environment import environment
+
+
+class Deployed:
+    """What a run was shipped as: a folder runs/<id>/deployments/<identity>/.
+
+    Attributes:
+        onnx, int8, latency: its files; the last one is written last, and says what was measured.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.onnx = folder / "step.onnx"
+        self.int8 = folder / "step.int8.onnx"
+        self.latency = folder / "latency.json"
+
+    @property
+    def done(self) -> bool:
+        """Whether all of it is there."""
+        return self.latency.is_file()
+
+    def finish(self, record: Mapping[str, Any]) -> None:
+        """Write what was measured, with the digests of the files: the sign that all of it is there."""
+        artifacts = {path.name: file_digest(path) for path in (self.onnx, self.int8) if path.exists()}
+        made = {"made": now(), "made_by": environment(), "artifacts": artifacts}
+        write_json(self.latency, {**record, **made})
+
+    @property
+    def made(self) -> str:
+        """When."""
+        return str(read_json(self.latency).get("made", ""))
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What was asked for."""
+        return dict(read_json(self.latency).get("settings", {}))
+
+    @property
+    def prefers_int8(self) -> bool:
+        """Whether its int8 file is as accurate as the other one."""
+        return self.int8.exists() and bool(read_json(self.latency).get("int8", {}).get("default"))

@@ -1,0 +1,108 @@
+"""What a run ran on and with."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import functools
+import hashlib
+import os
+import platform
+import re
+import subprocess
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import memmlp
+
+PACKAGE = Path(memmlp.__file__).parent
+NOT_NUMBERS = ("cli", "config", "live", "render", "report", "search", "statistics", "sweep", "tables")
+"""Folders of the package whose code no result of a run comes from."""
+PATCH = 1_000_000  # characters of changes that are kept with a run, at most
+
+
+def environment() -> dict[str, Any]:
+    """What a run ran on and with; the machine's name only as a digest."""
+    packages = ("torch", "numpy", "onnxruntime")
+    return {
+        "version": memmlp.__version__,
+        "git": _git(),
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in packages},
+        "platform": platform.platform(),
+        "cpu": _cpu(),
+        "cores": os.cpu_count(),
+        "host": host(),
+    }
+
+
+def host() -> str:
+    """The machine, by a digest of its name."""
+    return hashlib.sha256(platform.node().encode()).hexdigest()[:12]
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+@functools.cache
+def _git() -> dict[str, Any] | None:
+    """Commit of the checkout that the package lies in and whether it was changed; None when installed."""
+    try:
+        _in_git("ls-files", "--error-unmatch", "__init__.py")
+        commit = _in_git("rev-parse", "HEAD")
+        return {"commit": commit, "dirty": bool(_in_git("status", "--porcelain", "--", "."))}
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def _in_git(*args: str) -> str:
+    """What git says in the package's folder."""
+    command = ["git", "-C", str(PACKAGE), *args]
+    return subprocess.run(command, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
+
+
+def changes() -> str:
+    """A patch from the package's commit to its code as it is, with the names of new files; or nothing."""
+    git = _git()
+    if not git or not git["dirty"]:
+        return ""
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        new = _in_git("ls-files", "--others", "--exclude-standard", "--", ".")
+        listed = "".join(f"# not in the commit: {name}\n" for name in new.splitlines())
+        return (listed + _in_git("diff", "HEAD", "--", ".") + "\n")[:PATCH]
+    return ""
+
+
+@functools.cache
+def sources() -> dict[str, str]:
+    """A digest of the code, without comments and docstrings, of each file that a run's numbers come from."""
+    files = [path for path in sorted(PACKAGE.rglob("*.py")) if _counts(path.relative_to(PACKAGE))]
+    return {path.relative_to(PACKAGE).as_posix(): code_digest(path.read_text("utf-8")) for path in files}
+
+
+def _counts(path: Path) -> bool:
+    wiring = path.as_posix() in ("config/build.py", "config/components.py")  # what reaches the constructors
+    return wiring or (not path.parts[0].startswith("_") and path.parts[0] not in NOT_NUMBERS)
+
+
+def code_digest(text: str) -> str:
+    """12 hex digits of Python code, whatever its layout, comments and docstrings."""
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
+            node.body = node.body[1:] or [ast.Pass()]
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12]
+
+
+def _cpu() -> str:
+    """The processor's model name."""
+    with contextlib.suppress(OSError):
+        match = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+        if match:
+            return match[1].strip()
+    return platform.processor() or platform.machine()

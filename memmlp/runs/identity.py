@@ -1,0 +1,221 @@
+"""Identities: a digest of all that can change a result, for each of the stages that results come from.
+
+A **run** is a training (of a VQ-VAE or of a network): its identity is its config, its data, the run that it
+builds upon, and the recipe numbers of the components it uses. An **evaluation** of it (one mode, with or
+without inverse kinematics) and a **deployment** (ONNX, int8, latency) have identities of their own, of what
+can change their result alone. So a new mode, inverse kinematics or precision on a finished run is that
+stage's work and no training. A component is known by its name in the config, never by where its class lies.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from memmlp.common.files import plain
+from memmlp.runs.recipes import recipes
+
+NEUTRAL = (
+    "data",  # its digest stands for it: frames, clips, split and rest pose; but see `_draws`
+    "profile",  # sizes, read by the groups that use them
+    "paths",
+    "tracker",
+    "device",  # recorded, and flagged where runs that are compared differ in it
+    "threads",
+    "force",
+    "save_predictions",
+    "optim.checkpoint_every",
+    "optim.log_every",
+    "optim.validate_every",
+    "hydra",
+)
+"""Config keys that change no result of any stage."""
+
+PATHS = ("_target_", "_partial_")
+"""Where a component's class lies; the `name` of one of this package says what it is."""
+
+EVALUATION = ("evaluation",)
+DEPLOYMENT = ("export",)
+INFERENCE = ("memory.blend", "memory.history", "model.sampling_steps")
+"""Keys of the later stages; those of INFERENCE count for both, and for a training that rolls out."""
+
+SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand")
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What a run is.
+
+    Attributes:
+        kind: "vqvae" or "memmlp".
+        config: the resolved config; only the keys that change a training's result count.
+        data: digest of the prepared data. upstream: the run whose artifact this one uses.
+    """
+
+    kind: str
+    config: Mapping[str, Any]
+    data: str
+    upstream: Identity | None = None
+
+    @property
+    def recipes(self) -> dict[str, int]:
+        """The recipe numbers of the components that the training uses."""
+        return recipes(list(trained_components(self.kind, self.config)))
+
+    @property
+    def id(self) -> str:
+        """16 hex digits over all that can change the result."""
+        above = self.upstream.id if self.upstream else None
+        return run_id(self.kind, self.config, data=self.data, upstream=above)
+
+    @property
+    def what(self) -> str:
+        """The same less the recipe numbers: equal in runs that differ in the age of their code alone."""
+        above = self.upstream.what if self.upstream else None
+        return _digest(_training(self.kind, self.config, self.data, above))
+
+
+def run_id(kind: str, config: Mapping[str, Any], *, data: str, upstream: str | None) -> str:
+    """The identity of a training: 16 hex digits over all that can change its result.
+
+    Args:
+        kind: "vqvae" or "memmlp".
+        config: resolved config; what is neutral or of a later stage does not count, nor does 1 against 1.0.
+        data: digest of the prepared data. upstream: id of the run whose artifact this one uses.
+    """
+    what = _training(kind, config, data, upstream)
+    return _digest(what | {"recipes": recipes(list(trained_components(kind, config)))})
+
+
+def evaluation_id(config: Mapping[str, Any], mode: str) -> str:
+    """The identity of a run's evaluation in a mode: a word and 16 hex digits."""
+    settings = evaluation_settings(config, mode)
+    used = ["metrics", f"mode.{mode}", *([f"ik.{settings['ik']}"] if settings["ik"] != "off" else [])]
+    name = mode if settings["ik"] == "off" else f"{mode}-{settings['ik']}"
+    return f"{name}-{_digest({'settings': settings, 'recipes': recipes(used)})}"
+
+
+def evaluation_settings(config: Mapping[str, Any], mode: str) -> dict[str, Any]:
+    """What an evaluation's result follows from, beside the run and its data."""
+    group = config.get("evaluation", {})
+    ik = group.get("ik", "off")
+    solver = {"ik": ik} | ({"ik_iterations": group.get("ik_iterations")} if ik != "off" else {})
+    groups = ((config.get("data") or {}).get("split") or {}).get(
+        "groups"
+    )  # its rows say who belongs together
+    drawn = {"batch": group.get("batch")} if _inference(config).get("memory.blend") == "sampled" else {}
+    return {"mode": mode, **solver, **_inference(config), **({"groups": groups} if groups else {}), **drawn}
+
+
+def deployment_id(config: Mapping[str, Any]) -> str:
+    """The identity of what a run is shipped as: a word and 16 hex digits."""
+    settings = deployment_settings(config)
+    graph = settings.get("graph", "auto")
+    used = [
+        "export",
+        "latency",
+        *(f"graph.{name}" for name in ("streaming", "naive") if graph in (name, "auto")),
+    ]
+    used += ["int8"] if settings.get("precision") == "int8" else []
+    name = settings.get("precision", "fp32")
+    return f"{name}-{_digest({'settings': settings, 'recipes': recipes(used)})}"
+
+
+def deployment_settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What a deployment's result follows from, beside the run and its data."""
+    return {key: _canonical(value) for key, value in config.get("export", {}).items()} | _inference(config)
+
+
+def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
+    """The components that a training's numbers come from."""
+    yield from ("features", "sampler", "training")
+    if coordinates := config.get("frame", {}).get("coordinates"):
+        yield f"coordinates.{coordinates}"
+    names = {slot: (config.get(slot) or {}).get("name") for slot in SLOTS}
+    yield from (f"{slot}.{name}" for slot, name in names.items() if name)
+    if schedule := config.get("optim", {}).get("schedule"):
+        yield f"schedule.{schedule}"
+    if kind == "vqvae" or names["memory"] == "vq_joint":
+        yield from ("vqvae", f"codebook.{config.get('vqvae', {}).get('codebook')}")
+    if kind == "vqvae":
+        yield "schedule.milestones"
+
+
+def trained_by(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The dotted keys of a config that can change the result of a training; null is no key."""
+    later = (*EVALUATION, *DEPLOYMENT, *(() if _rolls_out(config) else INFERENCE))
+    out = (*NEUTRAL, *later, *_unused(config))
+    flat = {key: _canonical(value) for key, value in flatten(config).items() if value is not None}
+    counting = {key: flat[key] for key in flat if not _below(key, out) and not _is_path(key, flat[key])}
+    return counting | _draws(config)
+
+
+def _draws(config: Mapping[str, Any]) -> dict[str, Any]:
+    """How windows are drawn, the one key of the data that is not in its digest."""
+    return {"data.weighting": config["data"].get("weighting", "frames")} if config.get("data") else {}
+
+
+def _training(kind: str, config: Mapping[str, Any], data: str, upstream: str | None) -> dict[str, Any]:
+    return {"kind": kind, "config": trained_by(config), "data": data, "upstream": upstream}
+
+
+def used_as_configured(settings: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
+    """Whether a stage's settings use the network as the run's own config does."""
+    return all(settings.get(key) == value for key, value in _inference(config).items())
+
+
+def _inference(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The keys that act when the network is used, where the network has them."""
+    flat = flatten(config)
+    return {key: _canonical(flat[key]) for key in INFERENCE if key in flat}
+
+
+def _rolls_out(config: Mapping[str, Any]) -> bool:
+    """Whether the training uses the network as it is used live, so that what acts then acts here too."""
+    return (config.get("rollout") or {}).get("name", "teacher_forcing") != "teacher_forcing"
+
+
+def _unused(config: Mapping[str, Any]) -> Iterable[str]:
+    """Keys that nothing reads, given the others."""
+    if config.get("optim", {}).get("schedule", "step") != "step":
+        yield "optim.drop_at"
+    if config.get("vqvae", {}).get("codebook", "ema") != "ema":
+        yield "vqvae.decay"
+
+
+def _below(key: str, names: Iterable[str]) -> bool:
+    """Whether a dotted key is one of some, or below one."""
+    return any(key == name or key.startswith(f"{name}.") for name in names)
+
+
+def _is_path(key: str, value: Any) -> bool:
+    """Whether a key says where a class of this package lies. A foreign one is known by its path alone."""
+    return key.rsplit(".", 1)[-1] in PATHS and (value is True or str(value).startswith("memmlp."))
+
+
+def _digest(what: Mapping[str, Any]) -> str:
+    text = json.dumps(plain(what), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _canonical(value: Any) -> Any:
+    """The same value for the same number, however it was typed."""
+    if isinstance(value, list | tuple):
+        return [_canonical(item) for item in value]
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
+    return value
+
+
+def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A nested mapping with dotted keys; lists stay values."""
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, Mapping) and value:
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat

@@ -1,0 +1,65 @@
+"""A run's log of metrics: one JSON line a record, only ever appended to."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from memmlp.common.errors import InputError
+from memmlp.common.files import plain
+
+
+class Metrics(NamedTuple):
+    """One line of the log: values at a step of a phase ("train", "val"), unix time in seconds."""
+
+    step: int
+    phase: str
+    values: dict[str, float]
+    time: float
+
+
+class MetricsLog:
+    """The file `metrics.jsonl` of a run."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._whole = False
+
+    def append(self, step: int, values: Mapping[str, float], phase: str) -> None:
+        """Append one line, in one write: a kill tears at most that line."""
+        if not self._whole:
+            self.repair()
+            self._whole = True
+        entry = {"step": step, "phase": phase, "time": round(time.time(), 3), "values": dict(values)}
+        with open(self.path, "ab", buffering=0) as file:
+            file.write(json.dumps(plain(entry), allow_nan=False).encode() + b"\n")
+
+    def repair(self) -> None:
+        """Cut a torn last line off."""
+        if self.path.exists():
+            content = self.path.read_bytes()
+            whole = content.rfind(b"\n") + 1
+            if whole < len(content):
+                os.truncate(self.path, whole)
+
+    def read(self) -> list[Metrics]:
+        """All records: a torn last line left out, of a step that a resumed run repeated the last one.
+
+        Raises InputError, naming file and line, where one is damaged.
+        """
+        if not self.path.exists():
+            return []
+        entries: dict[tuple[str, int], Metrics] = {}
+        for number, line in enumerate(self.path.read_bytes().split(b"\n")[:-1], 1):
+            try:
+                entry = json.loads(line)
+                values = {key: float(value) for key, value in entry["values"].items()}
+                metrics = Metrics(entry["step"], entry["phase"], values, entry["time"])
+            except (ValueError, KeyError, TypeError):
+                raise InputError(f"{self.path}: line {number} is no line of a metrics log") from None
+            entries[metrics.phase, metrics.step] = metrics
+        return list(entries.values())

@@ -1,0 +1,62 @@
+"""Finding runs below an outputs folder, and comparing two."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from memmlp.common.errors import InputError
+from memmlp.runs.identity import flatten
+from memmlp.runs.run import Run
+
+ID = re.compile(r"[0-9a-f]{16}")
+
+
+class Diff(NamedTuple):
+    """Dotted keys whose values differ between two runs, with both values ("-" where a run has none)."""
+
+    config: dict[str, tuple[Any, Any]]
+    results: dict[str, tuple[Any, Any]]
+
+
+def list_runs(outputs: Path | str) -> list[Run]:
+    """The runs below an outputs folder, the newest first."""
+    folders = sorted((Path(outputs) / "runs").glob("*/"))
+    runs = [Run(folder) for folder in folders if ID.fullmatch(folder.name)]
+    return sorted(runs, key=lambda run: str(run.manifest.get("started", "")), reverse=True)
+
+
+def find_run(outputs: Path | str, name: str) -> Run:
+    """The run of an id, of the beginning of one, or of a folder."""
+    if name and ("/" in name or not ID.fullmatch(name)) and (Path(name) / "manifest.json").is_file():
+        return Run(Path(name).resolve())
+    known = list_runs(outputs)
+    matches = [run for run in known if name and run.id.startswith(name)]
+    if len(matches) == 1:
+        return matches[0]
+    where = Path(outputs) / "runs"
+    if not matches and name and (Path(name) / "manifest.json").is_file():
+        return Run(Path(name).resolve())
+    if not matches:
+        raise InputError(f"run '{name}': no such folder, and no id in {where} ({len(known)}) begins so")
+    ids = _enumerate(sorted(run.id for run in matches))
+    raise InputError(f"run '{name}': {len(matches)} ids begin so: {ids}")
+
+
+def _enumerate(names: Iterable[str], most: int = 8) -> str:
+    """Names with commas, the first few of many."""
+    every = list(names)
+    return ", ".join(every[:most]) + (", ..." if len(every) > most else "")
+
+
+def diff(a: Run, b: Run) -> Diff:
+    """What two runs differ in."""
+    return Diff(_differences(a.config, b.config), _differences(a.results, b.results))
+
+
+def _differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    flat_a, flat_b = flatten(a), flatten(b)
+    pairs = {key: (flat_a.get(key, "-"), flat_b.get(key, "-")) for key in flat_a | flat_b}
+    return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}

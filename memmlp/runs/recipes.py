@@ -1,0 +1,75 @@
+"""The recipe number of every component that numbers come from.
+
+A run's identity holds the numbers of the components that it uses. Whoever changes what a component computes
+raises its number in the same commit: the runs that used it are then of an older recipe and are made again,
+and no others. `tests/test_golden.py` computes a few steps of every component and fails until that is done.
+Moving or renaming code changes no number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+RECIPES: dict[str, int] = {
+    # what the network sees, and how its space lies in the world (memmlp.motion)
+    "features": 1,
+    "coordinates.heading": 1,
+    "coordinates.head_relative": 1,
+    "coordinates.world": 1,
+    # networks (memmlp.networks)
+    "model.mem_mlp": 1,
+    "model.agrol_mlp": 1,
+    "model.agrol_diffusion": 1,
+    "model.avatar_poser": 1,
+    "memory.vq": 1,
+    "memory.vq_joint": 1,
+    "memory.no_codes": 1,
+    "memory.lstm": 1,
+    "memory.gru": 1,
+    "memory.none": 1,
+    "predictor.two_branch": 1,
+    "predictor.two_branch_memory": 1,
+    "predictor.rotation_only": 1,
+    "predictor.rotation_only_memory": 1,
+    "vqvae": 1,
+    "codebook.ema": 1,
+    "codebook.gradient": 1,
+    # how they are trained (memmlp.training)
+    "sampler": 1,
+    "training": 1,
+    "schedule.step": 1,
+    "schedule.cosine": 1,
+    "schedule.milestones": 1,
+    "rollout.teacher_forcing": 1,
+    "rollout.own_predictions": 1,
+    "rollout.streams": 1,
+    "loss.uncertainty": 1,
+    "loss.manual": 1,
+    "loss.agrol": 1,
+    "loss.avatar_poser": 1,
+    "hand.position": 1,
+    "hand.fk": 1,
+    "hand.off": 1,
+    # how they are evaluated (memmlp.evaluation)
+    "metrics": 1,
+    "mode.stream": 1,
+    "mode.window": 1,
+    "ik.lbfgs": 1,
+    # how they are shipped (memmlp.deploy, memmlp.networks.streaming)
+    "export": 1,
+    "graph.streaming": 1,
+    "graph.naive": 1,
+    "int8": 1,
+    "latency": 1,
+}
+
+
+def outdated(known: Mapping[str, int]) -> list[str]:
+    """The components among some, by name and number, whose numbers are others now, as words."""
+    now = recipes(list(known))
+    return [f"{name} {number} -> {now[name]}" for name, number in known.items() if now[name] != number]
+
+
+def recipes(components: list[str]) -> dict[str, int]:
+    """The numbers of some components, by name; 0 for one that is not of this package."""
+    return {name: RECIPES.get(name, 0) for name in sorted(components)}

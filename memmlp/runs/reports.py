@@ -1,0 +1,29 @@
+"""The files of evaluations, each with its digest."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from memmlp.common.files import now, plain, read_json, write_json
+from memmlp.runs.environment import environment
+
+
+def write_report(path: Path, report: Mapping[str, Any]) -> None:
+    """Write the file of an evaluation: what was measured, when, by what, and its digest."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = plain({**report, "made": now(), "made_by": environment()})
+    write_json(path, content | {"digest": _content_digest(content)})
+
+
+def intact(path: Path) -> bool:
+    """Whether the file of an evaluation is as it was written."""
+    content = read_json(path)
+    return content.pop("digest", None) == _content_digest(content)
+
+
+def _content_digest(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]

@@ -1,0 +1,280 @@
+"""Run folders: lock, manifest, metrics log, completion. The folder is the truth; nothing else is.
+
+A run is done when it is trained. What was evaluated and shipped of it lies below its folder, a file or folder
+for each evaluation and deployment, named by its identity, there whole or not at all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from memmlp.common.errors import InputError
+from memmlp.common.files import atomic_write, file_digest, now, read_json, sync_folder, write_json
+from memmlp.runs.deployed import Deployed
+from memmlp.runs.environment import changes, environment, host, sources
+from memmlp.runs.identity import used_as_configured
+from memmlp.runs.lock import Lock
+from memmlp.runs.log import Metrics, MetricsLog
+from memmlp.runs.origin import joined
+from memmlp.runs.reports import intact
+
+
+class Run:
+    """A folder outputs/runs/<id>/.
+
+    Attributes:
+        folder: the folder; `id` is its name.
+        config_path, manifest_path, metrics_path, results_path, picture, checkpoint, model, marker: its files;
+            `config`, `manifest` and `metrics()` are what the first three hold.
+        evaluations, deployments: the folders of what was made of the trained network.
+    """
+
+    FILES = (
+        "deployments/*/latency.json",
+        "deployments/*/step.onnx",
+        "deployments/*/step.int8.onnx",
+        "evaluations/*.json",
+        "checkpoint.safetensors",
+        "model.safetensors",
+        "results.json",
+        "metrics.jsonl",
+        "poses.png",
+        "FAILED",
+        "code.patch",
+        "config.yaml",
+        "manifest.json",
+    )
+    """A run's own files, in the order in which a reset removes them: results before what they are of."""
+    STAGES = FILES[:4]
+
+    def __init__(self, folder: Path | str):
+        self.folder = Path(folder)
+        self.id = self.folder.name
+        self.config_path = self.folder / "config.yaml"
+        self.manifest_path = self.folder / "manifest.json"
+        self.metrics_path = self.folder / "metrics.jsonl"
+        self.checkpoint = self.folder / "checkpoint.safetensors"
+        self.model = self.folder / "model.safetensors"
+        self.picture = self.folder / "poses.png"
+        self.results_path = self.folder / "results.json"
+        self.evaluations = self.folder / "evaluations"
+        self.deployments = self.folder / "deployments"
+        self.marker = self.folder / "DONE"
+        self._lock, self._log = Lock(self.folder), MetricsLog(self.metrics_path)
+
+    @classmethod
+    def of(cls, outputs: Path | str, run_id: str) -> Run:
+        """The run of that id below an outputs folder, whether it exists or not."""
+        return cls(Path(outputs) / "runs" / run_id)
+
+    def evaluation(self, identity: str) -> Path:
+        """The file of an evaluation, whether it was made or not."""
+        return self.evaluations / f"{identity}.json"
+
+    def deployment(self, identity: str) -> Deployed:
+        """The folder of a deployment, whether it was made or not."""
+        return Deployed(self.deployments / identity)
+
+    def has(self, stage: str) -> bool:
+        """Whether the evaluation or deployment of that identity was made."""
+        return self.evaluation(stage).is_file() or self.deployment(stage).done
+
+    @property
+    def shipped(self) -> Deployed:
+        """The deployment to use, of those with the run's own settings: one whose int8 is as accurate, or the
+        last one.
+        """
+        made = [Deployed(path.parent) for path in self.deployments.glob("*/latency.json")]
+        own = [one for one in made if used_as_configured(one.settings, self.config)]
+        best = max(own, key=lambda one: (one.prefers_int8, one.made), default=None)
+        return best or Deployed(self.deployments / "none")
+
+    @property
+    def deployed(self) -> Path:
+        """The ONNX file to use: in int8 where the run has one that is as accurate (`export.precision`)."""
+        return self.shipped.int8 if self.shipped.prefers_int8 else self.shipped.onnx
+
+    @property
+    def onnx(self) -> Path:
+        """The float32 ONNX file of the deployment to use."""
+        return self.shipped.onnx
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.folder)!r})"
+
+    def lock(
+        self, say: Callable[[str], None] | None = None, wait: bool = True
+    ) -> AbstractContextManager[bool]:
+        """Hold the run for this process, which may hold it already; yields whether it does (`Lock.hold`)."""
+        return self._lock.hold(say, wait)
+
+    @property
+    def status(self) -> str:
+        """One of: done, failed, running (a process is at it), lost (its process died), stopped, new."""
+        return self.state(self.done)
+
+    def state(self, complete: bool) -> str:
+        """The status of work on the run that is complete or not."""
+        if complete:
+            return "done"
+        if (held := self._lock.held) is not None:
+            return "running" if held else "lost"
+        if self.failure:
+            return "failed"
+        return "stopped" if self.manifest_path.exists() else "new"
+
+    @property
+    def failure(self) -> str | None:
+        """Why the run failed, in a line; None where it didn't."""
+        return read_json(self.folder / "FAILED").get("reason")
+
+    def fail(self, reason: str, details: str = "") -> None:
+        """Leave word of why the run ended before it was done."""
+        write_json(
+            self.folder / "FAILED", {"reason": " ".join(reason.split()), "when": now(), "details": details}
+        )
+
+    def retry(self) -> None:
+        """Forget the failure, and the attempts that led to it."""
+        attempts = self.manifest.get("attempts", [])
+        if self.failure and attempts:
+            self.write_manifest({"forgiven": len(attempts)})
+        (self.folder / "FAILED").unlink(missing_ok=True)
+
+    def begin(
+        self, kind: str, config: Mapping[str, Any], *, data: str, upstream: str | None, **facts: Any
+    ) -> None:
+        """Write config.yaml and the manifest of a run that starts or resumes.
+
+        The patch of code that was changed since its commit is kept beside them.
+
+        Args:
+            facts: further entries of the manifest: recipes, device, threads, ...
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        atomic_write(self.config_path, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
+        if patch := changes():
+            atomic_write(self.folder / "code.patch", patch)
+        identity = {"id": self.id, "kind": kind, "data": data, "upstream": upstream}
+        before = self.manifest if self.checkpoint.exists() else {}
+        made = joined(before, {**facts, **environment(), "sources": sources()})
+        self.attempt("training")
+        times = {"started": self.manifest.get("started", now()), "finished": None}
+        self.write_manifest(identity | times | made)
+
+    def attempt(self, stage: str) -> None:
+        """Note that a process is at a stage of the run."""
+        self.retry()
+        begun = {"started": now(), "pid": os.getpid(), "host": host(), "step": self.step, "stage": stage}
+        self.write_manifest({"attempts": [*self.manifest.get("attempts", []), begun]})
+
+    def write_manifest(self, fields: Mapping[str, Any]) -> None:
+        """Add fields to the manifest, or replace them."""
+        write_json(self.manifest_path, self.manifest | dict(fields))
+
+    @property
+    def manifest(self) -> dict[str, Any]:
+        """What is known of the run; empty before it began."""
+        return read_json(self.manifest_path)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The resolved config; empty before the run began. Raises InputError where it is damaged."""
+        try:
+            found = yaml.safe_load(self.config_path.read_text()) if self.config_path.exists() else {}
+        except (yaml.YAMLError, UnicodeDecodeError):
+            found = None
+        if not isinstance(found, dict):
+            raise InputError(f"{self.config_path}: cannot be read; remove the run's folder to do it again")
+        return found
+
+    @property
+    def results(self) -> dict[str, Any]:
+        """What was measured with the run's own settings: mode -> branch -> metric, "latency"; of a VQ-VAE its
+        own results.
+
+        Where a branch was evaluated by inverse kinematics of several lengths, the last one counts; tables ask
+        for theirs by its identity.
+        """
+        found, config = read_json(self.results_path), self.config
+        reports = [read_json(path) for path in self.evaluations.glob("*.json")]
+        own = [report for report in reports if used_as_configured(report.get("settings", {}), config)]
+        for report in sorted(own, key=lambda report: report["made"]):
+            found[report["mode"]] = {**found.get(report["mode"], {}), **report["mean"]}
+        latency = read_json(self.shipped.latency)
+        return found | ({"latency": latency} if latency else {})
+
+    @property
+    def changed_sources(self) -> list[str]:
+        """The package's files whose code is not what the run was made by; none if that is unknown."""
+        before = self.manifest.get("sources", {})
+        return sorted(name for name, digest in sources().items() if before and before.get(name) != digest)
+
+    def log(self, step: int, values: Mapping[str, float], phase: str = "train") -> None:
+        """Append one line to the metrics, in one write: a kill tears at most that line."""
+        self._log.append(step, values, phase)
+
+    @property
+    def step(self) -> int:
+        """The last step of training that is logged; 0 before the first."""
+        return max((entry.step for entry in self.metrics()), default=0)
+
+    def metrics(self) -> list[Metrics]:
+        """The log (`MetricsLog.read`)."""
+        return self._log.read()
+
+    def finish(self, artifacts: Sequence[str]) -> None:
+        """Mark the run as done: the marker with the digests of its artifacts, last and atomically."""
+        finished = now()
+        self.write_manifest({"finished": finished})
+        digests = {name: file_digest(self.folder / name) for name in artifacts}
+        write_json(self.marker, {"id": self.id, "finished": finished, "artifacts": digests})
+
+    @property
+    def done(self) -> bool:
+        """Whether the run was finished."""
+        return "artifacts" in read_json(self.marker)
+
+    def verify(self) -> list[str]:
+        """The artifacts of a finished run that are missing or changed since."""
+        artifacts = dict(read_json(self.marker).get("artifacts", {}))
+        for latency in sorted(self.deployments.glob("*/latency.json")):
+            where = latency.parent.relative_to(self.folder)
+            made = read_json(latency).get("artifacts", {})
+            artifacts |= {str(where / name): digest for name, digest in made.items()}
+        changed = [name for name, digest in artifacts.items() if not self._same(name, digest)]
+        reports = sorted(self.evaluations.glob("*.json"))
+        return changed + [str(path.relative_to(self.folder)) for path in reports if not intact(path)]
+
+    def _same(self, name: str, digest: str) -> bool:
+        path = self.folder / name
+        return path.is_file() and file_digest(path) == digest
+
+    def reset(self) -> None:
+        """Remove the run's own files, the marker first, and nothing else."""
+        if not self.folder.exists():
+            return
+        self.marker.unlink(missing_ok=True)
+        sync_folder(self.folder)
+        self._remove((*self.FILES, self.marker.name))
+
+    def clear_stages(self) -> None:
+        """Remove what was made of earlier weights."""
+        self._remove(self.STAGES)
+
+    def _remove(self, names: Iterable[str]) -> None:
+        for name in names:
+            temporary = str(Path(name).with_name(f".{Path(name).name}.*.tmp"))
+            for path in (*self.folder.glob(name), *self.folder.glob(temporary)):
+                path.unlink(missing_ok=True)
+        for folder in (*self.deployments.glob("*/"), self.evaluations, self.deployments):
+            with contextlib.suppress(OSError):  # there is none, or there are files of the user's
+                folder.rmdir()
+        sync_folder(self.folder)

@@ -1,0 +1,64 @@
+"""What a planned sweep's runs have to say to a table."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+
+from memmlp.runs.lookup import list_runs
+from memmlp.runs.recipes import outdated
+from memmlp.runs.run import Run
+from memmlp.sweep.plan import Plan
+from memmlp.sweep.spec import Arm
+from memmlp.tables.collect import Find
+from memmlp.tables.flags import Say
+from memmlp.tables.measured import Measured
+
+Read = Callable[[Path, tuple[str, ...]], Measured]
+
+
+def finder(plan: Plan, read: Read) -> Find:
+    """What finds the results of a planned sweep's finished runs."""
+
+    entries = {(entry.label, entry.seed): entry for entry in plan.entries}
+
+    def find(arm: Arm, seed: int) -> Measured | None:
+        entry = entries.get((arm.label, seed))
+        complete = entry is not None and plan.complete(entry)
+        return read(plan.run_of(entry).folder, entry.stages) if entry and complete else None
+
+    return find
+
+
+def states(plan: Plan) -> Say:
+    """What tells how far a planned sweep's unfinished runs are, where they began."""
+
+    entries = {(entry.label, entry.seed): entry for entry in plan.entries}
+
+    def state(arm: Arm, seed: int) -> str | None:
+        entry = entries.get((arm.label, seed))
+        word = plan.run_of(entry).state(plan.complete(entry)) if entry else "new"
+        return word if word not in ("new", "done") else None
+
+    return state
+
+
+def older(plan: Plan) -> Say:
+    """What finds runs that differ from those of a planned sweep in recipe numbers alone, by cell."""
+    whats = {task.key: task.what for task in plan.tasks}
+    entries = {(entry.label, entry.seed): entry for entry in plan.entries}
+
+    @functools.cache
+    def known() -> dict[str, Run]:
+        return {run.manifest.get("what", ""): run for run in list_runs(plan.outputs) if run.done}
+
+    def say(arm: Arm, seed: int) -> str | None:
+        entry = entries.get((arm.label, seed))
+        run = known().get(whats.get(entry.key, "?")) if entry else None
+        if entry is None or run is None or run.id == entry.id:
+            return None
+        changed = ", ".join(outdated(run.manifest.get("recipes", {}))) or "its VQ-VAE's"
+        return f"run {run.id}: {changed}"
+
+    return say

@@ -1,0 +1,95 @@
+"""The stage that trains a VQ-VAE on single frames (App. A)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from memmlp.motion.dataset import Frames, WindowSampler
+from memmlp.motion.normalizer import Frame
+from memmlp.motion.source import Prepared
+from memmlp.networks import checkpoint
+from memmlp.networks.architecture import Architecture
+from memmlp.networks.vqvae import VQVAE, rotation_error
+from memmlp.runs.run import Run
+from memmlp.training.loop import StepResult, train
+from memmlp.training.optim import Optim
+
+
+@dataclass(frozen=True)
+class CodesTraining:
+    """How a VQ-VAE is trained.
+
+    Attributes:
+        config: the part of the resolved config that its result follows from.
+        seed: of its weights and batches. optim: by the number of training frames.
+    """
+
+    config: dict[str, Any]
+    seed: int
+    optim: Callable[[int], Optim]
+
+    def train(
+        self, architecture: Architecture, data: Prepared, run: Run, device: torch.device
+    ) -> dict[str, float]:
+        """Train the architecture's VQ-VAE from the run's checkpoint on, and write its weights.
+
+        Returns:
+            Its errors on the validation frames.
+        """
+        frames, validation = (data.open(split).to(device) for split in ("train", "val"))
+        torch.manual_seed(self.seed)
+        frame = architecture.frame(data.manifest, frames.frames).to(device)
+        model = architecture.vqvae().to(device)
+        optim = self.optim(len(frames.frames))
+        task = VQVAETask(model, frame, frames, validation, optim, self.seed)
+        train(task, optim, run, self.seed, "VQ-VAE")
+        checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
+        return task.validate()
+
+
+class VQVAETask:
+    """Eq. 1 on the reconstructed rotations plus the codebook's loss (App. A)."""
+
+    def __init__(
+        self, model: VQVAE, frame: Frame, frames: Frames, validation: Frames, optim: Optim, seed: int
+    ):
+        self.model, self.frame, self.frames, self.validation = model, frame, frames, validation
+        self.module: nn.Module = model
+        self.sampler = WindowSampler(frames, batch=optim.batch, window=1, seed=seed)
+        self.used = torch.zeros(len(model.codebook.vectors))
+
+    def parameter_groups(self) -> list[dict]:
+        """All parameters."""
+        return [{"params": [p for p in self.model.parameters() if p.requires_grad]}]
+
+    def step(self, step: int) -> StepResult:
+        """The loss on a batch of single frames."""
+        clips, end = self.sampler.draw(step)
+        frames = self.frame.encode(self.frames.segments(clips, end, 1))[:, 0]
+        terms, indices = self.model.loss_terms(frames, self.frame)
+        self.used = torch.bincount(indices, minlength=len(self.used)).float()
+        return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)
+
+    def report(self) -> dict[str, float]:
+        """How many codes are used, as the exponential of their entropy."""
+        return {"perplexity": perplexity(self.used)}
+
+    @torch.no_grad()
+    def validate(self) -> dict[str, float]:
+        """Eq. 1 and the perplexity on validation frames."""
+        frames = self.frame.encode(self.validation.frames)
+        vectors, index = self.model.codebook(self.model.encoder(frames))
+        used = torch.bincount(index, minlength=len(self.used)).float()
+        error = rotation_error(self.model.decoder(vectors), frames, self.frame)
+        return {"rotation": float(error), "perplexity": perplexity(used)}
+
+
+def perplexity(counts: Tensor) -> float:
+    """Exponential of the entropy of counts (K,): K where all are used alike, 1 where one is."""
+    share = counts / counts.sum().clamp_min(1)
+    return float(torch.special.entr(share).sum().exp())

@@ -1,0 +1,158 @@
+"""The training loop, for VQ-VAE and motion networks alike: steps, checkpoints, validation, records.
+
+A step's randomness comes from (seed, step) alone, so a run that was killed and resumed ends in the same
+weights, bit for bit on a CPU, as one that was not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from rich.progress import Progress, TaskID
+from torch import Tensor, nn
+
+from memmlp.common.errors import TrainingDiverged
+from memmlp.common.progress import progress
+from memmlp.motion.dataset import Frames
+from memmlp.networks import checkpoint
+from memmlp.runs.run import Run
+from memmlp.training.optim import Optim
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """The loss of a step, its terms by name, and the clips (B,) that its batch came from."""
+
+    loss: Tensor
+    terms: dict[str, Tensor]
+    clips: Tensor
+
+
+class Task(Protocol):
+    """What is trained."""
+
+    @property
+    def module(self) -> nn.Module:
+        """All that a checkpoint must carry."""
+
+    @property
+    def frames(self) -> Frames:
+        """The training split."""
+
+    def parameter_groups(self) -> list[dict]:
+        """For the optimiser."""
+
+    def step(self, step: int) -> StepResult:
+        """The loss of a training step."""
+
+    def report(self) -> dict[str, float]:
+        """Values worth logging beside the loss terms."""
+
+    def validate(self) -> dict[str, float]:
+        """Metrics on the validation split."""
+
+
+def seed_step(seed: int, step: int) -> None:
+    """Seed torch for one step."""
+    torch.manual_seed(int(np.random.SeedSequence([seed, step]).generate_state(1, np.uint64)[0] >> 1))
+
+
+Watch = Callable[[int, dict[str, float]], None]
+
+
+def unwatched(step: int, values: dict[str, float]) -> None:
+    """Lets every run go on."""
+
+
+def train(task: Task, optim: Optim, run: Run, seed: int, description: str, watch: Watch = unwatched) -> None:
+    """Train to `optim.steps`, from the run's checkpoint where there is one, and leave the last checkpoint.
+
+    `watch` is called after each validation with the step and its values, and may raise to stop.
+    Raises TrainingDiverged, naming step, term and clips, where a term is NaN or Inf.
+    """
+    optimiser = optim.build(task.parameter_groups())
+    start = resume(task, optimiser, run) if run.checkpoint.exists() else 0
+    with progress() as bar:
+        row = bar.add_task(description, total=optim.steps, completed=start, note="")
+        for step in range(start, optim.steps):
+            seed_step(seed, step)
+            result = train_step(task, optim, optimiser, step)
+            validation = record(task, optim, run, step + 1, result, bar, row)
+            if (step + 1) % optim.checkpoint_every == 0 or step + 1 == optim.steps:
+                save(task, optimiser, run, step + 1)
+            if validation:
+                watch(step + 1, validation)
+
+
+def train_step(task: Task, optim: Optim, optimiser: torch.optim.Optimizer, step: int) -> StepResult:
+    """One step of the optimiser."""
+    task.module.train()
+    for group in optimiser.param_groups:
+        group.setdefault("initial_lr", group["lr"])
+        group["lr"] = group["initial_lr"] * optim.factor(step)
+    device = task.frames.frames.device
+    mixed = torch.autocast(device.type, torch.bfloat16) if optim.precision == "bf16" else nullcontext()
+    with mixed:
+        result = task.step(step)
+    check_finite(task, result, step)
+    optimiser.zero_grad(set_to_none=True)
+    result.loss.backward()
+    if optim.clip_norm:
+        torch.nn.utils.clip_grad_norm_(task.module.parameters(), optim.clip_norm)
+    optimiser.step()
+    return result
+
+
+def check_finite(task: Task, result: StepResult, step: int) -> None:
+    """Stop where the loss is no number."""
+    if torch.isfinite(result.loss):
+        return
+    bad = [name for name, term in result.terms.items() if not torch.isfinite(term)] or ["weighted sum"]
+    names = sorted({task.frames.names[i] for i in result.clips.tolist()})
+    raise TrainingDiverged(
+        f"loss is {float(result.loss.detach())} at step {step + 1}, term {', '.join(bad)}; "
+        f"clips of the batch: {', '.join(names[:20])}{' ...' if len(names) > 20 else ''}"
+    )
+
+
+def record(
+    task: Task, optim: Optim, run: Run, step: int, result: StepResult, bar: Progress, row: TaskID
+) -> dict[str, float]:
+    """Log and show a finished step, and validate where it is time; the validation's values, or none."""
+    last = step == optim.steps
+    bar.advance(row)
+    if step % optim.log_every == 0 or last:
+        loss = float(result.loss.detach())
+        terms = {name: float(term.detach()) for name, term in result.terms.items()}
+        run.log(step, {"loss": loss, **terms, **task.report()})
+        bar.update(row, note=f"loss {loss:.3g}")
+    if step % optim.validate_every == 0 or last:
+        task.module.eval()
+        values = task.validate()
+        run.log(step, values, phase="val")
+        return values
+    return {}
+
+
+def save(task: Task, optimiser: torch.optim.Optimizer, run: Run, step: int) -> None:
+    """Write all that a later process needs to go on after `step` steps."""
+    rates = [group["initial_lr"] for group in optimiser.param_groups]
+    tensors = checkpoint.module_tensors("module", task.module) | checkpoint.optimiser_tensors(optimiser)
+    tensors["rng.torch"] = torch.get_rng_state()
+    checkpoint.write(run.checkpoint, tensors, {"step": step, "initial_lr": rates})
+
+
+def resume(task: Task, optimiser: torch.optim.Optimizer, run: Run) -> int:
+    """Put the run's checkpoint back; the number of steps done."""
+    tensors, values = checkpoint.read(run.checkpoint)
+    checkpoint.load_module("module", task.module, tensors)
+    checkpoint.load_optimiser(optimiser, tensors)
+    torch.set_rng_state(tensors["rng.torch"])
+    for group, rate in zip(optimiser.param_groups, values["initial_lr"], strict=True):
+        group["initial_lr"] = rate
+    return values["step"]

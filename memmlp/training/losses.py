@@ -1,0 +1,273 @@
+"""The training loss: the terms of Eqs. 1-4, the hand term, and how they are weighted (Eq. 5).
+
+As printed: L1, summed over joints and components, mean over time and batch (reading 10). Everything is
+in the world: 6D components, metres, per frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import Tensor, nn
+
+from memmlp.motion.body import FRAME_DIM, HANDS, LOWER, N_JOINTS, POSITION, ROOT, ROTATION, SPARSE_DIM
+from memmlp.motion.coordinates import World
+from memmlp.motion.normalizer import Frame
+
+Terms = dict[str, Tensor]
+
+
+def l1(error: Tensor) -> Tensor:
+    """Sum over components, mean over batch and time, of an error (B, T, ...)."""
+    return error.abs().flatten(2).sum(-1).mean()
+
+
+def joints(motion: Tensor) -> Tensor:
+    """Positions (B, T, 22, 3) of motion (B, T, 198)."""
+    return motion[..., POSITION].unflatten(-1, (N_JOINTS, 3))
+
+
+class NoHand:
+    """No hand term."""
+
+    branch = "position"
+
+    def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+        """No term."""
+        return {}
+
+
+class HandPosition:
+    """L1 on both wrists' positions of the position branch (reading 9)."""
+
+    branch = "position"
+
+    def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+        """The term, from motion and truth (B, T, 198)."""
+        hands = list(HANDS)
+        return {"hand": l1((joints(motion) - joints(truth))[:, :, hands])}
+
+
+class HandFK:
+    """L1 on both wrists' positions by forward kinematics of the rotation branch, head on its tracker."""
+
+    branch = "rotation"
+
+    def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+        """The term, from motion and truth (B, T, 198) and inputs (B, T, 54)."""
+        hands = list(HANDS)
+        return {"hand": l1(frame.pose(motion, sparse)[:, :, hands] - joints(truth)[:, :, hands])}
+
+
+Hand = NoHand | HandPosition | HandFK
+
+
+def rotation_terms(motion: Tensor, truth: Tensor) -> Terms:
+    """Eqs. 1 and 2 for motion and truth (B, T, 198)."""
+    error = (motion - truth)[..., ROTATION]
+    return {"rotation": l1(error), "rotation_velocity": l1(error.diff(dim=1))}
+
+
+def position_terms(motion: Tensor, truth: Tensor) -> Terms:
+    """Eqs. 3 and 4 (the latter on the lower body alone) for motion and truth (B, T, 198)."""
+    error = joints(motion) - joints(truth)
+    return {"position": l1(error), "velocity": l1(error[:, :, list(LOWER)].diff(dim=1))}
+
+
+class Fixed(nn.Module):
+    """Fixed weights by the names of the terms."""
+
+    def __init__(self, values: Mapping[str, float]):
+        super().__init__()
+        self.values = values
+
+    def build(self, names: list[str]) -> None:
+        """Nothing to learn."""
+
+    def parameter_groups(self) -> list[dict]:
+        """Nothing to learn."""
+        return []
+
+    def forward(self, terms: Terms) -> Tensor:
+        """The weighted sum."""
+        return torch.stack([self.values[name] * term for name, term in terms.items()]).sum()
+
+    def weights(self) -> Mapping[str, float]:
+        """The weight of each term."""
+        return self.values
+
+
+class Manual(Fixed):
+    """Fixed weights; the defaults are the paper's grid search (Sec. 4.4)."""
+
+    def __init__(
+        self,
+        rotation: float = 1.0,
+        rotation_velocity: float = 30.0,
+        position: float = 0.5,
+        velocity: float = 0.1,
+        hand: float = 0.1,
+    ):
+        super().__init__(
+            {
+                "rotation": rotation,
+                "rotation_velocity": rotation_velocity,
+                "position": position,
+                "velocity": velocity,
+                "hand": hand,
+            }
+        )
+
+
+class Uncertainty(nn.Module):
+    """Homoscedastic uncertainty (Kendall et al. 2018): e^-s L + s, one learned s a term (reading 8).
+
+    Args:
+        lr: learning rate of the s; the model's own is too small for them to settle.
+    """
+
+    def __init__(self, lr: float = 1e-2):
+        super().__init__()
+        self.lr = lr
+        self.s = nn.ParameterDict()
+
+    def build(self, names: list[str]) -> None:
+        """One s, from 0, for each term."""
+        self.s = nn.ParameterDict({name: nn.Parameter(torch.zeros(())) for name in names})
+
+    def parameter_groups(self) -> list[dict]:
+        """The s, with their own learning rate and no decay."""
+        return [{"params": list(self.s.values()), "lr": self.lr, "weight_decay": 0.0}]
+
+    def forward(self, terms: Terms) -> Tensor:
+        """The weighted sum."""
+        return torch.stack(
+            [(-self.s[name]).exp() * term + self.s[name] for name, term in terms.items()]
+        ).sum()
+
+    def weights(self) -> Mapping[str, float]:
+        """The weight of each term now."""
+        return {name: float((-s.detach()).exp()) for name, s in self.s.items()}
+
+
+Weighting = Fixed | Uncertainty
+
+
+class Loss(nn.Module):
+    """The slot's interface: terms by name, and their weighted sum."""
+
+    weighting: Weighting
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+        """Each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
+        raise NotImplementedError
+
+    def forward(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> tuple[Tensor, Terms]:
+        """The loss and its unweighted terms."""
+        terms = self.terms(motion, truth, sparse, frame)
+        return self.weighting(terms), terms
+
+
+class MotionLoss(Loss):
+    """The loss of Eq. 5 over the branches that the predictor has.
+
+    Args:
+        weighting: Manual or Uncertainty. hand: the hand term. branches: the predictor's.
+    """
+
+    def __init__(self, weighting: Weighting, hand: Hand, branches: frozenset[str]):
+        super().__init__()
+        self.weighting, self.hand, self.branches = weighting, hand, branches
+        probe = torch.zeros(1, 2, FRAME_DIM)
+        frame = Frame.raw(World(), torch.zeros(N_JOINTS, 3))
+        motion = probe[..., SPARSE_DIM:]
+        weighting.build(list(self.terms(motion, motion, probe[..., :SPARSE_DIM], frame)))
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+        """Each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
+        terms: Terms = {}
+        if "rotation" in self.branches:
+            terms |= rotation_terms(motion, truth)
+        if "position" in self.branches:
+            terms |= position_terms(motion, truth)
+        if self.hand.branch in self.branches:
+            terms |= self.hand(motion, truth, sparse, frame)
+        return terms
+
+
+def joint_norms(error: Tensor) -> Tensor:
+    """Mean over frames and joints of the L2 norm of each joint's 6D error, of errors (..., 132)."""
+    return error.unflatten(-1, (N_JOINTS, 6)).norm(dim=-1).mean()
+
+
+def mean_square(error: Tensor) -> Tensor:
+    """Mean of the squared components of errors (..., 132)."""
+    return error.square().mean()
+
+
+ERRORS: dict[str, Callable[[Tensor], Tensor]] = {"norm": joint_norms, "square": mean_square}
+
+
+class AGRoLLoss(Loss):
+    """AGRoL's error of the 6D rotations, in network space, where the diffusion model's noise lies too.
+
+    Args:
+        error: "norm", as its released code trains both of its networks (`joint_norms`), or "square", the
+            mean squared error that its paper can be read as (Du et al. 2023, L2).
+    """
+
+    def __init__(self, error: str = "norm"):
+        super().__init__()
+        self.error = ERRORS[error]
+        self.weighting = Fixed({"rotation": 1.0})
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+        """The one term, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
+        place = frame.place(sparse)
+        error = frame.encode_motion(motion, place) - frame.encode_motion(truth, place)
+        return {"rotation": self.error(error[..., ROTATION])}
+
+
+def from_pelvis(positions: Tensor) -> Tensor:
+    """Joint positions (..., 22, 3) less the pelvis' own."""
+    return positions - positions[..., ROOT : ROOT + 1, :]
+
+
+def from_origin(positions: Tensor) -> Tensor:
+    """Joint positions (..., 22, 3) in the world."""
+    return positions
+
+
+ANCHORS: dict[str, Callable[[Tensor], Tensor]] = {"pelvis": from_pelvis, "head": from_origin}
+
+
+class AvatarPoserLoss(Loss):
+    """Mean absolute errors of root orientation, local rotations and joint positions (Jiang et al. 2022).
+
+    The positions are by forward kinematics, over the 22 joints (its authors' mean is over the fingers too,
+    which move with the wrists).
+
+    Args:
+        orientation, rotation, position: weights of the three terms. The first is 0.02 in the released code
+            and 0.05 in the paper.
+        anchor: where the compared bodies meet: "pelvis", as in the released code, which knows no
+            translation, or "head", the predicted body's put on its tracker.
+    """
+
+    def __init__(
+        self, orientation: float = 0.02, rotation: float = 1.0, position: float = 1.0, anchor: str = "pelvis"
+    ):
+        super().__init__()
+        weights = {"orientation": orientation, "rotation": rotation, "position": position}
+        self.weighting, self.anchored = Fixed(weights), ANCHORS[anchor]
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+        """Each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
+        error = (motion - truth)[..., ROTATION].abs()
+        position = self.anchored(frame.pose(motion, sparse)) - self.anchored(joints(truth))
+        return {
+            "orientation": error[..., :6].mean(),
+            "rotation": error[..., 6:].mean(),
+            "position": position.abs().mean(),
+        }

@@ -1,0 +1,121 @@
+"""The stage that trains a motion network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from memmlp.evaluation import modes
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.dataset import Frames, WindowSampler
+from memmlp.motion.source import Prepared
+from memmlp.networks import checkpoint
+from memmlp.networks.architecture import Architecture
+from memmlp.networks.window_model import WindowModel
+from memmlp.runs.run import Run
+from memmlp.training.loop import StepResult, Watch, train, unwatched
+from memmlp.training.losses import Loss
+from memmlp.training.optim import Optim
+from memmlp.training.rollout import Rollout
+
+VALIDATION_PIECE = 240  # frames: validation streams through pieces of clips of 4 s
+
+
+@dataclass(frozen=True)
+class NetworkTraining:
+    """How a motion network is trained.
+
+    Attributes:
+        seed: of its weights, batches and rollouts.
+        loss: makes the loss over a network's branches. rollout: makes the history that it is trained on.
+        optim: steps and learning rates. weighting: of the windows' draws, "frames" or "clips".
+    """
+
+    seed: int
+    loss: Callable[[frozenset[str]], Loss]
+    rollout: Rollout
+    optim: Optim
+    weighting: str
+
+    def train(
+        self,
+        architecture: Architecture,
+        data: Prepared,
+        codes: Path | None,
+        run: Run,
+        device: torch.device,
+        watch: Watch = unwatched,
+    ) -> WindowModel:
+        """The network after its training, which goes on from the run's checkpoint; its weights are written.
+
+        Args:
+            codes: weights of the frozen VQ-VAE, where the architecture uses one.
+            watch: see `memmlp.training.loop.train`.
+        """
+        frames = data.open("train").to(device)
+        torch.manual_seed(self.seed)
+        frozen = architecture.load_codes(codes) if codes else None
+        model = architecture.build(architecture.frame(data.manifest, frames.frames), frozen).to(device)
+        self.rollout.begin(model)
+        pieces = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)
+        task = MotionTask(
+            model,
+            self.loss(model.branches).to(device),
+            self.rollout.to(device),
+            frames,
+            self.optim,
+            self.seed,
+            validate=lambda network: modes.quick_stream(network, pieces),
+            weighting=self.weighting,
+        )
+        train(task, self.optim, run, self.seed, "network", watch)
+        checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
+        return model.eval()
+
+
+class MotionTask:
+    """A motion network under its loss, its history made by the rollout."""
+
+    def __init__(
+        self,
+        model: WindowModel,
+        loss: Loss,
+        rollout: Rollout,
+        frames: Frames,
+        optim: Optim,
+        seed: int,
+        validate: Callable[[WindowModel], dict[str, float]],
+        weighting: str = "frames",
+    ):
+        self.model, self.loss, self.rollout, self.frames = model, loss, rollout, frames
+        self.module: nn.Module = nn.ModuleDict({"model": model, "loss": loss, "rollout": rollout})
+        self.sampler = WindowSampler(frames, optim.batch, model.frames, seed, weighting)
+        self.learn = torch.compile(model.learn) if optim.compile else model.learn
+        self._validate = validate
+
+    def parameter_groups(self) -> list[dict]:
+        """The model's trainable parameters, and the loss' own."""
+        trained = [p for p in self.model.parameters() if p.requires_grad]
+        return [{"params": trained}, *self.loss.weighting.parameter_groups()]
+
+    def step(self, step: int) -> StepResult:
+        """The loss of one training call."""
+        call = self.rollout.draw(self.model, self.frames, self.sampler, step)
+        motion, state = self.learn(call.sparse, call.state, call.truth)
+        self.rollout.keep(state)
+        true = call.truth[:, -motion.shape[1] :]
+        loss, terms = self.loss(motion, true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], self.model.frame)
+        own = self.model.terms(call.truth)
+        return StepResult(sum(own.values(), loss), terms | own, call.clips)
+
+    def report(self) -> dict[str, float]:
+        """The weights of the loss terms."""
+        return {f"weight_{name}": value for name, value in self.loss.weighting.weights().items()}
+
+    def validate(self) -> dict[str, float]:
+        """Stream-mode metrics on the validation split."""
+        return self._validate(self.model)

@@ -1,0 +1,163 @@
+"""What a network is shipped as: its graph, int8 and what that costs, and what a run records of it."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import tiny
+from conftest import one_line
+
+import memmlp as package
+from memmlp.config.build import build_experiment
+from memmlp.config.compose import composed
+from memmlp.deploy.deployment import GRAPHS, Deployment
+from memmlp.deploy.export import export
+from memmlp.deploy.parity import streamed
+from memmlp.deploy.quantization import accuracy, compared, quantise
+from memmlp.deploy.session import OnnxStream
+from memmlp.motion.coordinates import Heading
+from memmlp.networks.memory import CodeMemory
+from memmlp.networks.streaming import Stream, streaming
+from memmlp.networks.window_model import WindowModel
+from memmlp.runs.deployed import Deployed
+from memmlp.runs.lookup import list_runs
+
+CLIPS = [tiny.clip(60, seed=seed) for seed in range(3)]
+
+
+def files(folder: Path, model: WindowModel) -> tuple[Path, Path]:
+    """A model's stream in float32 and in int8."""
+    exact, quantised, stream = folder / "fp32.onnx", folder / "int8.onnx", streaming(model)
+    export(stream, exact, "0123456789abcdef")
+    quantise(exact, quantised, stream.ends, CLIPS)
+    return exact, quantised
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory) -> tuple[Path, Path]:
+    """The two files of the first tiny network."""
+    return files(tmp_path_factory.mktemp("pair"), tiny.model())
+
+
+def test_auto_is_the_stream_where_there_is_one():
+    assert isinstance(GRAPHS["auto"](tiny.model()), Stream)
+    revised = tiny.model(CodeMemory, history="latest")
+    assert GRAPHS["auto"](revised) is revised
+    assert GRAPHS["naive"](revised) is revised
+
+
+def weights(graph: onnx.ModelProto) -> dict[str, int]:
+    """The number type of each layer's weight that a product takes in, directly or dequantised."""
+    types = {tensor.name: tensor.data_type for tensor in graph.graph.initializer}
+    sources = {
+        node.output[0]: node.input[0] for node in graph.graph.node if node.op_type == "DequantizeLinear"
+    }
+    found = {}
+    for node in graph.graph.node:
+        if node.op_type in ("Gemm", "MatMul"):
+            name = sources.get(node.input[1], node.input[1])
+            found[name.removesuffix("_quantized")] = types.get(name, 0)
+    return found
+
+
+@pytest.mark.parametrize("network", ["mem_mlp", *tiny.REFERENCES])
+def test_inner_layers_are_int8_and_the_ends_are_not(pair, tmp_path, network):
+    _, quantised = pair if network == "mem_mlp" else files(tmp_path, tiny.reference(network))
+    kinds = weights(onnx.load(quantised))
+    inner = [kind for name, kind in kinds.items() if ".blocks." in name or ".layers." in name]
+    assert inner
+    assert set(inner) == {onnx.TensorProto.INT8}
+    ends = {
+        "mem_mlp": {"model.stem.weight", "model.predictor.rotation.linear.weight"},
+        "avatar_poser": {"model.model.embedding.weight", "model.model.orientation.0.weight"},
+    }.get(network, {"model.model.head.weight"})
+    assert {kinds[name] for name in ends} == {onnx.TensorProto.FLOAT}
+
+
+def test_int8_is_near_and_keeps_the_metadata(tmp_path):
+    exact, quantised = files(tmp_path, tiny.model(coordinates=Heading()))
+    before, after = (streamed(OnnxStream(path), CLIPS[0]) for path in (exact, quantised))
+    assert 1e-6 < float((before - after).abs().mean()) < 0.02
+    props = [{p.key: p.value for p in onnx.load(path).metadata_props} for path in (exact, quantised)]
+    assert props[0].items() <= props[1].items()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fp32.onnx", "int8.onnx"]
+
+
+def test_int8_may_stand_for_float32_only_if_it_is_as_good(pair, tmp_path):
+    model = tiny.model()
+    exact, quantised = pair
+    cost = compared(exact, quantised, model.frame, CLIPS)
+    assert cost["growth"] == pytest.approx(cost["int8"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
+    assert cost["default"] == (cost["growth"] <= 0.01)
+    other = tmp_path / "other.onnx"  # of two networks the better one may stand for the other alone
+    export(streaming(tiny.model(seed=1)), other, "0")
+    both = [compared(*pair, model.frame, CLIPS) for pair in ((exact, other), (other, exact))]
+    assert sorted(cost["default"] for cost in both) == [False, True]
+    assert (1 + both[0]["growth"]) * (1 + both[1]["growth"]) == pytest.approx(1)
+    assert compared(exact, exact, model.frame, CLIPS)["default"]
+
+
+def test_accuracy_is_that_of_the_evaluation(pair):
+    from memmlp.evaluation import modes as evaluation
+
+    model = tiny.model()
+    exact, _ = pair
+    found = accuracy(exact, model.frame, CLIPS)
+    motions = evaluation.stream(model, CLIPS)
+    rows = [
+        evaluation.rotations_report(model.frame, motion, clip)
+        for motion, clip in zip(motions, CLIPS, strict=True)
+    ]
+    for name, value in found.items():
+        assert value == pytest.approx(np.mean([row[name] for row in rows]), rel=1e-3), name
+
+
+def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
+    monkeypatch.chdir(home)
+    (made,) = (found for found in list_runs(home / "outputs") if found.manifest["kind"] == "memmlp")
+    place = made.shipped
+    written = place.latency.read_text()
+    record = json.loads(written)
+    assert record["graph"] == "streaming"
+    assert 0 < record["step_macs"] < record["macs"]
+    cost = record["int8"]
+    assert cost["growth"] == pytest.approx(cost["int8"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
+    assert cost["median_ms"] > 0
+    assert cost["onnx_bytes"] == place.int8.stat().st_size
+    assert made.verify() == []
+    assert math.isclose(cost["fp32"]["MPJPE"], made.results["stream"]["rotation"]["MPJPE"], rel_tol=1e-3)
+    for default, used in ((True, place.int8), (False, place.onnx)):
+        cost["default"] = default
+        place.latency.write_text(json.dumps(record))
+        assert made.deployed == used
+        assert package.Stream(made).network.path == used
+        assert package.Stream(str(made.folder)).network.path == used
+    place.latency.write_text(written)
+    assert made.verify() == []
+    place.int8.write_bytes(b"")
+    assert made.verify() == [f"deployments/{place.folder.name}/step.int8.onnx"]
+
+    line = ["export", made.id, "--out", "int8.onnx", "--precision", "int8"]
+    assert "MPJPE" in memmlp(*line, "--max-growth", "50").out
+    Path("int8.onnx").unlink()
+    refused = memmlp(*line, "--max-growth", "-100")
+    assert refused.code == 1
+    assert "not written" in refused.err
+    assert sorted(path.name for path in home.iterdir()) == ["out.txt", "outputs"]
+    assert one_line(memmlp(*line, "--graph", "naive"), "allowed")
+
+
+def test_the_naive_graph_by_switch(tmp_path):
+    """No run: what a config's deployment writes."""
+    shipped = {}
+    for graph in ("naive", "auto"):
+        place = Deployed(tmp_path / graph)
+        shipped[graph] = Deployment(1, graph).ship(tiny.model(), place, "0" * 16, CLIPS, CLIPS)
+    assert [record["graph"] for record in shipped.values()] == ["naive", "streaming"]
+    assert shipped["naive"]["step_macs"] == shipped["naive"]["macs"] == shipped["auto"]["macs"]
+    assert build_experiment(composed(["export.graph=naive"])).deployment.graph == "naive"

@@ -1,0 +1,110 @@
+"""The ONNX step: the same numbers on a whole clip, its interface, its latency."""
+
+import json
+
+import numpy as np
+import onnx
+import pytest
+import tiny
+import torch
+
+from memmlp.deploy import latency
+from memmlp.deploy.export import export
+from memmlp.deploy.parity import TOLERANCE, in_torch, parity, streamed
+from memmlp.deploy.session import OnnxStream
+from memmlp.motion.body import JOINTS, ROTATION, SPARSE_DIM
+from memmlp.motion.coordinates import Heading
+from memmlp.networks.memory import NoMemory
+from memmlp.networks.predictor import RotationOnly
+
+CLIP = tiny.clip(50)
+CASES = {
+    "vq": {},
+    "frame-latest-heading": {"shift": "frame", "history": "latest", "coordinates": Heading()},
+    "rotation-only": {"kind": NoMemory, "predictor": RotationOnly},
+}
+
+
+@pytest.fixture(scope="module", params=CASES, ids=str)
+def exported(request, tmp_path_factory):
+    model = tiny.model(**CASES[request.param])
+    path = tmp_path_factory.mktemp("onnx") / "step.onnx"
+    export(model, path, "0123456789abcdef")
+    return model, path
+
+
+def test_torch_and_onnx_agree_on_a_whole_clip(exported):
+    model, path = exported
+    assert parity(model, path, CLIP) <= TOLERANCE
+
+
+def test_parity_sees_a_difference(exported):
+    model, path = exported
+    with torch.no_grad():
+        model.stem.bias += 0.1
+    assert parity(model, path, CLIP) > TOLERANCE
+    with torch.no_grad():
+        model.stem.bias -= 0.1
+
+
+def test_almost_parallel_columns_are_no_failure(tmp_path):
+    """As an untrained network makes them: the joints of rotations that agree may be far apart."""
+    model, path = tiny.reference("agrol_mlp"), tmp_path / "step.onnx"
+    mean, std = (t[SPARSE_DIM:][ROTATION].view(22, 6) for t in (model.frame.mean, model.frame.std))
+    mean[9, 3:], std[9] = mean[9, :3], 4e-3
+    export(model, path, "0123456789abcdef")
+    with torch.no_grad():
+        model.head.bias.view(22, 6)[9, 3] += 1e-3  # 4e-6 of the rotation, the rounding of a large network
+    assert parity(model, path, CLIP) <= TOLERANCE
+    assert float((in_torch(model, CLIP) - streamed(OnnxStream(path), CLIP)).abs().max()) > TOLERANCE
+    model.frame.rest[15] += 0.01  # of the joints alone
+    assert parity(model, path, CLIP) > TOLERANCE
+
+
+def test_interface_and_metadata(exported):
+    model, path = exported
+    graph = onnx.load(path)
+    inputs = {i.name: [d.dim_value for d in i.type.tensor_type.shape.dim] for i in graph.graph.input}
+    outputs = {o.name: [d.dim_value for d in o.type.tensor_type.shape.dim] for o in graph.graph.output}
+    states = {name: list(tensor.shape) for name, tensor in model.initial_state(1).items()}
+    assert inputs == {"sparse": [1, 54]} | {f"state.{name}": shape for name, shape in states.items()}
+    assert outputs == {"rotation6d": [1, 22, 6], "position": [1, 22, 3]} | {
+        f"state.{name}.next": shape for name, shape in states.items()
+    }
+    props = {p.key: p.value for p in graph.metadata_props}
+    assert json.loads(props["joints"]) == list(JOINTS)
+    assert (props["fps"], props["T"], props["run_id"]) == ("60", "7", "0123456789abcdef")
+    assert "features" in props
+    assert "memmlp_version" in props
+
+
+def test_zeros_are_a_fresh_start(exported):
+    _, path = exported
+    stream = OnnxStream(path)
+    sparse = CLIP[:5, None, :SPARSE_DIM].numpy()
+    first = [stream.step(frame)[1] for frame in sparse]
+    stream.reset()
+    again = [stream.step(frame)[1] for frame in sparse]
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+
+
+def test_latency_and_size(exported):
+    model, path = exported
+    measured = latency.measure(path, steps=1)
+    assert measured["steps"] == 200
+    assert 0 < measured["median_ms"] <= measured["p95_ms"]
+    assert measured["ratio_to_reference"] > 0
+    size = latency.size(model, model, path)
+    assert size["flops"] == 2 * size["macs"] > 0
+    assert size["onnx_bytes"] == path.stat().st_size
+
+
+def test_macs_are_counted_by_hand():
+    """Stem, 4 blocks of time and channel mixing, two branches of one block and a linear."""
+    model = tiny.model(NoMemory)
+    frames, hidden = model.frames, model.hidden
+    block = frames * frames * hidden + frames * hidden * hidden
+    newest = frames * hidden + hidden * hidden  # the branches' last block makes the newest frame alone
+    expected = frames * 54 * hidden + 4 * block + 2 * newest + hidden * (132 + 66)
+    with torch.no_grad():
+        assert latency.macs(model) == expected

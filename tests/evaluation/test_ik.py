@@ -1,0 +1,171 @@
+"""Inverse kinematics: its objective, its optimiser, and its place in evaluation."""
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from torch import Tensor
+
+from memmlp.evaluation import metrics
+from memmlp.evaluation.ik import LBFGS, JointDistance, NoIK, minimise
+from memmlp.evaluation.modes import clip_report, evaluate, local_rotations, stream
+from memmlp.evaluation.predictions import prediction_arrays
+from memmlp.motion.body import HEAD, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
+from memmlp.motion.geometry import axis_angle_to_matrix, matrix_to_sixd
+
+FRAME = tiny.frame()
+TRUTH = tiny.clip(40)
+SPARSE, MOTION = TRUTH[:, :SPARSE_DIM], TRUTH[:, SPARSE_DIM:]
+LEAVES = [10, 11, 15, 20, 21]
+
+
+def perturbed(size: float, seed: int = 0) -> Tensor:
+    """The true motion (40, 198) with every rotation turned by some `size` radians; true positions."""
+    draw = torch.Generator().manual_seed(seed)
+    turn = size * torch.randn(len(MOTION), N_JOINTS, 3, generator=draw)
+    local = local_rotations(MOTION) @ axis_angle_to_matrix(turn)
+    return torch.cat([matrix_to_sixd(local).flatten(1), MOTION[:, POSITION]], -1)
+
+
+def distance(motion: Tensor) -> Tensor:
+    """Largest distance (N,) of a joint of the rotations' pose to the motion's own positions, cm."""
+    target = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
+    return 100 * (FRAME.pose(motion, SPARSE[: len(motion)]) - target).norm(dim=-1).amax(-1)
+
+
+def objective(motion: Tensor) -> JointDistance:
+    """The objective of a motion, in float64."""
+    head = SPARSE[: len(motion), 36:39].double()
+    target = motion[:, POSITION].double().unflatten(-1, (N_JOINTS, 3)) - head[:, None]
+    return JointDistance(local_rotations(motion.double()), target, FRAME.rest.double())
+
+
+def solve(motion: Tensor, iterations: int = 15) -> Tensor:
+    return LBFGS(iterations).solutions(FRAME, motion, SPARSE[: len(motion)])["combined"]
+
+
+def test_reachable_targets_are_reached():
+    motion = perturbed(0.1)
+    assert float(distance(motion).mean()) > 30
+    assert float(distance(solve(motion)).max()) < 2.5
+    assert float(distance(solve(motion, 200)).max()) < 0.15
+
+
+def test_only_rotations_that_move_joints_are_changed():
+    motion = perturbed(0.2)
+    solved = solve(motion)
+    assert torch.equal(solved[:, POSITION], motion[:, POSITION])
+    change = (local_rotations(solved) - local_rotations(motion)).abs().amax((0, 2, 3))
+    assert float(change[LEAVES].max()) < 1e-6
+    others = [joint for joint in range(N_JOINTS) if joint not in LEAVES]
+    assert float(change[others].min()) > 1e-3
+
+
+def test_a_fit_that_is_perfect_already_stays():
+    torch.testing.assert_close(local_rotations(solve(MOTION)), local_rotations(MOTION), atol=1e-4, rtol=0)
+
+
+def test_the_objective_falls_with_every_iteration_in_every_frame():
+    problem = objective(perturbed(0.3))
+    rows = torch.arange(len(MOTION))
+    zero = torch.zeros(len(MOTION), 3 * N_JOINTS, dtype=torch.float64)
+    values = torch.stack([problem(minimise(problem, zero, n), rows) for n in range(16)])
+    assert (values.diff(dim=0) <= 0).all()
+    assert (values[1] < values[0]).all()
+
+
+def test_the_objective_is_the_distance_that_is_measured():
+    """Sum of squares over joints, head on its tracker: `Frame.pose` says the same."""
+    motion = perturbed(0.3)
+    target = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
+    expected = (FRAME.pose(motion, SPARSE) - target).square().sum((1, 2))
+    rows = torch.arange(len(motion))
+    value = objective(motion)(torch.zeros(len(motion), 66, dtype=torch.float64), rows)
+    torch.testing.assert_close(value.float(), expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-7, 1.0])
+def test_the_gradient_is_that_of_finite_differences(size):
+    problem, rows = objective(perturbed(0.3)[:2]), torch.arange(2)
+    draw = torch.Generator().manual_seed(1)
+    at = (size * torch.randn(2, 66, dtype=torch.float64, generator=draw)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: problem(x, rows), at, eps=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("angle", [0.0, torch.pi - 1e-4, torch.pi])
+def test_identity_and_half_turns_give_no_nan(angle):
+    """Starts at the identity and at half turns, of the root and of all joints, towards an ordinary pose."""
+    for joints in ([0], range(N_JOINTS)):
+        turn = torch.zeros(3, N_JOINTS, 3)
+        turn[:, list(joints), 1] = angle
+        local = axis_angle_to_matrix(turn)
+        motion = torch.cat([matrix_to_sixd(local).flatten(1), MOTION[:3, POSITION]], -1)
+        solved = solve(motion)
+        assert torch.isfinite(solved).all()
+        assert (distance(solved) < distance(motion)).all()
+
+
+def test_a_frame_is_solved_alike_alone_in_a_batch_and_in_chunks():
+    motion = torch.cat([perturbed(0.3, seed)[:5] for seed in range(3)] + [perturbed(2.0, 9)[:5]])
+    sparse = SPARSE[:5].repeat(4, 1)
+    together = LBFGS(15).solutions(FRAME, motion, sparse)["combined"]
+    chunks = LBFGS(15, chunk=3).solutions(FRAME, motion, sparse)["combined"]
+    torch.testing.assert_close(chunks, together, atol=1e-5, rtol=0)
+    for i in range(0, len(motion), 4):
+        alone = LBFGS(15).solutions(FRAME, motion[i : i + 1], sparse[i : i + 1])["combined"]
+        torch.testing.assert_close(alone[0], together[i], atol=1e-5, rtol=0)
+    assert torch.equal(together, LBFGS(15).solutions(FRAME, motion, sparse)["combined"])
+
+
+def test_more_iterations_get_nearer():
+    motion = perturbed(0.5)
+    means = [float(distance(solve(motion, n)).mean()) for n in (1, 5, 15, 60)]
+    assert means == sorted(means, reverse=True)
+    assert means[0] > 2 * means[-1]
+
+
+def test_minimise_finds_the_minimum_of_quadratics_of_all_scales():
+    """Each row has a curvature of its own, from 1e-3 to 1e3, and a minimum of its own."""
+    draw = torch.Generator().manual_seed(0)
+    bend = torch.logspace(-3, 3, 7, dtype=torch.float64)[:, None] * torch.rand(7, 4, generator=draw) + 1e-3
+    best = torch.randn(7, 4, generator=draw, dtype=torch.float64)
+    found = minimise(lambda x, rows: (bend[rows] * (x - best[rows]) ** 2).sum(-1), torch.zeros_like(best), 60)
+    torch.testing.assert_close(found, best, atol=1e-5, rtol=0)
+
+
+def test_evaluation_reports_a_third_branch_with_the_rotation_branchs_metrics():
+    model, split = tiny.model(), tiny.frames((30, 20))
+    results = evaluate(model, split, ["window", "stream"], 8, LBFGS(5))
+    plain = evaluate(model, split, ["window", "stream"], 8, NoIK())
+    for mode in ("window", "stream"):
+        mean = results["mean"][mode]
+        assert set(mean) == {"rotation", "position", "combined"}
+        assert set(plain["mean"][mode]) == {"rotation", "position"}
+        assert mean["combined"].keys() == mean["rotation"].keys()
+        assert mean["rotation"] == plain["mean"][mode]["rotation"]
+        assert all("combined" in row[mode] for row in results["clips"])
+
+
+def test_the_combined_report_is_of_the_solved_rotations():
+    model, clip = tiny.model(), tiny.clip(25)
+    motion = stream(model, [clip])[0]
+    report = clip_report(model.frame, motion, clip, LBFGS(5))
+    solved = LBFGS(5).solutions(model.frame, motion, clip[:, :SPARSE_DIM])["combined"]
+    assert report["combined"] == clip_report(model.frame, solved, clip)["rotation"]
+    positions = model.frame.pose(solved, clip[:, :SPARSE_DIM])
+    truth = clip[:, SPARSE_DIM:][:, POSITION].unflatten(-1, (N_JOINTS, 3))
+    assert report["combined"]["MPJPE"] == float(metrics.position_error(positions, truth))
+    torch.testing.assert_close(positions[:, HEAD], truth[:, HEAD], atol=1e-5, rtol=0)
+    assert ROTATION.stop == 132
+
+
+def test_prediction_files_hold_the_solved_pose():
+    motion = perturbed(0.2)
+    plain = prediction_arrays(FRAME, TRUTH, motion, NoIK())
+    arrays = prediction_arrays(FRAME, TRUTH, motion, LBFGS(5))
+    assert set(arrays) - set(plain) == {"combined_positions", "combined_rotations"}
+    assert arrays["combined_rotations"].shape == (40, N_JOINTS, 3, 3)
+    target = arrays["predicted_positions_of_position_branch"]
+    distances = [np.abs(arrays[f"{name}_positions"] - target).mean() for name in ("combined", "predicted")]
+    assert distances[0] < distances[1] / 2
+    assert all(np.array_equal(arrays[name], plain[name]) for name in plain)

@@ -1,0 +1,178 @@
+"""Metrics against a plain NumPy computation, and predictors whose scores are known."""
+
+import math
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from scipy.spatial.transform import Rotation
+
+from memmlp.evaluation import metrics
+from memmlp.evaluation.modes import MODES, chunks, clip_report, evaluate, quick_stream, stream, window
+from memmlp.motion.body import MOTION_DIM, POSITION, SPARSE_DIM
+
+
+def random_rotations(rng: np.random.Generator, count: int, near_pi: bool) -> np.ndarray:
+    axis = rng.normal(size=(count, 22, 3))
+    axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+    angle = (
+        rng.uniform(math.pi - 1e-3, math.pi - 1e-6, (count, 22, 1))
+        if near_pi
+        else rng.uniform(0, 3, (count, 22, 1))
+    )
+    return Rotation.from_rotvec((axis * angle).reshape(-1, 3)).as_matrix().reshape(count, 22, 3, 3)
+
+
+@pytest.mark.parametrize("near_pi", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_rotation_metrics_are_numpys(near_pi, seed):
+    rng = np.random.default_rng(seed)
+    a, b = random_rotations(rng, 12, near_pi), random_rotations(rng, 12, near_pi and seed > 0)
+    va, vb = (Rotation.from_matrix(m[:, 1:].reshape(-1, 3, 3)).as_rotvec() for m in (a, b))
+    wrapped = (va - vb + np.pi) % (2 * np.pi) - np.pi
+    between = Rotation.from_matrix(a[:, 1:].reshape(-1, 3, 3)).inv() * Rotation.from_matrix(
+        b[:, 1:].reshape(-1, 3, 3)
+    )
+    report = metrics.rotations_report(torch.tensor(a), torch.tensor(b))
+    assert report["MPJRE"] == pytest.approx(np.rad2deg(np.abs(wrapped).mean()), abs=1e-5)
+    assert report["geodesic"] == pytest.approx(np.rad2deg(between.magnitude().mean()), abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_position_metrics_are_numpys(seed):
+    rng = np.random.default_rng(seed)
+    truth = np.cumsum(rng.normal(size=(30, 22, 3)) * 0.01, 0)
+    predicted = truth + rng.normal(size=truth.shape) * 0.05
+    report = metrics.positions_report(torch.tensor(predicted), torch.tensor(truth))
+    error = 100 * np.sqrt(((predicted - truth) ** 2).sum(-1))
+    upper, lower = [3, 6, 9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21], [0, 1, 2, 4, 5, 7, 8, 10, 11]
+    velocity = [
+        np.linalg.norm((predicted[t + 1] - predicted[t]) - (truth[t + 1] - truth[t]), axis=-1)
+        for t in range(29)
+    ]
+    third = [p[3] - 3 * p[2] + 3 * p[1] - p[0] for p in (predicted[t : t + 4] for t in range(27))]
+    true_third = [p[3] - 3 * p[2] + 3 * p[1] - p[0] for p in (truth[t : t + 4] for t in range(27))]
+    expected = {
+        "MPJPE": error.mean(), "Hand PE": error[:, [20, 21]].mean(), "Root PE": error[:, 0].mean(),
+        "Upper PE": error[:, upper].mean(), "Lower PE": error[:, lower].mean(),
+        "MPJVE": 100 * 60 * np.mean(velocity), "Jitter": np.linalg.norm(third, axis=-1).mean() * 60**3 / 100,
+        "GT Jitter": np.linalg.norm(true_third, axis=-1).mean() * 60**3 / 100,
+    }  # fmt: skip
+    assert report == pytest.approx(expected, abs=1e-5, rel=1e-5)
+
+
+class Copy:
+    """Knows the truth: what it is given as input it looks up."""
+
+    shift = 0
+
+    def __init__(self, clips, error=0.0, frames=7):
+        self.frame, self.frames, self.error = tiny.frame(), frames, error
+        self.table = {tuple(row[:SPARSE_DIM].tolist()): row[SPARSE_DIM:] for clip in clips for row in clip}
+
+    def initial_state(self, batch=1):
+        return {"motion": torch.zeros(batch, self.frames, MOTION_DIM)}
+
+    def advance(self, sparse, state, newest=None):
+        new = torch.stack(
+            [torch.stack([self.table[tuple(x.tolist())] for x in row]) for row in sparse]
+        ).clone()
+        new[..., POSITION] += self.error
+        motion = torch.cat([state["motion"], new], 1)[:, -self.frames :]
+        return motion, {"motion": motion}
+
+
+class Still(Copy):
+    """Always the first pose of its first clip."""
+
+    def advance(self, sparse, state, newest=None):
+        pose = next(iter(self.table.values()))
+        return pose.expand(len(sparse), self.frames, -1), state
+
+
+@pytest.mark.parametrize("mode", ["window", "stream"])
+def test_the_truth_scores_zero(mode):
+    split = tiny.frames((30, 21, 5))
+    results = evaluate(Copy([split.clip(i) for i in range(3)]), split, [mode], batch=2)
+    rotation, position = (results["mean"][mode][branch] for branch in ("rotation", "position"))
+    errors = {name: value for name, value in (rotation | position).items() if "Jitter" not in name}
+    assert errors == pytest.approx(dict.fromkeys(errors, 0.0), abs=2e-2)
+    assert position["Jitter"] == pytest.approx(position["GT Jitter"], rel=1e-6)
+    assert position["MPJPE"] == 0
+    assert [row["name"] for row in results["clips"]] == split.names
+
+
+@pytest.mark.parametrize("mode", ["window", "stream"])
+def test_a_constant_offset_scores_itself(mode):
+    """3, 4, 0 cm of error on every joint is 5 cm of MPJPE and no velocity error."""
+    split = tiny.frames((30, 25))
+    copy = Copy([split.clip(i) for i in range(2)], error=torch.tensor([0.03, 0.04, 0.0]).repeat(22))
+    position = evaluate(copy, split, [mode], batch=8)["mean"][mode]["position"]
+    assert position["MPJPE"] == pytest.approx(5.0, abs=1e-4)
+    assert position["Hand PE"] == pytest.approx(5.0, abs=1e-4)
+    assert position["MPJVE"] == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("mode", ["window", "stream"])
+def test_a_constant_pose_has_known_scores(mode):
+    split = tiny.frames((30,))
+    clip = split.clip(0)
+    truth = clip[:, SPARSE_DIM:][:, POSITION].unflatten(-1, (22, 3)).numpy()
+    position = evaluate(Still([clip]), split, [mode], batch=1)["mean"][mode]["position"]
+    assert position["Jitter"] == 0
+    assert position["MPJPE"] == pytest.approx(
+        100 * np.linalg.norm(truth - truth[0], axis=-1).mean(), rel=1e-5
+    )
+    speed = 100 * 60 * np.linalg.norm(np.diff(truth, axis=0), axis=-1).mean()
+    assert position["MPJVE"] == pytest.approx(speed, rel=1e-4)
+
+
+def test_windows_do_not_overlap_and_the_tail_is_shifted_back():
+    """A network that numbers its calls shows which call each frame's output came from."""
+
+    class Counter(Copy):
+        calls = 0
+
+        def advance(self, sparse, state, newest=None):
+            self.calls += 1
+            return torch.full((len(sparse), self.frames, MOTION_DIM), float(self.calls)), state
+
+    clip = tiny.clip(17)
+    calls = window(Counter([clip]), [clip])[0][:, 0]
+    assert calls.tolist() == [1.0] * 7 + [2.0] * 7 + [3.0] * 3
+    assert stream(Counter([clip]), [clip])[0][:, 0].tolist() == list(range(1, 18))
+
+
+def test_modes_differ_and_batches_do_not():
+    split, model = tiny.frames((40, 33, 12)), tiny.model()
+    one, many = (evaluate(model, split, list(MODES), batch=batch) for batch in (1, 3))
+    assert one["mean"]["window"] != one["mean"]["stream"]
+    for mode in MODES:
+        for branch in ("rotation", "position"):
+            assert one["mean"][mode][branch] == pytest.approx(many["mean"][mode][branch], rel=1e-3)
+
+
+def test_the_mean_is_over_clips_not_frames():
+    split = tiny.frames((40, 10))
+    model = tiny.model()
+    results = evaluate(model, split, ["stream"], batch=2)
+    per_clip = [row["stream"]["rotation"]["MPJPE"] for row in results["clips"]]
+    assert results["mean"]["stream"]["rotation"]["MPJPE"] == pytest.approx(np.mean(per_clip), rel=1e-6)
+
+
+def test_jitter_of_too_short_a_clip_is_undefined_and_does_not_count():
+    split, model = tiny.frames((3, 30)), tiny.model()
+    results = evaluate(model, split, ["stream"], batch=2)
+    assert math.isnan(results["clips"][0]["stream"]["rotation"]["Jitter"])
+    expected = results["clips"][1]["stream"]["rotation"]["Jitter"]
+    assert results["mean"]["stream"]["rotation"]["Jitter"] == pytest.approx(expected)
+
+
+def test_validation_streams_through_pieces():
+    split, model = tiny.frames((50, 20)), tiny.model()
+    pieces = chunks(split, 24, least=10)
+    assert [len(piece) for piece in pieces] == [24, 24, 20]
+    values = quick_stream(model, pieces)
+    reports = [clip_report(model.frame, stream(model, [p])[0], p)["rotation"]["MPJPE"] for p in pieces]
+    assert values["rotation MPJPE"] == pytest.approx(np.mean(reports), rel=1e-4)

@@ -1,0 +1,31 @@
+"""A tiny network as an ONNX file, and a clip, for the tests of memmlp.live.player."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+import wearer
+
+from memmlp.deploy.export import export
+from memmlp.live.player.sources import Clip
+from memmlp.networks.memory import NoMemory
+from memmlp.networks.streaming import streaming
+
+PERSON = wearer.person(np.arange(121) / 60)
+
+
+@pytest.fixture(scope="session")
+def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Random weights about a person who stands, as a file."""
+    path = tmp_path_factory.mktemp("player") / "step.onnx"
+    export(streaming(wearer.at_ease(tiny.model(NoMemory), PERSON.frames)), path, "0123456789abcdef")
+    return path
+
+
+@pytest.fixture
+def clip() -> Clip:
+    """Two seconds."""
+    return Clip("person", PERSON.frames.numpy())

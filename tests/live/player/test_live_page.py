@@ -1,0 +1,95 @@
+"""The page in a browser: it draws, stops, goes back, and fits a phone."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chromium import Browser
+
+from memmlp.live.player.play import greeting, play
+from memmlp.live.player.server import Hub, Server
+from memmlp.live.player.sources import Clip, ClipSource
+from memmlp.live.stream import Stream
+
+SHOWN = "Number(document.documentElement.dataset.shown)"
+NEWEST = "Number(document.querySelector('#scrub').max)"
+
+
+@pytest.fixture
+def url(network: Path, clip: Clip) -> Iterator[str]:
+    """A clip that plays."""
+    stopped, source = threading.Event(), ClipSource(clip, 60)
+    with Server(Hub(greeting(source, "tiny")), 0) as server:
+        loop = threading.Thread(target=play, args=(Stream(network), source, server.hub.publish, stopped))
+        loop.start()
+        yield server.url
+        stopped.set()
+        loop.join()
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Browser]:
+    with Browser(tmp_path / "profile") as browser:
+        yield browser
+
+
+def stage(browser: Browser) -> np.ndarray:
+    """The picture's part with the person."""
+    x, y, width, height = browser.value(
+        "(b => [b.x, b.y, b.width, b.height])(document.querySelector('#stage').getBoundingClientRect())"
+    )
+    return browser.picture()[round(y) : round(y + height), round(x) : round(x + width)].astype(int)
+
+
+def test_it_plays_pauses_and_goes_back(browser: Browser, url: str):
+    browser.open(url)
+    browser.wait(f"{SHOWN} > 20")
+    picture = stage(browser)
+    background = np.abs(picture - picture[5, 5]).max(-1) < 12
+    vivid = picture.max(-1) - picture.min(-1) > 60
+    assert 0.3 < background.mean() < 0.97
+    assert vivid.mean() > 0.01
+
+    browser.click("#pause")
+    browser.wait("document.querySelector('#pause').textContent == 'Play'")
+    stopped = browser.value(SHOWN)
+    browser.wait(f"{NEWEST} > {stopped} + 20")
+    assert browser.value(SHOWN) == stopped
+    still = stage(browser)
+
+    early = browser.value("Number(document.querySelector('#scrub').min)") + 3
+    slide = f"s.value = {early}; s.dispatchEvent(new Event('input'))"
+    browser.value(f"(s => {{ {slide} }})(document.querySelector('#scrub'))")
+    browser.wait(f"{SHOWN} == {early}")
+    assert (np.abs(stage(browser) - still).max(-1) > 30).mean() > 0.002
+
+    browser.click("#newest")
+    browser.wait(f"{SHOWN} > {stopped} + 20")
+    assert browser.value("document.querySelector('#about').textContent") == "tiny · person at 60 Hz"
+    assert float(browser.value("document.querySelector('#mean').textContent")) > 0
+    assert browser.errors == []
+
+
+def test_it_says_what_it_waits_for_and_when_the_command_has_ended(browser: Browser, clip: Clip):
+    with Server(Hub(greeting(ClipSource(clip, 60), "tiny")), 0) as server:
+        browser.open(server.url)
+        browser.wait("document.querySelector('#status').textContent == 'waiting for trackers'")
+        server.hub.publish({"dropped": 0, "malformed": 3})
+        browser.wait("document.querySelector('#status').textContent.endsWith('3 packets malformed')")
+    browser.wait("document.querySelector('#status').textContent == 'not connected'")
+
+
+def test_it_fits_a_phone_in_the_dark(tmp_path: Path, url: str):
+    with Browser(tmp_path / "profile", 390, 780, dark=True) as browser:
+        browser.open(url)
+        browser.wait(f"{SHOWN} > 5")
+        outside = (
+            "[...document.querySelectorAll('body *')].filter(e => e.getBoundingClientRect().right > 391)"
+        )
+        assert browser.value(f"{outside}.length") == 0
+        assert browser.value("document.querySelector('#stage').clientHeight") > 300
+        assert stage(browser)[5, 5].max() < 60

@@ -1,0 +1,186 @@
+"""The loop and the page's server, with plain HTTP clients."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from memmlp.common.errors import InputError
+from memmlp.live.player import server as module
+from memmlp.live.player.play import greeting, play
+from memmlp.live.player.server import FILES, Hub, Server
+from memmlp.live.player.sources import Clip, ClipSource, Sample
+from memmlp.live.stream import Stream
+
+
+class Instant(ClipSource):
+    """A clip whose time passes at once; at its end it stops the loop."""
+
+    def __init__(self, clip: Clip, hz: float, stopped: threading.Event):
+        self.now, self.stopped = 0.0, stopped
+        super().__init__(clip, hz, 1, lambda: self.now, self.pass_time)
+
+    def pass_time(self, seconds: float) -> None:
+        self.now += seconds
+
+    def read(self) -> Sample | None:
+        sample = super().read()
+        if self.over:
+            self.stopped.set()
+        return sample
+
+
+class Losing(Instant):
+    """Loses the left hand in the middle, and sends what is no rotation once."""
+
+    def read(self) -> Sample | None:
+        sample = super().read()
+        head, left, right = sample.trackers
+        if 40 <= self.next < 50:
+            left = None
+        if self.next == 60:
+            right = (right[0], np.array([0, 0, 0, 3.0]))
+        return sample._replace(trackers=(head, left, right))
+
+
+def played(network: Path, clip: Clip, hz: float, kind: type[Instant] = Instant) -> list[dict]:
+    """The messages of a clip."""
+    stopped, messages = threading.Event(), []
+    play(Stream(network), kind(clip, hz, stopped), messages.append, stopped)
+    return messages
+
+
+def test_frames_come_at_60_hz_whatever_the_trackers(network: Path, clip: Clip):
+    for hz in (60, 72, 90):
+        messages = played(network, clip, hz)
+        assert [m["number"] for m in messages] == list(range(len(messages)))
+        assert [m["time"] for m in messages] == pytest.approx(np.arange(len(messages)) / 60, abs=1e-4)
+        assert len(messages) >= 119
+
+
+def test_truth_and_prediction_in_the_pages_axes(network: Path, clip: Clip):
+    message = played(network, clip, 90)[30]
+    truth = clip.truth(0.5)
+    assert message["truth"] == pytest.approx(
+        1000 * truth[:, [0, 2, 1]].ravel() * np.tile([1, 1, -1], 22), abs=1
+    )
+    joints = np.array(message["joints"]).reshape(22, 3)
+    assert joints[15] == pytest.approx(np.array(message["truth"]).reshape(22, 3)[15], abs=1)
+    assert message["ms"] > 0
+    json.dumps(message)
+
+
+def test_held_trackers_and_refused_samples_are_told(network: Path, clip: Clip):
+    told = played(network, clip, 60, Losing)
+    messages = [message for message in told if "joints" in message]
+    assert [message for message in told if "joints" not in message] == [{"dropped": 0, "malformed": 1}]
+    held = [m["number"] for m in messages if m["held"]]
+    assert held == list(range(39, 49))
+    assert messages[45]["held"] == ("left",)
+    assert messages[50]["malformed"] == 0
+    assert messages[-1]["malformed"] == 1
+
+
+@pytest.fixture
+def server(clip: Clip) -> Iterator[Server]:
+    with Server(Hub(greeting(ClipSource(clip, 60), "tiny")), 0) as server:
+        yield server
+
+
+def get(server: Server, path: str) -> http.client.HTTPResponse:
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+    connection.request("GET", path)
+    return connection.getresponse()
+
+
+def events(response: http.client.HTTPResponse) -> Iterator[tuple[str, dict]]:
+    """The events of a stream."""
+    name = ""
+    for line in response:
+        key, _, value = line.decode().strip().partition(": ")
+        if key == "event":
+            name = value
+        elif key == "data":
+            yield name, json.loads(value)
+
+
+def test_two_watchers_get_all_frames(server: Server):
+    streams = [events(get(server, "/events")) for _ in range(2)]
+    for stream in streams:
+        name, words = next(stream)
+        assert (name, words["network"], words["source"]) == ("greeting", "tiny", "person at 60 Hz")
+        assert len(words["limbs"]) == 24
+    for number in range(5):
+        server.hub.publish({"number": number})
+    for stream in streams:
+        assert [next(stream)[1]["number"] for _ in range(5)] == list(range(5))
+    server.hub.close()
+    assert [list(stream) for stream in streams] == [[], []]
+
+
+def test_a_slow_watcher_loses_the_oldest_frames(monkeypatch):
+    monkeypatch.setattr(module, "QUEUED", 4)
+    hub = Hub({})
+    with hub.watch() as watcher:
+        for number in range(10):
+            hub.publish({"number": number})
+        assert [watcher.get_nowait() for _ in range(4)] == [
+            f'event: frame\ndata: {{"number":{n}}}\n\n'.encode() for n in range(6, 10)
+        ]
+    assert hub.watchers == set()
+
+
+def test_the_pages_files_are_there(server: Server):
+    for name, (path, kind) in FILES.items():
+        response = get(server, f"/{name}")
+        assert (response.status, response.headers["Content-Type"]) == (200, kind), path
+        assert len(response.read()) > 200
+
+
+def test_the_page_needs_no_network(server: Server):
+    """Nothing that the page loads is elsewhere."""
+    for name in FILES:
+        if not name.startswith("three/"):
+            assert "//" not in get(server, f"/{name}").read().decode().replace("// ", ""), name
+
+
+def test_the_licence_of_three_is_there():
+    assert "MIT" in (Path(module.__file__).parent / "page/three/LICENSE").read_text()
+
+
+@pytest.mark.parametrize("path", ["/../server.py", "/three/LICENSE/..", "/%2e%2e/server.py", "/main"])
+def test_nothing_else_is_served(server: Server, path: str):
+    assert get(server, path).status == 404
+
+
+def test_only_this_machine_is_served(server: Server):
+    assert server.socket.getsockname()[0] == "127.0.0.1"
+
+
+def test_a_page_of_another_site_gets_nothing(server: Server):
+    """Whose name was made to mean this machine."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+    connection.request("GET", "/events", headers={"Host": f"elsewhere.example:{server.server_port}"})
+    assert connection.getresponse().status == 403
+
+
+def test_a_taken_port_is_one_line(server: Server):
+    with pytest.raises(InputError, match=f"port {server.server_port}: taken"):
+        Server(Hub({}), server.server_port)
+
+
+def test_the_end_leaves_the_port_and_no_thread(clip: Clip):
+    before = threading.active_count()
+    with Server(Hub({}), 0) as server:
+        response = get(server, "/events")
+        port = server.server_port
+    assert list(response)[-1:] == [b"\n"]
+    with Server(Hub({}), port):
+        pass
+    assert threading.active_count() <= before + 1  # the watcher's own may still be on its way out

@@ -1,0 +1,135 @@
+"""Clips in real time and packets from a port, on a clock of the test's own."""
+
+from __future__ import annotations
+
+import socket
+import threading
+
+import numpy as np
+import pytest
+
+from memmlp.common.errors import InputError
+from memmlp.live.player.packets import from_json, from_osc, to_json, to_osc
+from memmlp.live.player.sources import HOST, PAUSE, Clip, ClipSource, PacketSource, send
+from memmlp.live.rotations import quaternion_to_matrix
+from memmlp.live.spaces import SPACES
+
+PACKETS = {"udp": (to_json, from_json), "osc": (to_osc, from_osc)}
+
+
+class Clock:
+    """A time that passes when somebody sleeps, or works."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        assert seconds >= 0
+        self.now += seconds
+
+
+def source(clip: Clip, hz: float, clock: Clock, rounds: float = 1) -> ClipSource:
+    return ClipSource(clip, hz, rounds, clock, clock.sleep)
+
+
+@pytest.mark.parametrize(("hz", "count"), [(60, 120), (72, 143), (90, 179)])
+def test_a_clip_comes_at_its_rate(clip: Clip, hz: float, count: int):
+    clock = Clock()
+    played = source(clip, hz, clock)
+    samples = []
+    while not played.over:
+        samples.append((clock.now, played.read()))
+    assert len(samples) == count
+    assert clock.now - 100 == pytest.approx((count - 1) / hz)
+    assert [s.time for _, s in samples] == pytest.approx([i / hz for i in range(count)])
+    assert all(s.dropped == 0 for _, s in samples)
+
+
+def test_at_60_hz_the_samples_are_the_clips_frames(clip: Clip):
+    for index in (0, 7, 119):
+        position, quaternion = clip.trackers(index / 60)[1]
+        assert position == pytest.approx(clip.positions[index, 1], abs=1e-9)
+        assert quaternion_to_matrix(quaternion) == pytest.approx(clip.rotations[index, 1], abs=1e-6)
+        assert clip.truth(index / 60) == pytest.approx(clip.joints[index], abs=1e-9)
+
+
+def test_between_frames_it_is_between_them(clip: Clip):
+    position, quaternion = clip.trackers(10.5 / 60)[2]
+    assert position == pytest.approx(clip.positions[10:12, 2].mean(0), abs=1e-9)
+    middle = quaternion_to_matrix(quaternion)
+    a, b = (np.linalg.norm(middle - clip.rotations[i, 2]) for i in (10, 11))
+    assert a == pytest.approx(b, abs=1e-6)
+    assert clip.truth(10.5 / 60) == pytest.approx(clip.joints[10:12].mean(0), abs=1e-9)
+
+
+def test_what_is_due_while_somebody_works_is_dropped(clip: Clip):
+    clock = Clock()
+    played = source(clip, 60, clock)
+    played.read()
+    clock.sleep(3.5 / 60)
+    sample = played.read()
+    assert sample.dropped == 2
+    assert sample.time == pytest.approx(3 / 60)
+    assert played.read().dropped == 0
+
+
+def test_a_round_follows_after_a_pause(clip: Clip):
+    clock = Clock()
+    played = source(clip, 60, clock, rounds=2)
+    samples = [played.read() for _ in range(121)]
+    assert samples[120].time - samples[119].time == pytest.approx(PAUSE)
+    assert np.array_equal(samples[120].trackers[0][0], samples[0].trackers[0][0])
+    assert np.array_equal(played.truth(samples[120].time), played.truth(0.0))
+
+
+@pytest.mark.parametrize(("kind", "space"), [("udp", "amass"), ("osc", "unity")])
+def test_a_clip_arrives_as_packets(clip: Clip, kind: str, space: str):
+    pack, parse = PACKETS[kind]
+    arrives = PacketSource(kind, 0, parse, space)
+    there, clock = SPACES[space], Clock()
+    played = source(clip, 60, clock)
+    sender = threading.Thread(target=send, args=(played, arrives.port, pack, there))
+    sender.start()
+    samples = [arrives.read() for _ in range(120)]
+    sender.join()
+    arrives.close()
+    assert [sample.time for sample in samples] == pytest.approx([i / 60 for i in range(120)])
+    assert all(sample.dropped == 0 for sample in samples)
+    position, quaternion = samples[50].trackers[2]
+    assert there.positions_in(position) == pytest.approx(clip.positions[50, 2], abs=1e-6)
+    turned = there.rotations_in(quaternion_to_matrix(quaternion[None]))
+    assert turned[0] == pytest.approx(clip.rotations[50, 2], abs=1e-6)
+    assert arrives.malformed == 0
+    assert arrives.truth(0.5) is None
+
+
+def test_malformed_and_missing_packets_are_counted():
+    arrives = PacketSource("UDP", 0, from_json, "amass")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        head = '"head": [0, 0, 1.6, 0, 0, 0, 1]'
+        for text in (
+            f'{{{head}, "seq": 4}}',
+            "nonsense",
+            "",
+            f'{{{head}, "seq": 8}}',
+            f'{{{head}, "seq": 2}}',
+            f'{{{head}, "seq": {10**300}}}',
+        ):
+            sender.sendto(text.encode(), (HOST, arrives.port))
+        samples = [arrives.read() for _ in range(6)]
+    assert [s and s.dropped for s in samples] == [0, None, None, 3, 0, 0]
+    assert arrives.malformed == 2
+    assert arrives.read() is None
+    arrives.close()
+
+
+def test_only_this_machine_is_listened_to():
+    arrives = PacketSource("UDP", 0, from_json, "amass")
+    assert arrives.socket.getsockname()[0] == "127.0.0.1"
+    with pytest.raises(InputError, match=f"port {arrives.port}: taken"):
+        PacketSource("UDP", arrives.port, from_json, "amass")
+    arrives.close()
+    PacketSource("UDP", arrives.port, from_json, "amass").close()

@@ -1,0 +1,110 @@
+"""The whole way as one ONNX file: that of evaluation, and that of the live stream."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import tiny
+import torch
+import wearer
+
+from memmlp.common.errors import InputError
+from memmlp.deploy.export import export
+from memmlp.deploy.parity import TOLERANCE
+from memmlp.deploy.session import OnnxStream
+from memmlp.live.full import export_full, full_parity, trackers_of
+from memmlp.live.spaces import SPACES
+from memmlp.live.stream import Stream
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.coordinates import Heading
+from memmlp.motion.features import sparse_features
+from memmlp.networks.streaming import streaming
+
+RUN = "0123456789abcdef"
+PERSON = wearer.person(np.arange(61) / 60)
+
+
+@pytest.fixture(scope="module")
+def network():
+    return tiny.model(coordinates=Heading())
+
+
+@pytest.fixture(scope="module")
+def folder(network, tmp_path_factory) -> Path:
+    """The network's own file, and the whole way in Unity's space."""
+    folder = tmp_path_factory.mktemp("full")
+    export(streaming(network), folder / "step.onnx", RUN)
+    export_full(streaming(network), folder / "unity.onnx", RUN, "unity")
+    return folder
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_it_is_the_stream(name, network, folder: Path):
+    """In every space, from a fresh start and after a reset; of the whole graph but in Unity's."""
+    file, space = folder / f"{name}.onnx", SPACES[name]
+    if not file.exists():
+        export_full(network, file, RUN, name)
+    assert full_parity(network, file, PERSON.frames, name) <= TOLERANCE
+    positions, rotations = space.positions_out(PERSON.positions), space.rotations_out(PERSON.rotations)
+    poses = wearer.play(Stream(folder / "step.onnx", space=name), positions, rotations)
+    full = OnnxStream(file)
+    for _ in range(2):
+        for index, pose in enumerate(poses):
+            given = [part[index : index + 1].astype(np.float32) for part in (positions, rotations)]
+            expected = (pose.rotations, pose.positions, pose.joints)
+            for ours, theirs in zip(full.step(*given), expected, strict=True):
+                np.testing.assert_allclose(ours[0], theirs, atol=1e-4)
+        full.reset()
+
+
+@pytest.mark.parametrize("name", tiny.REFERENCES)
+def test_reference_networks_have_it_too(name, tmp_path: Path):
+    network = tiny.reference(name)
+    export_full(network, tmp_path / "full.onnx", RUN, "unity")
+    assert full_parity(network, tmp_path / "full.onnx", PERSON.frames, "unity") <= TOLERANCE
+
+
+def test_parity_sees_a_difference(network, folder: Path):
+    file = folder / "unity.onnx"
+    assert full_parity(network, file, PERSON.frames, "openxr") > TOLERANCE
+    other = copy.deepcopy(network)
+    with torch.no_grad():
+        other.stem.bias += 0.1
+    assert full_parity(other, file, PERSON.frames, "unity") > TOLERANCE
+
+
+def test_interface_and_metadata(folder: Path):
+    graph = onnx.load(folder / "unity.onnx")
+    shapes = {
+        part.name: [d.dim_value for d in part.type.tensor_type.shape.dim]
+        for part in (*graph.graph.input, *graph.graph.output)
+    }
+    states = {name for name in shapes if name.startswith("state.") and not name.endswith(".next")}
+    assert all(shapes[f"{name}.next"] == shapes[name] for name in states)
+    rest = {name: shape for name, shape in shapes.items() if not name.startswith("state.")}
+    assert rest == {
+        "tracker_positions": [1, 3, 3],
+        "tracker_rotations": [1, 3, 3, 3],
+        "rotations": [1, 22, 3, 3],
+        "positions": [1, 22, 3],
+        "joints": [1, 22, 3],
+    }
+    props = {p.key: p.value for p in graph.metadata_props}
+    assert (props["scope"], props["space"], props["run_id"]) == ("full", "unity", RUN)
+    with pytest.raises(InputError, match="scope full; allowed here is one of scope network"):
+        Stream(folder / "unity.onnx")
+
+
+def test_an_unknown_space_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="space=maya"):
+        export_full(tiny.model(), tmp_path / "full.onnx", RUN, "maya")
+
+
+def test_trackers_of_frames_have_their_features():
+    positions, rotations = trackers_of(PERSON.frames.double())
+    again = sparse_features(rotations, positions)
+    np.testing.assert_allclose(again, PERSON.frames[:, :SPARSE_DIM], atol=1e-6)

@@ -1,0 +1,87 @@
+"""Frames of reference: what they mean, and there and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from memmlp.common.errors import InputError
+from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix
+from memmlp.live.spaces import SPACES, space_of
+from memmlp.live.trackers import UPRIGHT
+
+numbers = st.floats(-10, 10)
+points = st.tuples(numbers, numbers, numbers).map(np.array)
+turns = st.tuples(numbers, numbers, numbers).map(lambda v: Rotation.from_rotvec(v).as_matrix())
+names = st.sampled_from(sorted(SPACES))
+FORWARD, UP, LEFT = np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), np.array([-1.0, 0, 0])  # amass
+
+
+@given(names, points, turns)
+def test_there_and_back(name, point, turn):
+    space = SPACES[name]
+    np.testing.assert_allclose(space.positions_out(space.positions_in(point)), point, atol=1e-12)
+    np.testing.assert_allclose(space.rotations_out(space.rotations_in(turn)), turn, atol=1e-12)
+    pose = np.stack([turn, turn.T, turn @ turn])
+    np.testing.assert_allclose(space.pose_out(space.pose_in(pose)), pose, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(space.pose_out(pose)), 1, atol=1e-9)
+
+
+@given(names, points, turns, turns)
+def test_a_chain_of_joints_is_the_same_in_every_space(name, offset, root, local):
+    """A child at a rest offset: turned and placed in AMASS' world, or all of it in the space."""
+    space = SPACES[name]
+    there_root, there_local = space.pose_out(np.stack([root, local]))
+    there_offset = offset * space.body  # the T-pose's axes
+    np.testing.assert_allclose(there_root @ there_offset, space.positions_out(root @ offset), atol=1e-9)
+    np.testing.assert_allclose(there_root @ there_local, space.rotations_out(root @ local), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "forward", "up", "left"),
+    [("openxr", (0, 0, -1), (0, 1, 0), (-1, 0, 0)), ("unity", (0, 0, 1), (0, 1, 0), (-1, 0, 0))],
+)
+def test_the_axes(name, forward, up, left):
+    space = SPACES[name]
+    for there, here in ((forward, FORWARD), (up, UP), (left, LEFT)):
+        np.testing.assert_allclose(space.positions_in(np.array(there, float)), here)
+    # who stands upright and looks forward has the identity: SMPL's +Z is forward, its +X left
+    upright = space.rotations_in(np.eye(3))
+    np.testing.assert_allclose(upright @ [0, 0, 1], FORWARD, atol=1e-12)
+    np.testing.assert_allclose(upright @ [0, 1, 0], UP, atol=1e-12)
+    np.testing.assert_allclose(upright @ [1, 0, 0], LEFT, atol=1e-12)
+
+
+def test_amass_is_amass():
+    turn = Rotation.from_rotvec([0.3, 2, -1]).as_matrix()
+    np.testing.assert_array_equal(SPACES["amass"].rotations_in(turn), turn)
+    np.testing.assert_array_equal(UPRIGHT @ [0, 1, 0], UP)
+
+
+def test_a_head_that_turns_left_turns_left_everywhere():
+    """90 degrees: about +Y in openxr (right-handed), about -Y in unity (left-handed)."""
+    for name, sign in (("openxr", 1), ("unity", -1)):
+        turn = Rotation.from_rotvec([0, sign * np.pi / 2, 0]).as_matrix()
+        np.testing.assert_allclose(SPACES[name].rotations_in(turn) @ [0, 0, 1], LEFT, atol=1e-12)
+
+
+def test_an_unknown_space_is_refused():
+    with pytest.raises(InputError, match=r"space=maya.*allowed: amass, openxr, unity"):
+        space_of("maya")
+
+
+@given(turns)
+def test_quaternions_are_scipys(turn):
+    quaternion = matrix_to_quaternion(turn[None])
+    np.testing.assert_allclose(quaternion_to_matrix(quaternion)[0], turn, atol=1e-12)
+    np.testing.assert_allclose(Rotation.from_quat(quaternion[0]).as_matrix(), turn, atol=1e-12)
+
+
+@pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, 0.8], [1, 1, 1]])
+@pytest.mark.parametrize("angle", [0, 1e-7, np.pi - 1e-7, np.pi])
+def test_quaternions_at_no_turn_and_half_a_turn(axis, angle):
+    turn = Rotation.from_rotvec(angle * np.array(axis) / np.linalg.norm(axis)).as_matrix()
+    np.testing.assert_allclose(quaternion_to_matrix(matrix_to_quaternion(turn[None]))[0], turn, atol=1e-12)

@@ -1,0 +1,211 @@
+"""Small BVH files of both shipped skeletons, damage to them, and how their refusals are expected."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from memmlp.common.errors import InputError
+from memmlp.motion.body import PARENTS, builtin_rest_joints
+from memmlp.motion.bvh import END, Bvh, EndSite, read_bvh
+from memmlp.motion.clip import Clip
+from memmlp.motion.retarget import fit
+from memmlp.motion.skeleton import Z_UP, load_skeleton
+
+# Joint, parent, offset; a * before an end site's joint, which comes with the offset only.
+DAZ = """
+hip - 0 0 0; abdomen hip 0 20.7 -0.7; chest abdomen 0 11.7 -0.5; neck chest 0 22.2 -2.2; head neck -0.2
+7.1 1.2; leftEye head 4.1 8 8; *leftEye 1 0 0; lCollar chest 2.7 19.3 -4.9; lShldr lCollar 8.8 -2 1.5;
+lForeArm lShldr 28.2 -1.7 0.5; lHand lForeArm 22.6 0.8 7.1; lThumb1 lHand 1.2 -0.5 3.4; *lThumb1 3.4 -0.5
+3.4; rCollar chest -2.7 19.3 -4.9; rShldr rCollar -8.8 -2 1.5; rForeArm rShldr -28.2 -1.7 0.5; rHand
+rForeArm -22.6 0.8 7.1; *rHand -1 0 0; lButtock hip 8.8 4.4 1.2; lThigh lButtock 0 -1.7 -2.2; lShin
+lThigh 0 -36.8 0.7; lFoot lShin -0.7 -45.1 -5.1; *lFoot 1.1 -3.7 12.1; rButtock hip -8.8 4.4 1.2; rThigh
+rButtock 0 -1.7 -2.2; rShin rThigh 0 -36.8 0.7; rFoot rShin 0.7 -45.1 -5.1; *rFoot -1.1 -3.7 12.1
+"""
+MOTIONBUILDER = """
+Hips - 0 0 0; LHipJoint Hips 0 0 0; LeftUpLeg LHipJoint 1.86 -1.74 0.85; LeftLeg LeftUpLeg 2.37 -6.51 0;
+LeftFoot LeftLeg 2.53 -6.96 0; LeftToeBase LeftFoot 0.16 -0.44 1.95; *LeftToeBase 0 0 1; RHipJoint Hips 0
+0 0; RightUpLeg RHipJoint -1.68 -1.74 0.85; RightLeg RightUpLeg -2.45 -6.72 0; RightFoot RightLeg -2.44
+-6.7 0; RightToeBase RightFoot -0.21 -0.57 2.02; *RightToeBase 0 0 1; LowerBack Hips 0 0 0; Spine
+LowerBack 0 2.24 0; Spine1 Spine 0 2.19 -0.2; Neck Spine1 0 0 0; Neck1 Neck -0.12 1.43 0.28; Head Neck1
+0.18 1.46 -0.33; *Head 0 1.5 0; LeftShoulder Spine1 0 0 0; LeftArm LeftShoulder 3.28 0.86 0.05;
+LeftForeArm LeftArm 4.97 0 0; LeftHand LeftForeArm 3.36 0 0; *LeftHand 0.8 0 0; RightShoulder Spine1 0 0
+0; RightArm RightShoulder -3.24 1.02 0.35; RightForeArm RightArm -5.22 0 0; RightHand RightForeArm -3.37
+0 0; *RightHand -0.6 0 0
+"""
+TREES = {"cmu_daz": DAZ, "cmu_motionbuilder": MOTIONBUILDER}
+FOLDED = ("lButtock", "rButtock", "LHipJoint", "RHipJoint", "Neck1")  # unmapped, between mapped ones
+POSITIONS = ("Xposition", "Yposition", "Zposition")
+ORDERS = [tuple(axis + "rotation" for axis in order) for order in permutations("XYZ")]
+
+
+@dataclass
+class Sample:
+    """A BVH file in the making: joints, and end sites as (joint's index, offset)."""
+
+    names: list[str]
+    parents: list[int]
+    offsets: list[list[float]]
+    ends: list[tuple[int, list[float]]]
+    channels: list[tuple[str, ...]]
+    values: np.ndarray
+
+    def text(
+        self, end: str = "\n", frames: str = "Frames:\t{}", time: str = "Frame Time: {}", dt: str = ""
+    ) -> str:
+        lines = [
+            *["HIERARCHY", *self._joint(0), "MOTION"],
+            *[frames.format(len(self.values)), time.format(dt or "0.00833333")],
+            *[" ".join(map(repr, row)) for row in self.values.tolist()],
+        ]
+        return end.join(lines) + end
+
+    def hierarchy(self) -> Bvh:
+        """What a reader makes of it, without the motion."""
+        ends = tuple(EndSite(self.names[joint] + END, joint, np.array(offset)) for joint, offset in self.ends)
+        tree = (tuple(self.names), tuple(self.parents), np.array(self.offsets), tuple(self.channels), ends)
+        return Bvh(Path("sample.bvh"), *tree, 1 / 120, self.values)
+
+    def _joint(self, joint: int) -> list[str]:
+        lines = [f"{'JOINT' if joint else 'ROOT'} {self.names[joint]}", "{"]
+        lines += ["OFFSET " + " ".join(map(repr, self.offsets[joint]))]
+        lines += [" ".join(["CHANNELS", str(len(self.channels[joint])), *self.channels[joint]])]
+        for parent, offset in self.ends:
+            if parent == joint:
+                lines += ["End Site", "{", "OFFSET " + " ".join(map(repr, offset)), "}"]
+        for child, parent in enumerate(self.parents):
+            if parent == joint:
+                lines += self._joint(child)
+        return [*lines, "}"]
+
+
+def person(skeleton: str, frames: int, seed: int, folded: bool = False) -> Sample:
+    """Frame 0 the zero pose, then random rotations; those between mapped joints only if `folded`."""
+    random = np.random.default_rng(seed)
+    names, parents, offsets, ends = [], [], [], []
+    for entry in TREES[skeleton].replace("\n", " ").split(";"):
+        name, *rest = entry.split()
+        if name.startswith("*"):
+            ends.append((names.index(name[1:]), [float(word) for word in rest]))
+        else:
+            names.append(name)
+            parents.append(-1 if rest[0] == "-" else names.index(rest[0]))
+            offsets.append([float(word) for word in rest[1:]])
+    channels = [ORDERS[random.integers(len(ORDERS))] for _ in names]
+    channels[0] = (*POSITIONS, *channels[0])
+    values = random.uniform(-180, 180, (frames, sum(map(len, channels))))
+    values[0, 3:] = 0
+    for joint, name in enumerate(names):
+        if name in FOLDED and not folded:
+            values[:, 3 + 3 * joint : 6 + 3 * joint] = 0
+    return Sample(names, parents, offsets, ends, channels, values)
+
+
+def mutate(data: bytes, seed: int) -> bytes:
+    """One piece of damage, drawn by the seed."""
+    random = np.random.default_rng(seed)
+    lines, at = data.splitlines(keepends=True), int(random.integers(1, len(data) - 1))
+    line = int(random.integers(len(lines)))
+    kind = seed % 8
+    if kind == 0:  # bits of four bytes
+        flipped = bytearray(data)
+        for place in random.integers(0, len(data), 4):
+            flipped[place] ^= int(random.integers(1, 256))
+        return bytes(flipped)
+    if kind == 1:
+        return data[:at]
+    if kind == 2:
+        return data[:at] + data[at + int(random.integers(1, 60)) :]
+    if kind == 3:
+        return b"".join(lines[:line] + lines[line + 1 :])
+    if kind == 4:
+        other = int(random.integers(len(lines)))
+        lines[line], lines[other] = lines[other], lines[line]
+        return b"".join(lines)
+    if kind == 5:
+        return data[:at] + random.bytes(20) + data[at:]
+    if kind == 6:
+        return b"".join([*lines[: line + 1], lines[line], *lines[line + 1 :]])
+    words = data.split(b" ")
+    number = random.choice([n for n, word in enumerate(words) if word[-1:].isdigit()])
+    wrong = [
+        b"nan",
+        b"inf",
+        b"-1e999",
+        b"1e300",
+        b"word",
+        b"1,5",
+        b"1_0",
+        b"0x10",
+        b"--1",
+        b"1 2",
+        b"",
+        b"\xff",
+    ]
+    words[number] = wrong[random.integers(len(wrong))]
+    return b" ".join(words)
+
+
+def write(folder: Path, text: str | bytes, name: str = "clip.bvh") -> Path:
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def read(folder: Path, skeleton: str, frames: int = 5, **options: int) -> Bvh:
+    return read_bvh(write(folder, person(skeleton, frames, **{"seed": 3, **options}).text()))
+
+
+@contextmanager
+def refuse(start: Path | str, *said: str) -> Iterator[None]:
+    """Expect an InputError of one line that begins with `start` and has what is said."""
+    with pytest.raises(InputError) as error:
+        yield
+    message = str(error.value)
+    assert message.startswith(str(start))
+    assert len(message.splitlines()) == 1
+    for part in (*said, "; allowed: "):
+        assert part in message
+
+
+def performed(skeleton: str, clip: Clip, seed: int = 3) -> Sample:
+    """A clip on the built-in body as a BVH file of a shipped skeleton, behind the zero pose.
+
+    What `retarget` makes of it is the clip, but for body joints without a joint in the file, which keep to
+    their parents.
+    """
+    sample, chosen, rest = (
+        person(skeleton, len(clip) + 1, seed),
+        load_skeleton(skeleton),
+        builtin_rest_joints(),
+    )
+    fitted, world = fit(sample.hierarchy(), chosen, rest), Z_UP @ chosen.upright
+    body = body_rotations(clip)
+    turned = {}
+    for joint, node in reversed(list(enumerate(fitted.nodes))):  # of joints that share a node the first
+        turned[int(node)] = world.T @ body[:, joint] @ fitted.corrections[joint].T @ chosen.upright
+    hips = clip.trans + rest[0] - body[:, 0] @ fitted.anchor
+    sample.values[1:, :3] = hips @ world / (fitted.scale * chosen.unit)
+    for joint, parent in enumerate(sample.parents):
+        above = turned[parent] if parent >= 0 else np.eye(3)
+        local = np.swapaxes(np.broadcast_to(above, body[:, 0].shape), 1, 2) @ turned.setdefault(joint, above)
+        order = "".join(channel[0] for channel in sample.channels[joint][-3:])
+        angles = Rotation.from_matrix(local).as_euler(order, degrees=True)
+        sample.values[1:, 3 + 3 * joint : 6 + 3 * joint] = angles
+    return sample
+
+
+def body_rotations(clip: Clip) -> np.ndarray:
+    """Global rotations (N, 22, 3, 3)."""
+    local = Rotation.from_rotvec(clip.poses.reshape(-1, 3)).as_matrix().reshape(len(clip), -1, 3, 3)
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        local[:, joint] = local[:, parent] @ local[:, joint]
+    return local

@@ -1,0 +1,94 @@
+"""Rotations against SciPy, gradients at awkward angles, forward kinematics against a plain recursion."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from memmlp.motion import geometry
+from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
+
+ANGLES = (0.0, 1e-9, 1e-7, 1e-3, 1.0, 3.0, math.pi - 1e-4, math.pi - 1e-7, 10.0)
+
+
+def vectors(angle: float, count: int = 50) -> torch.Tensor:
+    axis = np.random.default_rng(0).normal(size=(count, 3))
+    return torch.tensor(angle * axis / np.linalg.norm(axis, axis=-1, keepdims=True))
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_axis_angle_is_scipys(angle):
+    expected = Rotation.from_rotvec(vectors(angle).numpy()).as_matrix()
+    np.testing.assert_allclose(geometry.axis_angle_to_matrix(vectors(angle)).numpy(), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_matrix_to_axis_angle_is_scipys(angle):
+    matrix = Rotation.from_rotvec(vectors(angle).numpy()).as_matrix()
+    expected = Rotation.from_matrix(matrix).as_rotvec()
+    got = geometry.matrix_to_axis_angle(torch.tensor(matrix)).numpy()
+    np.testing.assert_allclose(got, expected, atol=1e-7)
+    assert (np.linalg.norm(got, axis=-1) <= math.pi + 1e-12).all()
+
+
+@pytest.mark.parametrize("angle", [1e-7, 1.0, math.pi - 1e-3, 10.0])
+def test_gradients(angle):
+    assert torch.autograd.gradcheck(
+        geometry.axis_angle_to_matrix, vectors(angle, 3).requires_grad_(), atol=1e-5
+    )
+
+
+def test_sixd_is_two_columns_and_gram_schmidt_of_anything():
+    matrix = torch.tensor(Rotation.random(20, rng=0).as_matrix())
+    sixd = geometry.matrix_to_sixd(matrix)
+    assert torch.equal(sixd[:, :3], matrix[:, :, 0])
+    assert torch.equal(sixd[:, 3:], matrix[:, :, 1])
+    torch.testing.assert_close(geometry.sixd_to_matrix(sixd), matrix)
+    stretched = torch.cat([1.7 * sixd[:, :3], 0.4 * sixd[:, 3:] + 0.3 * sixd[:, :3]], -1)
+    torch.testing.assert_close(geometry.sixd_to_matrix(stretched), matrix)
+
+
+def test_sixd_of_exactly_three_rows():
+    """torch.cross without `dim` goes wrong on 3 x 3."""
+    matrix = torch.tensor(Rotation.random(3, rng=1).as_matrix())
+    torch.testing.assert_close(geometry.sixd_to_matrix(geometry.matrix_to_sixd(matrix)), matrix)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 0.5, 3.1, math.pi])
+def test_geodesic_angle(angle):
+    a = torch.tensor(Rotation.random(50, rng=2).as_matrix())
+    b = a @ geometry.axis_angle_to_matrix(vectors(angle))
+    np.testing.assert_allclose(geometry.geodesic_angle(a, b).numpy(), angle, atol=1e-7)
+
+
+def test_forward_kinematics_is_a_recursion():
+    rng = np.random.default_rng(3)
+    local = Rotation.random(22, rng=3).as_matrix()
+    root, rest = rng.normal(size=3), rng.normal(size=(22, 3))
+
+    def place(joint: int) -> tuple[np.ndarray, np.ndarray]:
+        if joint == 0:
+            return local[0], root
+        rotation, position = place(PARENTS[joint])
+        return rotation @ local[joint], position + rotation @ (rest[joint] - rest[PARENTS[joint]])
+
+    args = (torch.tensor(x)[None] for x in (local, root))
+    rotations, positions = geometry.forward_kinematics(*args, torch.tensor(rest))
+    for joint in range(22):
+        expected = place(joint)
+        np.testing.assert_allclose(rotations[0, joint], expected[0], atol=1e-12)
+        np.testing.assert_allclose(positions[0, joint], expected[1], atol=1e-12)
+
+
+def test_the_built_in_body_is_a_person():
+    rest = dict(zip(JOINTS, builtin_rest_joints(), strict=True))
+    assert (
+        rest["head"][1] > rest["neck"][1] > rest["pelvis"][1] > rest["left_knee"][1] > rest["left_ankle"][1]
+    )
+    for name in JOINTS:
+        if name.startswith("left_"):
+            assert rest[name][0] > 0
+            np.testing.assert_allclose(rest[name] * [-1, 1, 1], rest["right_" + name[5:]])
+    assert 1.5 < rest["head"][1] - rest["left_foot"][1] < 1.7

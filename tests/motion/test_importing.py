@@ -1,0 +1,201 @@
+"""Folders of BVH files -> folders of clips: rates, damaged files, what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bvh_samples import mutate, person, refuse, write
+
+from memmlp.common.errors import InputError
+from memmlp.motion.body import builtin_rest_joints
+from memmlp.motion.bvh import read_bvh
+from memmlp.motion.clip import read_clip
+from memmlp.motion.fidelity import verify_folder
+from memmlp.motion.importing import import_folder
+from memmlp.motion.retarget import retarget
+from memmlp.motion.skeleton import find_skeleton
+
+REST = builtin_rest_joints()
+
+
+# Damaged files
+
+
+def test_damaged_files_are_refused_in_one_line(tmp_path: Path) -> None:
+    """200 pieces of damage: each gives a finite clip or one line that names the file."""
+    data, refused = person("cmu_daz", 4, 7).text().encode(), []
+    for seed in range(200):
+        path = write(tmp_path, mutate(data, seed), f"damaged {seed}.bvh")
+        try:
+            bvh = read_bvh(path)
+            clip = retarget(bvh, find_skeleton(bvh), REST)
+        except InputError as error:
+            refused.append((path, str(error)))
+        else:
+            assert len(clip) > 0
+            assert np.isfinite(clip.poses).all()
+            assert np.isfinite(clip.trans).all()
+    for path, message in refused:
+        assert message.startswith(str(path))
+        assert len(message.splitlines()) == 1
+    assert 150 <= len(refused) < 200
+
+
+# Folders
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    """salsa/01, salsa/02, indian/01 and top.bvh, each of 3 frames at 120 Hz by the header."""
+    for seed, name in enumerate(["salsa/01", "salsa/02", "indian/01", "top"]):
+        write(tmp_path / "source", person("cmu_daz", 3, seed).text("\r\n"), f"{name}.bvh")
+    write(tmp_path / "source", "no motion", "readme.txt")
+    return tmp_path / "source"
+
+
+def rates(out: Path) -> dict[str, float]:
+    files = sorted(out.rglob("*.npz"))
+    return {name: read_clip(path, name).fps for path in files for name in [path.relative_to(out).as_posix()]}
+
+
+def test_import_writes_clips_and_record(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    report = import_folder(source, out)
+    assert rates(out) == {"indian/01.npz": 120, "salsa/01.npz": 60, "salsa/02.npz": 60, "top.npz": 120}
+    assert [clip.source for clip in report.clips] == [
+        "indian/01.bvh",
+        "salsa/01.bvh",
+        "salsa/02.bvh",
+        "top.bvh",
+    ]
+    assert report.notes == ("salsa: 60 Hz, known of salsa in cmu_daz; the header says 120 Hz",)
+    record = json.loads((out / "import.json").read_text())
+    assert [clip["clip"] for clip in record["clips"]] == sorted(rates(out))
+    assert record["clips"][3]["sha256"] == hashlib.sha256((source / "top.bvh").read_bytes()).hexdigest()
+    assert str(tmp_path) not in (out / "import.json").read_text()
+    assert not [path for path in tmp_path.iterdir() if path.name not in ("source", "out")]
+    bvh = read_bvh(source / "salsa/02.bvh")
+    expected = retarget(bvh, find_skeleton(bvh), REST)
+    clip = read_clip(out / "salsa/02.npz", "salsa/02")
+    np.testing.assert_array_equal(clip.poses.astype(np.float32), expected.poses.astype(np.float32))
+
+
+def test_import_twice_is_the_same(source: Path, tmp_path: Path) -> None:
+    first = import_folder(source, tmp_path / "out")
+    record = (tmp_path / "out" / "import.json").read_bytes()
+    assert import_folder(source, tmp_path / "out") == first
+    assert (tmp_path / "out" / "import.json").read_bytes() == record
+
+
+@pytest.mark.parametrize(
+    ("fps", "expected"),
+    [
+        ({"salsa": 100}, [120, 100, 100, 120]),
+        ({"": 50}, [50, 50, 50, 50]),
+        ({"": 50, "salsa": 120}, [50, 120, 120, 50]),
+        ({"indian": 30.5}, [30.5, 60, 60, 120]),
+    ],
+)
+def test_given_rates(source: Path, tmp_path: Path, fps: dict[str, float], expected: list[float]) -> None:
+    report = import_folder(source, tmp_path / "out", fps=fps)
+    assert list(rates(tmp_path / "out").values()) == expected
+    assert [clip.fps for clip in report.clips] == expected
+    assert all("given" in clip.fps_reason for clip in report.clips if clip.fps not in (60, 120))
+    corrected = {Path(clip.source).parent.as_posix() for clip in report.clips if clip.fps != 120}
+    assert {note.split(":")[0] for note in report.notes} == corrected
+
+
+@pytest.mark.parametrize(
+    "fps", [{"waltz": 60}, {"salsa": 0}, {"salsa": float("nan")}, {"": 5000}, {"salsa/": 60}]
+)
+def test_wrong_rates_are_refused(source: Path, tmp_path: Path, fps: dict[str, float]) -> None:
+    with refuse("fps: ", "'indian', 'salsa'"):
+        import_folder(source, tmp_path / "out", fps=fps)
+
+
+def test_known_rate_holds_for_the_folder_or_file_itself(source: Path, tmp_path: Path) -> None:
+    assert import_folder(source / "salsa", tmp_path / "a").clips[0].fps == 60
+    assert import_folder(source / "salsa" / "01.bvh", tmp_path / "b").clips[0].fps == 60
+    assert (tmp_path / "b" / "01.npz").is_file()
+
+
+def test_a_header_that_is_right_is_not_corrected(source: Path, tmp_path: Path) -> None:
+    write(source, person("cmu_daz", 3, 0).text(dt="0.0166667"), "salsa/01.bvh")
+    report = import_folder(source / "salsa/01.bvh", tmp_path / "out")
+    assert (report.clips[0].fps, report.clips[0].fps_reason) == (60, "the header's")
+    assert report.notes == ()
+
+
+def test_bad_files_are_skipped(source: Path, tmp_path: Path) -> None:
+    import_folder(source, tmp_path / "out")
+    write(source, "HIERARCHY", "salsa/01.bvh")
+    report = import_folder(source, tmp_path / "out")
+    assert [skipped.source for skipped in report.skipped] == ["salsa/01.bvh"]
+    assert report.skipped[0].reason.startswith("salsa/01.bvh: no MOTION")
+    assert list(rates(tmp_path / "out")) == ["indian/01.npz", "salsa/02.npz", "top.npz"]
+    assert str(tmp_path) not in (tmp_path / "out" / "import.json").read_text()
+
+
+def test_strict_import_leaves_nothing(source: Path, tmp_path: Path) -> None:
+    write(source, "HIERARCHY", "salsa/01.bvh")
+    with refuse(source / "salsa/01.bvh", "no MOTION"):
+        import_folder(source, tmp_path / "out", strict=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["source"]
+
+
+def test_strict_import_leaves_an_earlier_one_alone(source: Path, tmp_path: Path) -> None:
+    import_folder(source, tmp_path / "out")
+    before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.*")}
+    write(source, person("cmu_daz", 9, 9).text(), "indian/01.bvh")
+    write(source, "HIERARCHY", "top.bvh")
+    with pytest.raises(InputError):
+        import_folder(source, tmp_path / "out", strict=True)
+    assert {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.*")} == before
+
+
+def test_nothing_to_import_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    for source in (tmp_path / "empty", tmp_path / "missing", write(tmp_path, "", "clip.txt")):
+        with refuse(source):
+            import_folder(source, tmp_path / "out")
+        with refuse(source):
+            verify_folder(source)
+    for name in ("a", "b"):
+        write(tmp_path / "bad", "HIERARCHY", f"{name}.bvh")
+    with pytest.raises(InputError, match=r"no usable BVH file of 2; the first: a\.bvh"):
+        import_folder(tmp_path / "bad", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_files_of_one_clip_are_refused(source: Path, tmp_path: Path) -> None:
+    write(source, person("cmu_daz", 3, 0).text(), "salsa/01.BVH")
+    if len(list((source / "salsa").iterdir())) == 2:
+        pytest.skip("the file system does not tell 01.bvh from 01.BVH")
+    with refuse("salsa/01", "2 BVH files"):
+        import_folder(source, tmp_path / "out")
+
+
+def test_foreign_clips_in_out_are_refused(source: Path, tmp_path: Path) -> None:
+    write(tmp_path / "out", "", "walk/01.npz")
+    with refuse(tmp_path / "out", "walk/01.npz"):
+        import_folder(source, tmp_path / "out")
+    with refuse(source / "top.bvh", "is a file"):
+        import_folder(source, source / "top.bvh")
+
+
+def test_verify_folder_names_files(source: Path) -> None:
+    found = verify_folder(source, skeleton="cmu_daz")
+    assert [fidelity.name for fidelity in found] == [
+        "indian/01.bvh",
+        "salsa/01.bvh",
+        "salsa/02.bvh",
+        "top.bvh",
+    ]
+    assert max(fidelity.worst_mm for fidelity in found) < 0.01
+    write(source, "HIERARCHY", "salsa/01.bvh")
+    with refuse(source / "salsa/01.bvh", "no MOTION"):
+        verify_folder(source)

@@ -1,0 +1,231 @@
+"""Caches: content, manifest, bad files, digests, interruption, concurrency; frames, segments, sampling."""
+
+import json
+import multiprocessing
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from memmlp.common.errors import InputError
+from memmlp.motion import prepare as module
+from memmlp.motion.body import builtin_rest_joints
+from memmlp.motion.clip import Clip, write_clip
+from memmlp.motion.dataset import Frames, WindowSampler
+from memmlp.motion.features import motion_frames
+from memmlp.motion.prepare import Manifest, Source, prepare
+from memmlp.motion.splits import SeededSplit
+from memmlp.runs.recipes import RECIPES
+
+
+def motion(length: int, seed: int, fps: float = 60.0) -> Clip:
+    rng = np.random.default_rng(seed)
+    poses = 0.1 * np.cumsum(rng.normal(size=(length, 22, 3)), 0)
+    return Clip(f"a/{seed}", poses, 0.01 * np.cumsum(rng.normal(size=(length, 3)), 0), fps)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    for seed in range(10):
+        write_clip(
+            tmp_path / "clips" / "a" / f"{seed}.npz", motion(60 + seed, seed, 120 if seed == 3 else 60)
+        )
+    return tmp_path / "clips"
+
+
+def source(root: Path, **changes) -> Source:
+    return replace(Source(root, SeededSplit(0.2, 0.2), min_frames=20), **changes)
+
+
+def test_the_cache_holds_the_clips_frames(root, tmp_path):
+    manifest = prepare(source(root), tmp_path / "cache")
+    assert manifest == Manifest.load(tmp_path / "cache")
+    assert {name: total["clips"] for name, total in manifest.totals.items()} == {
+        "train": 6,
+        "val": 2,
+        "test": 2,
+    }
+    rest = torch.tensor(builtin_rest_joints())
+    for record in manifest.clips:
+        seed = int(record.name.split("/")[1])
+        clip = motion(60 + seed, seed)
+        step = 2 if seed == 3 else 1
+        assert record.resampling == ("every 2. frame" if seed == 3 else "kept")
+        poses, trans = (x[::step].astype(np.float32).astype(np.float64) for x in (clip.poses, clip.trans))
+        expected = motion_frames(torch.tensor(poses), torch.tensor(trans), rest).float()
+        split = Frames.open(tmp_path / "cache", record.split)
+        torch.testing.assert_close(split.clip(split.names.index(record.name)), expected, atol=1e-5, rtol=0)
+
+
+def test_bad_files_are_skipped_with_a_reason_or_stop(root, tmp_path):
+    (root / "a" / "broken.npz").write_bytes(b"PK broken")
+    write_clip(root / "a" / "short.npz", motion(5, 99))
+    np.savez(root / "a" / "shape.npz", betas=np.zeros(16))
+    manifest = prepare(source(root), tmp_path / "cache")
+    assert {Path(file.file).name for file in manifest.skipped} == {"broken.npz", "short.npz"}
+    assert all(file.reason and "\n" not in file.reason for file in manifest.skipped)
+    assert manifest.ignored == 1
+    assert len(manifest.clips) == 10
+    with pytest.raises(InputError, match="npz"):
+        prepare(source(root, strict=True), tmp_path / "strict")
+    assert not (tmp_path / "strict" / "manifest.json").exists()
+
+
+def test_unchanged_sources_are_not_read_again(root, tmp_path, monkeypatch):
+    first = prepare(source(root), tmp_path / "cache")
+
+    def no_reading(*args):
+        raise AssertionError("read a clip")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "read_clip", no_reading)
+        assert prepare(source(root), tmp_path / "cache") == first
+    write_clip(root / "a" / "3.npz", motion(90, 77))
+    assert prepare(source(root), tmp_path / "cache").digest != first.digest
+
+
+def test_the_digest_knows_every_ingredient(root, tmp_path):
+    base = prepare(source(root), tmp_path / "0").digest
+    copy = tmp_path / "elsewhere"
+    shutil.copytree(root, copy)
+    assert prepare(source(copy), tmp_path / "1").digest == base
+    body = builtin_rest_joints() * 1.1
+    model = tmp_path / "model.npz"
+    parents = np.array([[-1, *module.load_rest_joints.__globals__["PARENTS"][1:]], range(22)])
+    np.savez(model, J_regressor=np.eye(22), v_template=body, kintree_table=parents)
+    others = [source(root, split=SeededSplit(0.2, 0.2, seed=1)), source(root, body=str(model))]
+    digests = {prepare(other, tmp_path / f"x{i}").digest for i, other in enumerate(others)}
+    (root / "a" / "9.npz").unlink()
+    digests.add(prepare(source(root), tmp_path / "y").digest)
+    assert len(digests | {base}) == 4
+
+
+def test_an_interrupted_prepare_is_redone(root, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_write_manifest", lambda *args: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            prepare(source(root), tmp_path / "cache")
+    with pytest.raises(InputError):
+        Manifest.load(tmp_path / "cache")
+    assert len(prepare(source(root), tmp_path / "cache").clips) == 10
+
+
+def _digest(args: tuple[Path, Path]) -> str:
+    return prepare(source(args[0]), args[1]).digest
+
+
+def test_two_processes_at_once(root, tmp_path):
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        digests = pool.map(_digest, [(root, tmp_path / "cache")] * 2)
+    assert len(set(digests)) == 1
+    assert Manifest.load(tmp_path / "cache").digest == digests[0]
+
+
+def test_the_manifest_has_no_absolute_path(root, tmp_path):
+    prepare(source(root), tmp_path / "cache")
+    assert str(tmp_path) not in json.dumps(json.loads((tmp_path / "cache" / "manifest.json").read_text()))
+
+
+def test_every_clip_knows_its_group(root, tmp_path):
+    """Ties are transitive: 1, 2 and 3 are one group through two patterns, and named after its first clip."""
+    tied = SeededSplit(0.2, 0.2, groups=["a/[12]$", "a/[23]$"])
+    manifest = prepare(source(root, split=tied), tmp_path / "cache")
+    expected = {f"a/{n}": "a/1" if n in (1, 2, 3) else f"a/{n}" for n in range(10)}
+    assert manifest.groups == expected
+    assert Manifest.load(tmp_path / "cache").groups == expected
+    for part in ("train", "val", "test"):
+        frames = Frames.open(tmp_path / "cache", part).to("cpu")
+        assert frames.groups == [expected[name] for name in frames.names]
+    alone = prepare(source(root), tmp_path / "alone")
+    assert alone.groups == {name: name for name in expected}
+
+
+def test_other_groups_make_the_cache_anew_and_no_run(root, tmp_path):
+    """Where the split is the same, the digest that runs are known by is."""
+    tied = SeededSplit(0, 0, groups=["a/[12]$"])
+    first, second = (
+        prepare(source(root, split=split), tmp_path / "cache") for split in (SeededSplit(0, 0), tied)
+    )
+    assert {clip.split for clip in (*first.clips, *second.clips)} == {"train"}
+    assert first.digest == second.digest
+    assert (first.groups["a/2"], second.groups["a/2"]) == ("a/2", "a/1")
+
+
+def test_a_cache_from_before_there_were_groups_is_made_anew(root, tmp_path):
+    path = tmp_path / "cache" / "manifest.json"
+    first = prepare(source(root), tmp_path / "cache")
+    old = json.loads(path.read_text())
+    old["format"] = 1
+    for clip in old["clips"]:
+        del clip["group"]
+    path.write_text(json.dumps(old))
+    with pytest.raises(InputError, match="format 1, not 2; prepare the data again"):
+        Manifest.load(tmp_path / "cache")
+    assert prepare(source(root), tmp_path / "cache") == first
+
+
+def test_the_manifest_names_the_body(root, tmp_path):
+    """Model files of all bodies have one name: a digest of the rest pose tells them apart."""
+    names = [prepare(source(root), tmp_path / "builtin").body]
+    parents = np.array([[-1, *module.load_rest_joints.__globals__["PARENTS"][1:]], range(22)])
+    for size in (0.9, 1.1):
+        model = tmp_path / str(size) / "model.npz"
+        model.parent.mkdir()
+        body = builtin_rest_joints() * size
+        np.savez(model, J_regressor=np.eye(22), v_template=body, kintree_table=parents)
+        names.append(prepare(source(root, body=str(model)), tmp_path / f"cache{size}").body)
+    assert names[0] == "builtin"
+    assert all(re.fullmatch(r"model\.npz [0-9a-f]{8}", name) for name in names[1:])
+    assert len(set(names)) == 3
+
+
+def test_nothing_to_prepare_is_one_line(tmp_path):
+    (tmp_path / "empty").mkdir()
+    for where in ("none", "empty"):
+        with pytest.raises(InputError, match=r"data\.root"):
+            prepare(source(tmp_path / where), tmp_path / "cache")
+
+
+@pytest.fixture
+def frames() -> Frames:
+    lengths = torch.tensor([5, 12, 30])
+    numbers = torch.arange(47.0)[:, None].expand(-1, 252)
+    return Frames(numbers, torch.tensor([0, 5, 17]), lengths, ["a", "b", "c"])
+
+
+def test_segments_end_where_asked_and_repeat_the_first_frame(frames):
+    segments = frames.segments(torch.tensor([0, 1, 2]), torch.tensor([2, 11, 29]), 4)[..., 0]
+    assert segments.tolist() == [[0, 0, 1, 2], [13, 14, 15, 16], [43, 44, 45, 46]]
+
+
+def test_the_sampler_draws_every_window_alike_and_the_step_is_its_position(frames):
+    sampler = WindowSampler(frames, batch=200, window=6, seed=0)
+    seen: dict[tuple[int, int], int] = {}
+    for step in range(60):
+        for pair in zip(*(x.tolist() for x in sampler.draw(step)), strict=True):
+            seen[pair] = seen.get(pair, 0) + 1
+    possible = {(0, 4)} | {(1, end) for end in range(5, 12)} | {(2, end) for end in range(5, 30)}
+    assert set(seen) == possible  # the last windows (2, 29) and (1, 11) among them
+    expected = 60 * 200 / len(possible)
+    assert all(0.7 * expected < count < 1.3 * expected for count in seen.values())
+    again = WindowSampler(frames, batch=200, window=6, seed=0)
+    assert all(torch.equal(a, b) for a, b in zip(sampler.draw(7), again.draw(7), strict=True))
+    assert not torch.equal(sampler.draw(7)[1], WindowSampler(frames, 200, 6, seed=1).draw(7)[1])
+    clips = WindowSampler(frames, batch=3000, window=6, seed=0, weighting="clips").draw(0)[0]
+    assert torch.bincount(clips).min() > 800
+
+
+def test_frames_of_an_older_recipe_are_made_again(root, tmp_path, monkeypatch):
+    """A run of a new recipe of the features is trained on what the new code makes."""
+    first = prepare(source(root), tmp_path / "cache")
+    made = (tmp_path / "cache" / "train.npy").stat().st_mtime_ns
+    prepare(source(root), tmp_path / "cache")
+    assert (tmp_path / "cache" / "train.npy").stat().st_mtime_ns == made
+    monkeypatch.setitem(RECIPES, "features", RECIPES["features"] + 1)
+    again = prepare(source(root), tmp_path / "cache")
+    assert (tmp_path / "cache" / "train.npy").stat().st_mtime_ns > made
+    assert again.digest == first.digest

@@ -1,0 +1,144 @@
+"""Skeleton maps: the shipped ones, which is chosen, a user's own, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from bvh_samples import TREES, person, read, refuse, write
+
+from memmlp.common.errors import InputError
+from memmlp.motion.body import builtin_rest_joints
+from memmlp.motion.bvh import read_bvh
+from memmlp.motion.importing import import_folder
+from memmlp.motion.retarget import fit, retarget
+from memmlp.motion.skeleton import SKELETONS, find_skeleton, load_skeleton, shipped_skeletons
+
+REST = builtin_rest_joints()
+
+
+def test_shipped_maps() -> None:
+    assert shipped_skeletons() == ("cmu_daz", "cmu_motionbuilder")
+    for name in shipped_skeletons():
+        assert load_skeleton(name).name == name
+
+
+@pytest.mark.parametrize("skeleton", TREES)
+def test_units_give_people(tmp_path: Path, skeleton: str) -> None:
+    own = fit(read(tmp_path, skeleton), load_skeleton(skeleton), REST).own_rest
+    assert 0.75 < sum(np.linalg.norm(own[child] - own[joint]) for joint, child in ((1, 4), (4, 7))) < 0.9
+
+
+@pytest.mark.parametrize("skeleton", TREES)
+def test_the_joints_choose_the_map(tmp_path: Path, skeleton: str) -> None:
+    bvh = read(tmp_path, skeleton)
+    assert find_skeleton(bvh).name == skeleton
+    assert [set(load_skeleton(name).joints.values()) <= set(bvh.nodes) for name in TREES].count(True) == 1
+
+
+def test_unknown_skeleton_lists_joints_and_maps(tmp_path: Path) -> None:
+    path = write(tmp_path, person("cmu_daz", 2, 0).text().replace("lShin", "shinbone"))
+    with refuse(path, "shinbone", "rThigh", "cmu_daz, cmu_motionbuilder"):
+        find_skeleton(read_bvh(path))
+
+
+def test_a_file_of_two_skeletons_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("one", "two"):
+        (tmp_path / f"{name}.yaml").write_text((SKELETONS / "cmu_daz.yaml").read_text())
+    monkeypatch.setattr("memmlp.motion.skeleton.SKELETONS", tmp_path)
+    with refuse(tmp_path, "more than one"):
+        find_skeleton(read(tmp_path, "cmu_daz"))
+
+
+def test_a_map_of_other_joints_is_refused(tmp_path: Path) -> None:
+    bvh, chosen = read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz")
+    with refuse(bvh.path, "Hips"):
+        fit(bvh, load_skeleton("cmu_motionbuilder"), REST)
+    swapped = chosen.joints | {"left_knee": "lFoot", "left_ankle": "lShin"}
+    with refuse(bvh.path, "lShin is not below lFoot"):
+        fit(bvh, replace(chosen, joints=swapped), REST)
+
+
+def test_a_zero_pose_that_does_not_stand_is_refused(tmp_path: Path) -> None:
+    bvh, chosen = read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz")
+    behind = replace(bvh, offsets=bvh.offsets * [-1, 1, -1])
+    with refuse(bvh.path, "left_shoulder", "T-pose"):
+        fit(behind, chosen, REST)
+    with refuse(bvh.path, "0 m"):
+        fit(replace(bvh, offsets=bvh.offsets * 0), chosen, REST)
+
+
+def test_a_unit_out_of_this_world_is_refused(tmp_path: Path) -> None:
+    bvh = read(tmp_path, "cmu_daz")
+    with refuse(bvh.path, "10000 m"):
+        retarget(replace(bvh, values=bvh.values * 1e4), load_skeleton("cmu_daz"), REST)
+
+
+def user_map(folder: Path, **changes: object) -> Path:
+    content = yaml.safe_load((SKELETONS / "cmu_daz.yaml").read_text()) | {"name": "mine"} | changes
+    path = folder / "mine.yaml"
+    path.write_text(yaml.safe_dump({key: value for key, value in content.items() if value is not None}))
+    return path
+
+
+def test_a_users_map(tmp_path: Path) -> None:
+    path = user_map(tmp_path, unit=0.02, calibration_frame=False, rates=None)
+    assert load_skeleton(str(path)).unit == 0.02
+    report = import_folder(
+        write(tmp_path, person("cmu_daz", 4, 0).text()), tmp_path / "out", skeleton=str(path)
+    )
+    assert [(clip.skeleton, clip.frames) for clip in report.clips] == [("mine", 4)]
+
+
+JOINTS_OF_DAZ = load_skeleton("cmu_daz").joints
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"unit": "cm"}, "unit"),
+        ({"unit": 0}, "unit"),
+        ({"unit": float("nan")}, "unit"),
+        ({"unit": True}, "unit"),
+        ({"unit": None}, "keys"),
+        ({"up": "x"}, "y or z"),
+        ({"calibration_frame": 1}, "true or false"),
+        ({"rates": {"salsa": 0}}, "rates.salsa"),
+        ({"rates": {4: 60}}, "rates.4"),
+        ({"rates": [60]}, "rates"),
+        ({"name": 3}, "name"),
+        ({"colour": "red"}, "keys"),
+        ({"joints": "all"}, "joints"),
+        ({"joints": {}}, "joints.pelvis"),
+        ({"joints": JOINTS_OF_DAZ | {"tail": "hip"}}, "joints.tail"),
+        ({"joints": JOINTS_OF_DAZ | {"head": True}}, "joints.head"),
+        ({"joints": JOINTS_OF_DAZ | {"head": "neck"}}, "neck"),
+    ],
+)
+def test_wrong_maps_are_refused(tmp_path: Path, changes: dict[str, object], said: str) -> None:
+    path = user_map(tmp_path, **changes)
+    with refuse(path, said):
+        load_skeleton(str(path))
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[", "a: 1\na: 2", "!!python/name:os.system", "[" * 1500, "\0", "- 1", "{{}: 1}"]
+)
+def test_maps_that_are_none_are_refused(tmp_path: Path, text: str) -> None:
+    path = write(tmp_path, text, "mine.yaml")
+    with pytest.raises(InputError, match=r"\A[^\n]*mine\.yaml[^\n]*\Z"):
+        load_skeleton(str(path))
+
+
+def test_a_key_that_stands_twice_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, user_map(tmp_path).read_text() + "\nunit: 0.02\n", "mine.yaml")
+    with refuse(path, "'unit' stands twice"):
+        load_skeleton(str(path))
+
+
+def test_a_map_that_is_missing_is_refused(tmp_path: Path) -> None:
+    with refuse("skeleton: ", "cmu_daz, cmu_motionbuilder"):
+        load_skeleton(str(tmp_path / "none.yaml"))

@@ -1,0 +1,192 @@
+"""The embedded data set: reproducible, in AMASS' layout, and of plausible people."""
+
+from functools import cache
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from memmlp.common.errors import InputError
+from memmlp.motion.body import JOINTS, builtin_rest_joints
+from memmlp.motion.clip import Clip, read_clip
+from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics, geodesic_angle
+from memmlp.motion.synthetic import ACTIVITIES, synthesize, synthesize_clip
+
+FPS = 60.0
+SEEDS = (0, 1, 2)
+FLYING = {"running", "jumping"}
+BRISK = {"punching": 0.45}  # rad per frame, where a joint may turn faster than elsewhere
+JITTER = {"running": 10.0}  # 1e2 m/s^3
+LIMITS = {
+    "hip": 2.3, "knee": 2.4, "ankle": 1.1, "foot": 0.7, "spine": 0.6, "neck": 0.9, "head": 0.9,
+    "collar": 0.6, "shoulder": 2.8, "elbow": 2.6, "wrist": 1.4,
+}  # fmt: skip
+
+
+@cache
+def performed(activity: str, seed: int) -> tuple[Clip, torch.Tensor, torch.Tensor, np.ndarray]:
+    """A clip, its local and global rotations and its joints' positions."""
+    clip = synthesize_clip(activity, seed, seconds=12.0, fps=FPS)
+    local = axis_angle_to_matrix(torch.from_numpy(clip.poses).double())
+    rest = torch.from_numpy(builtin_rest_joints())
+    rotations, positions = forward_kinematics(local, torch.from_numpy(clip.trans).double(), rest)
+    return clip, local, rotations, positions.numpy()
+
+
+def joint(positions: np.ndarray, name: str) -> np.ndarray:
+    return positions[:, JOINTS.index(name)]
+
+
+def contact(positions: np.ndarray, side: str) -> np.ndarray:
+    """Ball or heel on the floor, by height."""
+    ball, ankle = joint(positions, f"{side}_foot")[:, 2], joint(positions, f"{side}_ankle")[:, 2]
+    return (ball < 0.03) | (ankle < 0.085)
+
+
+def stances(positions: np.ndarray, side: str, part: str) -> list[np.ndarray]:
+    """Ball or ankle (n, 3) through each stretch of 5 frames or more with the ball down, or the foot flat."""
+    heights = {"foot": 0.02, "ankle": 0.075}
+    down = {name: np.abs(joint(positions, f"{side}_{name}")[:, 2] - z) < 1e-4 for name, z in heights.items()}
+    standing = down["foot"] if part == "foot" else down["foot"] & down["ankle"]
+    edges = np.flatnonzero(np.diff(np.r_[0, standing, 0]))
+    stretches = zip(edges[::2], edges[1::2], strict=True)
+    return [joint(positions, f"{side}_{part}")[a:b] for a, b in stretches if b - a >= 5]
+
+
+def poses_of(paths: list[Path]) -> list[bytes]:
+    return [np.load(path)["poses"].tobytes() + np.load(path)["trans"].tobytes() for path in paths]
+
+
+def test_a_seed_gives_the_same_bytes_and_another_gives_others(tmp_path):
+    first, again, other = (
+        synthesize(tmp_path / name, minutes=0.5, seed=seed, fps=20.0)
+        for name, seed in (("a", 3), ("b", 3), ("c", 4))
+    )
+    assert [p.relative_to(tmp_path / "a") for p in first] == [p.relative_to(tmp_path / "b") for p in again]
+    assert poses_of(first) == poses_of(again)
+    assert not set(poses_of(first)) & set(poses_of(other))
+
+
+def test_files_are_in_amass_layout_and_last_as_long_as_asked(tmp_path):
+    paths = synthesize(tmp_path, minutes=3.0, seed=1, fps=20.0)
+    lengths = []
+    for path in paths:
+        activity, number = path.stem.rsplit("_", 1)
+        assert path == tmp_path / activity / f"{activity}_{number}.npz"
+        assert len(number) == 3
+        with np.load(path, allow_pickle=False) as file:
+            assert set(file.files) == {"poses", "trans", "betas", "gender", "mocap_framerate"}
+            assert file["poses"].dtype == file["trans"].dtype == np.float32
+            assert file["poses"].shape[1] == 156
+        clip = read_clip(path, path.stem)
+        assert clip.fps == 20.0
+        lengths.append(len(clip))
+    assert sum(lengths) == 3 * 60 * 20
+    assert min(lengths) > 7 * 20
+    assert max(lengths) < 22 * 20
+    assert {path.parent.name for path in paths} == set(ACTIVITIES)
+    assert len(set(paths)) == len(paths)
+
+
+@pytest.mark.parametrize("seconds", [0.01, 1.0])
+def test_a_little_is_three_short_clips(tmp_path, seconds):
+    """One for each side of a split."""
+    lengths = [len(read_clip(path, path.stem)) for path in synthesize(tmp_path, minutes=seconds / 60)]
+    assert len(lengths) == 3
+    assert sum(lengths) == max(6, seconds * 60)
+    assert min(lengths) >= max(2, 0.6 / 1.4 * sum(lengths) / 5)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("minutes", value) for value in (0.0, -1.0, float("nan"), float("inf"))),
+        *(("fps", value) for value in (0.0, float("nan"), 1e9)),
+        ("seed", -1),
+    ],
+)
+def test_bad_arguments_are_named(tmp_path, key, value):
+    with pytest.raises(InputError, match=f"^{key}: "):
+        synthesize(tmp_path / "out", **{key: value})
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_activity_is_named():
+    with pytest.raises(InputError, match="'flying'; allowed: walking, running"):
+        synthesize_clip("flying", 0)
+
+
+@pytest.mark.parametrize("activity", ACTIVITIES)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_motion_is_smooth(activity, seed):
+    _, local, _, positions = performed(activity, seed)
+    assert geodesic_angle(local[1:], local[:-1]).max() < BRISK.get(activity, 0.35)
+    jitter = np.linalg.norm(np.diff(positions, 3, axis=0), axis=-1).mean() * FPS**3 / 100
+    assert jitter < JITTER.get(activity, 5.0)
+
+
+@pytest.mark.parametrize("activity", ACTIVITIES)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_feet_stay_on_the_floor_where_they_are(activity, seed):
+    positions = performed(activity, seed)[3]
+    feet = np.stack([joint(positions, f"{side}_foot") for side in ("left", "right")])
+    assert feet[..., 2].min() > 0.015
+    touching = contact(positions, "left") | contact(positions, "right")
+    assert (not touching.all()) == (activity in FLYING)
+    assert touching.mean() > 0.4
+    parts = ("foot",) if activity == "running" else ("foot", "ankle")  # a runner's foot is hardly ever flat
+    for side, part in product(("left", "right"), parts):
+        standing = stances(positions, side, part)
+        assert sum(map(len, standing)) > 0.1 * len(positions)
+        assert max(np.linalg.norm(place - place.mean(0), axis=1).max() for place in standing) < 2e-3
+
+
+@pytest.mark.parametrize("activity", ACTIVITIES)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_joints_stay_within_a_persons_range(activity, seed):
+    clip, _, rotations, positions = performed(activity, seed)
+    for name, angles in zip(JOINTS[1:], np.linalg.norm(clip.poses[:, 1:], axis=2).T, strict=True):
+        limit = next(limit for part, limit in LIMITS.items() if part in name)
+        assert angles.max() < limit, name
+    assert joint(clip.poses, "left_knee")[:, 0].min() > 0.0
+    assert joint(clip.poses, "right_knee")[:, 0].min() > 0.0
+    assert joint(clip.poses, "left_elbow")[:, 1].max() < 0.0
+    assert joint(clip.poses, "right_elbow")[:, 1].min() > 0.0
+    assert (joint(positions, "head")[:, 2] > joint(positions, "pelvis")[:, 2] + 0.3).all()
+    assert (rotations[:, 0, 2, 1] > 0.3).all()  # the pelvis is upright
+
+
+@pytest.mark.parametrize("activity", ["walking", "running"])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_arms_swing_against_the_legs(activity, seed):
+    _, _, rotations, positions = performed(activity, seed)
+    forward = rotations[:, 0, :, 2].numpy()
+    for side in ("left", "right"):
+        hand, ankle = (
+            ((joint(positions, f"{side}_{part}") - positions[:, 0]) * forward).sum(1)
+            for part in ("wrist", "ankle")
+        )
+        assert np.corrcoef(hand, ankle)[0, 1] < -0.4
+
+
+def test_flight_is_ballistic():
+    positions = performed("jumping", 0)[3]
+    flying = ~(contact(positions, "left") | contact(positions, "right"))
+    inside = flying[:-6] & flying[3:-3] & flying[6:]
+    fall = np.diff(joint(positions, "pelvis")[:, 2], 2)[2:-2] * FPS**2
+    np.testing.assert_allclose(np.median(fall[inside]), -9.81, rtol=0.05)
+
+
+def test_walks_differ_in_speed_and_direction():
+    speeds, directions = [], []
+    for seed in range(40):
+        trans = synthesize_clip("walking", seed, seconds=6.0, fps=20.0).trans
+        speeds.append(np.median(np.linalg.norm(np.diff(trans[:, :2], axis=0), axis=1)) * 20.0)
+        directions.append(np.arctan2(*(trans[-1] - trans[0])[1::-1]))
+    assert min(speeds) < 0.9
+    assert max(speeds) > 1.5
+    assert np.std(speeds) > 0.2
+    assert np.diff(np.sort(directions)).max() < 1.0
+    assert np.ptp(directions) > 5.0

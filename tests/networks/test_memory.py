@@ -1,0 +1,232 @@
+"""Memories in place of the paper's: recurrent layers, a VQ-VAE trained jointly, blocks in the predictor."""
+
+from functools import partial
+
+import pytest
+import tiny
+import torch
+
+from memmlp.common.errors import InputError
+from memmlp.deploy import latency
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.dataset import WindowSampler
+from memmlp.networks.mem_mlp import MemMLP
+from memmlp.networks.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory
+from memmlp.networks.predictor import RotationOnlyMemory, TwoBranchMemory
+from memmlp.networks.vqvae import VQVAE
+from memmlp.runs.run import Run
+from memmlp.training.loop import train
+from memmlp.training.losses import HandPosition, MotionLoss, Uncertainty, l1
+from memmlp.training.network import MotionTask
+from memmlp.training.optim import Optim
+from memmlp.training.rollout import OwnPredictions, PersistentStreams, TeacherForcing
+
+RECURRENT = [LSTMMemory, GRUMemory]
+SPARSE = tiny.clip(35)[None, :, :SPARSE_DIM]
+SPLIT = tiny.frames((60, 90))
+
+
+def outputs(model: MemMLP, sparse: torch.Tensor, new: int) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    """The last window's motion and the state after taking the frames in `new` at a time."""
+    state = model.initial_state(len(sparse))
+    for part in sparse.split(new, 1):
+        motion, state = model.advance(part, state)
+    return motion, state
+
+
+@pytest.mark.parametrize("predictor", [None, TwoBranchMemory])
+@pytest.mark.parametrize("new", [2, 5, 7])
+@pytest.mark.parametrize("kind", RECURRENT)
+@torch.no_grad()
+def test_a_recurrent_stream_is_the_same_however_it_is_cut(kind, new, predictor):
+    """Frame by frame, by a few and by whole windows: the recurrence runs once over each frame."""
+    model = tiny.model(kind, **{"predictor": predictor} if predictor else {})
+    one, state = outputs(model, SPARSE, 1)
+    some, after = outputs(model, SPARSE, new)
+    torch.testing.assert_close(one, some, atol=1e-5, rtol=0)
+    torch.testing.assert_close(state, after, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("kind", RECURRENT)
+@torch.no_grad()
+def test_the_recurrent_feature_is_norm_layer_silu_over_the_whole_stream(kind):
+    """An independent re-derivation: torch's layer over all frames from zeros."""
+    model = tiny.model(kind)
+    seen = []
+    model.blocks[1].register_forward_hook(lambda module, args, output: seen.append(args[1]))
+    outputs(model, SPARSE, 1)
+    encoded = model.frame.encode_sparse(SPARSE, model.frame.place(SPARSE))
+    first = model.memory.recurrences[0]
+    expected = torch.nn.functional.silu(first.layer(first.norm(encoded))[0])
+    block = model.blocks[1]
+    torch.testing.assert_close(block.feature(seen[-1]), expected[:, -model.frames :], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("kind", RECURRENT)
+def test_teacher_forcing_starts_the_hidden_state_from_the_input_before_the_window(kind):
+    model = tiny.model(kind).train()
+    sampler = WindowSampler(SPLIT, batch=5, window=7, seed=0)
+    call = TeacherForcing().draw(model, SPLIT, sampler, 0)
+    clips, end = sampler.draw(0)
+    assert torch.equal(call.sparse, SPLIT.segments(clips, end, 7)[..., :SPARSE_DIM])
+    before = SPLIT.segments(clips, end - 7, 1)
+    encoded = model.frame.encode(before)[:, 0, :SPARSE_DIM]
+    layer = model.memory.recurrences[1]
+    torch.testing.assert_close(call.state["hidden"][:, 1], layer.first(layer.norm(encoded)))
+    assert all(float(call.state[name].abs().sum()) == 0 for name in set(call.state) & {"cell", "features"})
+    model.advance(call.sparse, call.state)[0].square().sum().backward()
+    assert [name for name, p in model.named_parameters() if p.grad is None] == []
+
+
+@pytest.mark.parametrize("kind", RECURRENT)
+def test_other_rollouts_carry_the_recurrent_state_on(kind):
+    sampler = WindowSampler(SPLIT, batch=5, window=7, seed=0)
+    model = tiny.model(kind)
+    torch.manual_seed(next(seed for seed in range(99) if passes(seed) > 0))
+    own = OwnPredictions(2).draw(model, SPLIT, sampler, 0)
+    assert float(own.state["hidden"].abs().sum()) > 0
+    streams = PersistentStreams(5)
+    streams.begin(model)
+    first = streams.draw(model, SPLIT, sampler, 0)
+    assert float(first.state["hidden"].abs().sum()) == 0
+    _, state = model.advance(first.sparse, first.state)
+    streams.keep(state)
+    ends, clips = streams.end.clone(), streams.clip.clone()
+    second = streams.draw(model, SPLIT, sampler, 1)
+    going = ends + model.frames < SPLIT.lengths[clips]
+    assert going.any()
+    assert torch.equal(second.state["hidden"][going], state["hidden"][going])
+
+
+def passes(seed: int) -> int:
+    torch.manual_seed(seed)
+    return int(torch.randint(3, ()))
+
+
+@pytest.mark.parametrize(("kind", "gates"), [(LSTMMemory, 4), (GRUMemory, 3)])
+@torch.no_grad()
+def test_the_recurrence_costs_one_step_a_frame(kind, gates):
+    """Counted by hand: each of two layers sees the new frame alone, the memory blocks the window."""
+    model, plain = tiny.model(kind), tiny.model(NoMemory)
+    extra = latency.macs(model) - latency.macs(plain)
+    width, fused = 6, 2 * model.frames * 6 * model.hidden
+    assert extra == fused + 2 * gates * width * (SPARSE_DIM + width)
+
+
+@pytest.mark.parametrize("rollout", [TeacherForcing, lambda: PersistentStreams(6)])
+@pytest.mark.parametrize("kind", [*RECURRENT, JointCodeMemory])
+def test_every_memory_trains_in_bfloat16(kind, rollout, tmp_path):
+    model, made = tiny.model(kind), rollout()
+    if isinstance(made, PersistentStreams):
+        made.begin(model)
+    loss = MotionLoss(Uncertainty(), HandPosition(), model.predictor.branches)
+    optim = Optim(steps=3, batch=3, lr=1e-3, precision="bf16", log_every=1)
+    task = MotionTask(model, loss, made, SPLIT, optim, 0, validate=lambda model: {})
+    train(task, optim, Run(tmp_path), 0, "bf16")
+    assert len(Run(tmp_path).metrics()) >= 3
+    assert all(torch.isfinite(p).all() for p in model.parameters())
+
+
+def joint_task(codebook: str = "ema") -> MotionTask:
+    """A tiny network with a VQ-VAE of its own, and its training."""
+    vqvae = partial(VQVAE, codes=8, width=12, encoder_depth=2, codebook=codebook)
+    model = tiny.model(JointCodeMemory, vqvae=vqvae).train()
+    weighted = MotionLoss(Uncertainty(), HandPosition(), model.predictor.branches)
+    optim = Optim(steps=3, batch=5, lr=1e-2)
+    return MotionTask(model, weighted, TeacherForcing(), SPLIT, optim, 0, validate=lambda model: {})
+
+
+@pytest.mark.parametrize("codebook", ["ema", "gradient"])
+def test_joint_training_adds_the_vqvaes_own_terms_unweighted(codebook):
+    task = joint_task(codebook)
+    result = task.step(0)
+    own = {"vqvae_rotation", "vqvae_codebook"}
+    assert own <= set(result.terms)
+    assert own.isdisjoint(task.loss.weighting.weights())
+    weighted = task.loss.weighting({n: t for n, t in result.terms.items() if n not in own})
+    torch.testing.assert_close(result.loss, weighted + sum(result.terms[name] for name in own))
+    result.loss.backward()
+    learned = {name for name, p in task.model.named_parameters() if p.requires_grad and p.grad is not None}
+    assert {name for name, _ in task.model.named_parameters()} == learned
+    assert ("memory.codes.codebook.vectors" in learned) == (codebook == "gradient")
+
+
+def test_the_networks_loss_reaches_the_joint_encoder_straight_through():
+    task = joint_task()
+    task.step(0)  # puts the codes onto data
+    call = task.rollout.draw(task.model, SPLIT, task.sampler, 1)
+    vqvae = task.model.memory.codes
+
+    def gradient() -> float:
+        task.model.zero_grad()
+        task.model.advance(call.sparse, call.state)[0].square().sum().backward()
+        return float(vqvae.encoder[0].weight.grad.abs().sum())
+
+    assert gradient() > 0
+    assert all(p.grad is None for p in vqvae.decoder.parameters())
+
+
+@torch.no_grad()
+def test_joint_codes_are_entries_of_the_codebook_and_a_frozen_copy_gives_the_same():
+    joint = tiny.model(JointCodeMemory)
+    frozen = tiny.model(CodeMemory)
+    frozen.load_state_dict(joint.state_dict())
+    torch.testing.assert_close(outputs(joint, SPARSE, 1)[0], outputs(frozen, SPARSE, 1)[0])
+    sparse, motion = torch.randn(2, 7, 54), torch.randn(2, 7, 198)
+    codes = joint.memory.code_vectors(sparse, motion)
+    assert (codes[..., None, :] == joint.memory.codes.codebook.vectors).all(-1).any(-1).all()
+
+
+@torch.no_grad()
+def test_the_vqvaes_terms_are_eq_1_in_the_worlds_units_and_the_codebooks_loss():
+    model = tiny.vqvae()
+    frames = tiny.frame().encode(tiny.clip(20))
+    latent = model.encoder(frames)
+    nearest = torch.cdist(latent, model.codebook.vectors).argmin(-1)
+    model.codebook.started.fill_(True)
+    rotations = model.decoder(model.codebook.vectors[nearest])
+    std, mean = (tensor[54:186] for tensor in (tiny.frame().std, tiny.frame().mean))
+    place = tiny.frame().place(tiny.clip(20)[:, :54])
+    truth = tiny.frame().coordinates.motion_in(tiny.clip(20)[:, 54:], place)[:, :132]
+    expected = l1((rotations * std + mean - truth)[:, None])
+    terms, indices = model.loss_terms(frames, tiny.frame())
+    torch.testing.assert_close(terms["rotation"], expected, rtol=1e-5, atol=0)
+    assert torch.equal(indices, nearest)
+    assert set(terms) == {"rotation", "codebook"}
+
+
+def test_parameters_count_a_joint_vqvae_and_not_a_frozen_one():
+    joint, frozen = tiny.model(JointCodeMemory), tiny.model(CodeMemory)
+    vqvae = sum(p.numel() for p in joint.memory.codes.parameters())
+    assert vqvae > 0
+    assert joint.count_parameters() == frozen.count_parameters() + vqvae
+
+
+@pytest.mark.parametrize("predictor", [TwoBranchMemory, RotationOnlyMemory])
+@pytest.mark.parametrize("kind", [NoCodesMemory, CodeMemory, JointCodeMemory, LSTMMemory, GRUMemory])
+@torch.no_grad()
+def test_the_branches_look_at_the_memory(kind, predictor):
+    """With the backbone's own memory blocks out of the way: the past changes the output all the same."""
+    model = tiny.model(kind, predictor, layers=())
+    _, state = outputs(model, SPARSE[:, :20], 7)
+    blank = {
+        name: torch.zeros_like(t) if name not in ("sparse", "started") else t for name, t in state.items()
+    }
+    following = SPARSE[:, 20:21]
+    with_past, without = model.advance(following, state)[0], model.advance(following, blank)[0]
+    assert not torch.allclose(with_past, without, atol=1e-5)
+
+
+def test_no_memory_has_no_blocks_for_the_branches():
+    with pytest.raises(InputError, match="memory=none"):
+        tiny.model(NoMemory, TwoBranchMemory)
+
+
+@torch.no_grad()
+def test_m_at_inference_can_be_changed_in_a_trained_network():
+    model, other = tiny.model(blend=0.5), tiny.model(blend=1.0)
+    before = outputs(model, SPARSE, 1)[0]
+    model.memory.blend.value = 1.0
+    after = outputs(model, SPARSE, 1)[0]
+    assert not torch.allclose(before, after, atol=1e-5)
+    assert torch.equal(after, outputs(other, SPARSE, 1)[0])

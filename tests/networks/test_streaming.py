@@ -1,0 +1,113 @@
+"""The live stream computes what the trained network does, with less work."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import pytest
+import tiny
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from memmlp.common.errors import InputError
+from memmlp.deploy.export import export
+from memmlp.deploy.parity import parity
+from memmlp.deploy.session import OnnxStream
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.coordinates import Heading, HeadRelative, World
+from memmlp.networks.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory
+from memmlp.networks.predictor import RotationOnly, TwoBranch, TwoBranchMemory
+from memmlp.networks.streaming import Stream, streaming
+
+MEMORIES = [
+    (NoMemory, {}),
+    (NoCodesMemory, {"shift": "frame"}),
+    (CodeMemory, {"shift": "frame"}),
+    (CodeMemory, {"shift": "window"}),
+    (CodeMemory, {"fusion": "plain", "blend": 0.2}),
+    (JointCodeMemory, {}),
+    (LSTMMemory, {}),
+    (GRUMemory, {"fusion": "plain"}),
+]
+CLIP = tiny.clip(40)[None, :, :SPARSE_DIM]
+
+
+def largest_difference(model, sparse: torch.Tensor) -> float:
+    """Over a stream of (1, N, 54), each with its own history."""
+    live = streaming(model)
+    whole, carried, worst = model.initial_state(1), live.initial_state(), 0.0
+    for frame in sparse.split(1, 1):
+        expected, whole = model.advance(frame, whole, 1)
+        found, carried = live.advance(frame, carried)
+        worst = max(worst, float((expected - found).abs().max()))
+    return worst
+
+
+@pytest.mark.parametrize("predictor", [TwoBranch, RotationOnly, TwoBranchMemory])
+@pytest.mark.parametrize(("kind", "changes"), MEMORIES)
+@torch.no_grad()
+def test_the_stream_is_the_network(kind, changes, predictor):
+    if kind is NoMemory and predictor is TwoBranchMemory:
+        return
+    assert largest_difference(tiny.model(kind, predictor, **changes).double(), CLIP.double()) < 1e-11
+
+
+@pytest.mark.parametrize("name", tiny.REFERENCES)
+@pytest.mark.parametrize("depth", [1, 3])
+@torch.no_grad()
+def test_the_stream_of_a_reference_is_the_network(name, depth):
+    assert largest_difference(tiny.reference(name, depth=depth).double(), CLIP.double()) < 1e-11
+
+
+@pytest.mark.parametrize("coordinates", [World(), HeadRelative(), Heading()])
+@torch.no_grad()
+def test_in_all_coordinates(coordinates):
+    model = tiny.model(coordinates=coordinates).double()
+    turning = CLIP.double().clone()
+    turning[..., :18] = tiny.clip(40, seed=4, spread=2.0)[None, :, :18]
+    assert largest_difference(model, turning) < 1e-11
+
+
+def test_the_network_itself_stays_as_it_is():
+    model = tiny.model()
+    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    live = streaming(model)
+    assert isinstance(live, Stream)
+    assert not any(parameter.requires_grad for parameter in live.parameters())
+    assert model.memory.frames == model.frames
+    for name, tensor in model.state_dict().items():
+        assert torch.equal(tensor, before[name])
+    assert any(parameter.requires_grad for parameter in model.parameters())
+
+
+@pytest.mark.parametrize("model", [tiny.model(), *map(tiny.reference, tiny.REFERENCES)])
+@torch.no_grad()
+def test_less_work(model):
+    counts = []
+    for network in (model, streaming(model)):
+        with FlopCounterMode(display=False) as counter:
+            network.advance(CLIP[:, :1], network.initial_state(1), 1)
+        counts.append(counter.get_total_flops())
+    assert counts[1] < counts[0]
+
+
+def test_what_has_no_stream_is_refused():
+    with pytest.raises(InputError, match=r"memory\.history=latest"):
+        streaming(tiny.model(CodeMemory, history="latest"))
+
+
+NETWORKS = {
+    "codes": partial(tiny.model, CodeMemory, coordinates=Heading()),
+    "lstm": partial(tiny.model, LSTMMemory, coordinates=Heading()),
+    **{name: partial(tiny.reference, name) for name in tiny.REFERENCES},
+}
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+def test_its_file_is_the_network_in_onnx_runtime(tmp_path: Path, network):
+    model = NETWORKS[network]()
+    path = tmp_path / "stream.onnx"
+    export(streaming(model), path, "0123456789abcdef")
+    assert parity(model, path, tiny.clip(40)) < 1e-4
+    assert "state.count" in OnnxStream(path).state

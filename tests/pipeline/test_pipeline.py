@@ -1,0 +1,186 @@
+"""The whole way at profile=tiny, by the commands a person would type."""
+
+import json
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+import yaml
+from command_line import TINY
+from command_line import run as command
+from conftest import INT8, one_line
+from PIL import Image
+
+from memmlp.config.build import build_experiment
+from memmlp.config.compose import composed
+from memmlp.config.shipped import shipped
+from memmlp.motion.dataset import Frames
+from memmlp.pipeline.run import codes_run
+from memmlp.runs.lookup import list_runs
+from memmlp.runs.run import Run
+
+
+def motion_run(folder: Path) -> Run:
+    """The run that was there at first."""
+    return [run for run in list_runs(folder / "outputs") if run.manifest["kind"] == "memmlp"][-1]
+
+
+def test_a_run_leaves_everything(home):
+    run = motion_run(home)
+    assert run.done
+    assert run.verify() == []
+    for name in ("config.yaml", "manifest.json", "metrics.jsonl", "checkpoint.safetensors"):
+        assert (run.folder / name).stat().st_size > 0
+    assert run.shipped.done
+    assert len(list(run.evaluations.iterdir())) == 2
+    assert set(run.results) == {"window", "stream", "latency"}
+    assert run.results["stream"]["rotation"]["MPJPE"] > 0
+    assert run.results["latency"]["steps"] >= 200
+    assert run.results["latency"]["onnx_parity"] < 1e-4
+    upstream = Run.of(home / "outputs", run.manifest["upstream"])
+    assert upstream.done
+    assert upstream.manifest["kind"] == "vqvae"
+    with Image.open(run.folder / "poses.png") as picture:
+        assert picture.size[0] > 600
+        assert len(picture.convert("RGB").getcolors(10**6)) > 50
+    graph = onnx.load(run.onnx)
+    assert {p.key: p.value for p in graph.metadata_props}["run_id"] == run.id
+    out = (home / "out.txt").read_text()
+    assert "MPJPE" in out
+    assert str(run.folder.relative_to(home)) in out
+
+
+def test_the_same_command_finds_the_run_and_others_share_the_vqvae(home):
+    before = {run.id: run.marker.stat().st_mtime_ns for run in list_runs(home / "outputs")}
+    assert "finished already" in command(home, "train", *TINY, INT8)
+    assert {run.id: run.marker.stat().st_mtime_ns for run in list_runs(home / "outputs")} == before
+    for more, codes in ((["vqvae.seed=0"], 1), ([], 2)):  # by default a VQ-VAE follows its run's seed
+        command(home, "train", *TINY, "seed=1", "evaluation.modes=[stream]", *more)
+        kinds = [run.manifest["kind"] for run in list_runs(home / "outputs")]
+        assert kinds.count("vqvae") == codes
+
+
+def test_eval_repeats_the_runs_numbers_and_saves_predictions(home):
+    run = motion_run(home)
+    first = next(r for r in list_runs(home / "outputs") if "window" in r.results)
+    said = command(home, "eval", first.id[:6], "--json", "found.json")
+    assert "measured before" in said
+    words = ("--again", "--save-predictions", "predictions", "--json", "again.json")
+    assert "evaluation done" in command(home, "eval", first.id[:6], *words)
+    again = json.loads((home / "again.json").read_text())
+    for branch, values in again["mean"]["stream"].items():
+        assert values == pytest.approx(first.results["stream"][branch], rel=1e-4)
+    row = again["clips"][0]
+    arrays = np.load(home / "predictions" / "stream" / f"{row['name']}.npz", allow_pickle=False)
+    assert arrays["predicted_positions"].shape == (row["frames"], 22, 3)
+    assert arrays["predicted_rotations"].shape == (row["frames"], 22, 3, 3)
+    error = 100 * np.linalg.norm(arrays["predicted_positions"] - arrays["true_positions"], axis=-1).mean()
+    assert error == pytest.approx(row["stream"]["rotation"]["MPJPE"], rel=1e-4)
+    head = arrays["predicted_positions"][:, 15] - arrays["true_positions"][:, 15]
+    assert np.abs(head).max() < 1e-5
+    assert run.done
+
+
+def test_a_mode_a_solver_or_a_precision_is_that_stages_work_alone(home):
+    """On a run that is trained: not one step more, and the run's own results stay what they were."""
+    run = motion_run(home)
+    weights, log, results = run.model.read_bytes(), run.metrics_path.read_bytes(), run.results
+    stages = [path.name for path in (*run.evaluations.iterdir(), *run.deployments.iterdir())]
+    ik = ("evaluation.ik=lbfgs", "evaluation.ik_iterations=1")
+    assert "evaluation done" in command(home, "eval", run.id, *ik)
+    assert "finished already" in command(home, "train", *TINY, INT8, *seed_of(run), *ik)
+    assert "deployment done" in command(home, "eval", run.id, "export.precision=fp32", "export.graph=naive")
+    assert "evaluation and deployment done" in command(home, "eval", run.id, "memory.blend=1")
+    assert "measured before" in command(home, "eval", run.id, "evaluation.ik=off", INT8)
+    assert "changes the training" in command(home, "eval", run.id, "memory.shift=frame", code=2)
+    assert "evaluation.ik" in command(home, "eval", run.id, "evaluation.ik=[", code=2)
+    assert "evaluation.ik=guess" in command(home, "eval", run.id, "evaluation.ik=guess", code=2)
+    assert (run.model.read_bytes(), run.metrics_path.read_bytes()) == (weights, log)
+    now = Run(run.folder).results
+    assert set(now["stream"]) == {*results["stream"], "combined"}
+    assert now["stream"]["rotation"] == results["stream"]["rotation"]  # of m = 0.5, and not of the last one
+    made = [path.name for path in (*run.evaluations.iterdir(), *run.deployments.iterdir())]
+    assert len(made) == len(stages) + 2 + 1 + 3
+
+
+def seed_of(run: Run) -> list[str]:
+    """What makes the run's command line."""
+    return [f"seed={run.config['seed']}", f"vqvae.seed={run.config['vqvae']['seed']}"]
+
+
+def test_a_run_of_other_code_under_the_same_recipes_is_said(home, monkeypatch):
+    run = motion_run(home)
+    changed = {**run.manifest["sources"], "losses.py": "0" * 12}
+    monkeypatch.setattr("memmlp.runs.run.sources", lambda: changed)
+    assert run.changed_sources == ["losses.py"]
+    said = " ".join(command(home, "train", *TINY, INT8, *seed_of(run)).split())
+    assert "before the code of losses.py changed" in said
+
+
+def test_the_live_stream_of_a_run(home, memmlp, monkeypatch):
+    monkeypatch.chdir(home)
+    run = motion_run(home)
+    out = memmlp("bench", "soak", run.id, "--hours", "0.001").out
+    assert "all finite: yes" in out
+    first, last = re.search(r"MPJPE (\S+) cm in the first tenth, (\S+) cm in the last", out).groups()
+    assert float(last) == pytest.approx(float(first), rel=0.05)
+    assert "ratio" in memmlp("bench", "avatar", "--run", run.id, "--frames", "5", "--rounds", "1").out
+    assert one_line(memmlp("bench", "soak"), "neither RUN nor --onnx")
+
+
+def test_export_again_and_bad_names(home, memmlp, monkeypatch):
+    monkeypatch.chdir(home)
+    run = motion_run(home)
+    assert "differs from torch" in memmlp("export", run.id, "--out", "again.onnx").out
+    onnx.checker.check_model(onnx.load(home / "again.onnx"))
+    full = ["export", run.id, "--out", "full.onnx", "--space", "unity"]
+    assert "differs from torch" in memmlp(*full, "--scope", "full").out
+    assert one_line(memmlp(*full), "allowed with --scope full")
+    assert one_line(memmlp("eval", "zzz"), "run 'zzz'")
+    assert one_line(memmlp("export", run.id, "--out", "no/where.onnx"), "--out")
+    assert one_line(memmlp("eval", run.manifest["upstream"]), "not a finished Mem-MLP run")
+
+
+def test_a_nan_on_a_later_clip_is_not_exported(home, memmlp, monkeypatch):
+    """Which Python's max would pass over."""
+    monkeypatch.chdir(home)
+    found = iter([1e-6, float("nan")])
+    monkeypatch.setattr("memmlp.deploy.parity.parity", lambda *_: next(found))
+    monkeypatch.setattr("memmlp.deploy.export.export", lambda model, path, run: path.write_bytes(b""))
+    monkeypatch.setattr(Frames, "clips", lambda self: [None, None])
+    ran = memmlp("export", motion_run(home).id, "--out", "never.onnx", "--clips", "0")
+    assert (ran.code, "not written" in ran.err) == (1, True)
+    assert not list(home.glob("*never*")) + list(home.glob(".export-*"))
+
+
+def test_foreign_targets_in_a_runs_config_are_refused(home, tmp_path):
+    run = motion_run(home)
+    copy = tmp_path / run.id
+    copy.mkdir()
+    for name in ("manifest.json", "DONE"):
+        (copy / name).write_bytes((run.folder / name).read_bytes())
+    config = run.config
+    config["memory"]["_target_"] = "os.system"
+    (copy / "config.yaml").write_text(yaml.safe_dump(config))
+    assert "os.system" in command(home, "eval", str(copy), code=2)
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in shipped("conf/experiment").glob("*.yaml")))
+def test_every_experiment_trains_and_streams(home, name):
+    """Two steps and one validation of each, on the prepared data, without export."""
+    os.chdir(home)
+    cfg = composed([f"experiment={name}", *TINY, "optim.steps=2"])
+    experiment = build_experiment(cfg)
+    data = experiment.data.prepare()
+    codes = codes_run(experiment, data).model if experiment.architecture.uses_codes else None
+    run = Run(home / "variants" / name)
+    run.folder.mkdir(parents=True, exist_ok=True)
+    model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)
+    values = run.metrics()[-1].values
+    assert all(np.isfinite(value) for value in values.values())
+    assert len(data.open("test").names) > 0
+    assert torch.isfinite(model.stem.weight).all()

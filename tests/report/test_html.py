@@ -1,0 +1,243 @@
+"""The report's page, in the text and in a browser."""
+
+from __future__ import annotations
+
+import html
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Memmlp, one_line
+from fake_runs import CLIPS, fake_sweep, nothing, runs_of, table_of
+
+from memmlp.common.errors import InputError
+from memmlp.report import figures
+from memmlp.report.html import Chapter, page, published
+from memmlp.sweep.plan import Entry, Plan
+from memmlp.sweep.spec import Sweep, load_sweep
+from memmlp.tables.collect import without_runs
+from memmlp.tables.distributions import distributions
+from memmlp.tables.grid import caption
+
+SHIPPED = Path(__file__).parent.parent.parent / "sweeps"
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+NAMES = ("table01", "table04", "table06", "table14", "table17")
+
+
+def measured(outputs: Path, name: str) -> Chapter:
+    """A chapter whose runs are all there."""
+    sweep = load_sweep(SHIPPED / f"{name}.yaml")
+    find = fake_sweep(outputs, sweep, {"2": 1.1, "no Multi-Head, no Memory-Block": 1.2}, log=True)
+    return Chapter(sweep, table_of(sweep, find), runs_of(sweep, find))
+
+
+@pytest.fixture(scope="module")
+def chapters(tmp_path_factory: pytest.TempPathFactory) -> list[Chapter]:
+    sweep = load_sweep(SHIPPED / "table01.yaml")
+    table = without_runs(sweep, ("stream", "window"), "nothing measured: data.root")
+    outputs = tmp_path_factory.mktemp("outputs")
+    return [Chapter(sweep, table, runs_of(sweep, nothing)), *(measured(outputs, n) for n in NAMES[1:])]
+
+
+@pytest.fixture(scope="module")
+def text(chapters: list[Chapter]) -> str:
+    systems = published(*(load_sweep(SHIPPED / f"table{number}.yaml") for number in ("01", "17")))
+    return page(chapters, systems, "Generated today", "0123456")
+
+
+def test_systems_of_both_tables():
+    systems = published(*(load_sweep(SHIPPED / f"table{number}.yaml") for number in ("01", "17")))
+    assert {(point.label, point.fps, point.error) for point in systems} == {
+        ("AvatarPoser", 72.0, 3.08),
+        ("AGRoL-MLP", 26.0, 2.69),
+        ("AGRoL-Diffusion", 3.5, 2.66),
+        ("Mem-MLP-41 (Ours)", 72.0, 2.57),
+        ("Mem-MLP-60 (Ours)", 65.0, 2.56),
+    }
+
+
+def test_page_needs_nothing_else(text: str):
+    """No address is loaded: of scripts, styles, images or fonts."""
+    assert not re.search(r"<script|<link(?! rel=\"icon\" href=\"data:)|@import|url\((?!#)|src=|<img", text)
+    addresses = set(re.findall(r"https?://[^\"'\s<)]+", text))
+    assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
+
+
+@pytest.mark.parametrize("count", [2, 12, 13])
+def test_points_of_ours_are_named_where_they_are_few(count: int):
+    """One that two tables share once."""
+    points = [figures.Point(f"arm {number};", 100.0 + number, 4.0) for number in range(count)]
+    svg = figures.accuracy({"one": points, "other": points[:1]}, [figures.Point("theirs", 72, 3)], "MPJRE")
+    assert svg.count("theirs") == 1
+    assert [svg.count(point.label) for point in points] == [int(count <= 12)] * count
+
+
+def test_page_has_every_table_and_figure(chapters: list[Chapter], text: str):
+    for chapter in chapters:
+        assert f'<section class="result" id="{chapter.sweep.name}">' in text
+        assert (
+            f'<a href="#{chapter.sweep.name}">{html.escape(caption(chapter.table), quote=True)}</a>' in text
+        )
+    assert (
+        text.count("<figure>") == text.count("</svg>") == 3 + 3 + 1 + 4
+    )  # effects, profiles, accuracy, training
+    runs = {run.id for chapter in chapters for found in chapter.runs.values() for run in found.values()}
+    assert len(runs) == 15 + 9 + 12 + 5
+    for run in runs:
+        assert text.count(f"<code>{run}</code>") == 2  # latency and runs
+    assert "Generated today, code 0123456, 41 finished runs" in text
+    assert "nothing measured: data.root" in text
+
+
+def test_ids_are_unique_and_links_lead_somewhere(text: str):
+    ids = re.findall(r' id="([^"]+)"', text)
+    of_page = [name for name in ids if not re.fullmatch(r"[mp][0-9a-f]{10}", name)]
+    assert len(set(of_page)) == len(of_page)
+    assert set(re.findall(r'<a href="#([^"]+)"', text)) <= set(of_page)
+
+
+def test_distributions_by_hand(tmp_path: Path):
+    """Interquartile means and probabilities of improvement of one metric, and the profile's fractions."""
+    sweep = load_sweep(SHIPPED / "table14.yaml")
+    find = fake_sweep(tmp_path, sweep, {"2": 1.02})
+    found = {one.label: one for one in distributions(sweep, runs_of(sweep, find), "stream")["MPJPE"]}
+    ours, theirs = found["2"], found["2, 4, 6, 8"]
+    assert theirs.improvement is None
+    assert ours.errors.shape == (3, len(CLIPS))
+    wins = [
+        (a > b) + (a == b) / 2
+        for clip in range(len(CLIPS))
+        for a in theirs.errors[:, clip]
+        for b in ours.errors[:, clip]
+    ]
+    assert ours.improvement == pytest.approx(np.mean(wins))
+    assert ours.improvement < 0.5
+    middle = np.sort(ours.errors.ravel())[9:27]
+    assert ours.middle == pytest.approx(middle.mean())
+    text = page([Chapter(sweep, table_of(sweep, find), runs_of(sweep, find))], [], "now", "0")
+    assert f"<td>{ours.middle:.2f}</td><td>{ours.improvement:.2f}</td>" in text
+
+
+def test_colours_are_the_pages(text: str):
+    assert "#0102" not in text
+    assert "var(--series0)" in text
+    assert "currentColor" in text
+
+
+def test_config_differences(text: str):
+    rows = re.findall(r"<tr><th scope=\"row\"><code>\w+</code></th>(.*?)</tr>", text)
+    seeds = [row for row in rows if "table14: 2, 4, 6, seed 2" in row and "config" not in row]
+    assert any("seed=2" in row and "&#x27;memory.layers=[2,4,6]&#x27;" in row for row in seeds)
+
+
+def test_labels_are_escaped(tmp_path: Path):
+    content = (
+        "arms: {'<script>alert(1)</script>': [a=b], '& <b>': [a=c]}\ntitle: <i>title</i>\nseeds: [0, 1]\n"
+    )
+    (tmp_path / "bad.yaml").write_text(content)
+    sweep = load_sweep(tmp_path / "bad.yaml")
+    find = fake_sweep(tmp_path, sweep, {"& <b>": 1.1}, log=True)
+    text = page([Chapter(sweep, table_of(sweep, find), runs_of(sweep, find))], [], "now", "0")
+    assert "<script" not in text
+    assert "<b>" not in text
+    assert "<i>" not in text
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+
+
+def test_nothing_measured_is_said():
+    sweep = load_sweep(SHIPPED / "table14.yaml")
+    text = page([Chapter(sweep, table_of(sweep, nothing), runs_of(sweep, nothing))], [], "now", "0")
+    assert "Nothing measured yet." in text
+    assert "fill with: memmlp sweep table14" in text
+    assert "<svg" not in text
+
+
+def browser(tmp_path: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Chromium without a window and without a network."""
+    if CHROMIUM is None:
+        pytest.skip("Chromium is not installed (apt-get install chromium)")
+    command = [
+        CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
+        "--host-resolver-rules=MAP * ~NOTFOUND", "--enable-logging=stderr", "--v=0",
+        f"--user-data-dir={tmp_path / 'profile'}", *arguments,
+    ]  # fmt: skip
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert ran.returncode == 0, ran.stderr[-2000:]
+    return ran
+
+
+def console(ran: subprocess.CompletedProcess[str]) -> list[str]:
+    """What the page wrote to the browser's console."""
+    return [line for line in ran.stderr.splitlines() if "CONSOLE" in line]
+
+
+def test_browser_shows_the_page(tmp_path: Path, text: str, chapters: list[Chapter]):
+    probe = """<script>
+      const wide = [...document.querySelectorAll('main *')].filter(e => !e.closest('.scroll'))
+        .filter(e => e.getBoundingClientRect().right > innerWidth + 1);
+      const flat = [...document.querySelectorAll('svg, table')]
+        .filter(e => e.getBoundingClientRect().height < 30);
+      document.documentElement.dataset.report = [innerWidth, wide.length, flat.length].join(' ');
+    </script>"""
+    path = tmp_path / "report.html"
+    path.write_text(text.replace("</body>", f"{probe}</body>"), encoding="utf-8")
+    for width in (1280, 500):  # Chromium's windows are not narrower
+        ran = browser(tmp_path, f"--window-size={width},900", "--dump-dom", path.as_uri())
+        assert console(ran) == []
+        assert f'data-report="{width} 0 0"' in ran.stdout
+        assert ran.stdout.count("<svg") == 11
+        assert all(f'id="{chapter.sweep.name}"' in ran.stdout for chapter in chapters)
+
+
+def test_browser_tells_of_errors(tmp_path: Path):
+    """The test above sees what a page's script throws, and what it cannot load."""
+    path = tmp_path / "bad.html"
+    path.write_text("<script>throw new Error('loud')</script><img src='http://example.invalid/x.png'>")
+    assert any("loud" in line for line in console(browser(tmp_path, "--dump-dom", path.as_uri())))
+
+
+def test_browser_prints_and_takes_a_picture(tmp_path: Path, text: str):
+    path = tmp_path / "report.html"
+    path.write_text(text, encoding="utf-8")
+    browser(tmp_path, f"--print-to-pdf={tmp_path / 'report.pdf'}", path.as_uri())
+    assert (tmp_path / "report.pdf").stat().st_size > 50_000
+
+
+@pytest.fixture
+def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Stands in for composing: the runs of Tables 5 and 6 are there, none of the others can be known."""
+
+    def plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
+        if sweep.table not in (5, 6):
+            raise InputError("data.root: has no value")
+        find = fake_sweep(tmp_path / sweep.name, sweep)
+        entries = [(arm, seed) for arm in sweep.runnable() for seed in sweep.seeds]
+        found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
+        return Plan(sweep.name, tmp_path / sweep.name, tuple(found), ())
+
+    monkeypatch.setattr("memmlp.config.plan.planned", plan)
+
+
+def test_command_writes_the_page(memmlp: Memmlp, planned: None):
+    ran = memmlp("report", "5", "table06", "data=mocap", "--out", "here/page.html")
+    assert (ran.code, ran.out) == (0, "here/page.html\n")
+    text = Path("here/page.html").read_text()
+    assert set(re.findall(r'class="result" id="(\w+)"', text)) == {"table05", "table06"}
+
+
+def test_command_takes_all_by_default(memmlp: Memmlp, planned: None):
+    assert memmlp("report").out == "outputs/report.html\n"
+    text = Path("outputs/report.html").read_text()
+    assert len(re.findall(r'class="result" id="table\d\d"', text)) == 17
+    assert 'id="memory_control"' in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [(["99"], ("no such sweep",)), (["5", "--out", "/proc/no/x"], ("--out /proc/no/x",))],
+)
+def test_bad_input_is_one_line(memmlp: Memmlp, planned: None, arguments: list[str], words: tuple[str, ...]):
+    assert one_line(memmlp("report", *arguments), *words)

@@ -1,0 +1,258 @@
+"""Results kept with the code, pages made of them, and prose that claims nothing by hand."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_runs import CLIPS, fake_run, fake_sweep, nothing, runs_of
+
+from memmlp.cli.results import sources
+from memmlp.common.errors import InputError
+from memmlp.report.claims import NEVER, WORDS, claims
+from memmlp.report.markdown import Source, pages
+from memmlp.report.store import Kept, dumps, load_kept, overrides_of, save, without_paths
+from memmlp.statistics import Verdict, holm, paired_effects
+from memmlp.sweep.spec import Sweep, load_sweep
+from memmlp.tables.collect import collect
+
+ROOT = Path(__file__).parent.parent.parent
+DOCS = ROOT / "docs" / "results"
+GROUPS = {clip: f"take {number // 2}" for number, clip in enumerate(CLIPS)}
+
+
+@pytest.fixture
+def sweep() -> Sweep:
+    return load_sweep(ROOT / "sweeps" / "table14.yaml")
+
+
+@pytest.fixture
+def kept(sweep: Sweep, tmp_path: Path) -> Kept:
+    find = fake_sweep(tmp_path, sweep, {"2": 1.1, "2, 4": 1.03}, groups=GROUPS)
+    return Kept("table14", ("data=mocap",), runs_of(sweep, find), overrides_of(sweep))
+
+
+def source(sweep: Sweep, kept: Kept) -> Source:
+    return Source(kept, collect(sweep, kept.of(sweep), command=kept.command))
+
+
+def test_kept_results_make_the_runs_table(sweep: Sweep, kept: Kept, tmp_path: Path):
+    """To six digits, with every origin and every group."""
+    save(tmp_path / "kept.json", kept)
+    read = load_kept(tmp_path / "kept.json")
+    assert (read.sweep, read.overrides, read.command) == (
+        "table14", ("data=mocap",), "memmlp sweep table14 data=mocap",
+    )  # fmt: skip
+    tables = [collect(sweep, one.of(sweep)) for one in (kept, read)]
+    assert tables[0].flags == tables[1].flags
+    for before, after in zip(tables[0].rows, tables[1].rows, strict=True):
+        for mode in tables[0].modes:
+            for metric, cell in before.cells[mode].items():
+                again = after.cells[mode][metric]
+                assert again.mean == pytest.approx(cell.mean, rel=1e-5)
+                if cell.effect:
+                    assert again.effect.low == pytest.approx(cell.effect.low, rel=1e-4, abs=1e-4)
+                    assert (again.effect.verdict, again.effect.groups) == (cell.effect.verdict, 6)
+    assert [run.origin for run in read.every] == [run.origin for run in kept.every]
+
+
+def test_kept_results_have_the_same_bytes(kept: Kept, tmp_path: Path):
+    """Whatever order the runs are found in, and after being read."""
+    turned = {label: dict(reversed(runs.items())) for label, runs in reversed(kept.runs.items())}
+    assert dumps(replace(kept, runs=turned)) == dumps(kept)
+    save(tmp_path / "kept.json", kept)
+    assert dumps(load_kept(tmp_path / "kept.json")) == dumps(kept)
+    assert max(map(len, dumps(kept).splitlines())) < 1000  # a line a list, so that changes can be read
+
+
+def test_results_of_several_machines_add_up(sweep: Sweep, kept: Kept, tmp_path: Path):
+    """Arms and seeds of both; a cell that both have is the newer one's, and the replaced run is gone."""
+    one = {label: {0: runs[0]} for label, runs in kept.runs.items()}
+    newer = fake_run(tmp_path, "again", 0)
+    other = runs_of(replace(sweep, seeds=(0,)), lambda arm, seed: newer if arm.label == "2" else None)
+    rest = {label: {seed: runs[seed] for seed in (1, 2)} for label, runs in kept.runs.items()}
+    merged = replace(kept, runs=one).merged(replace(kept, runs=rest)).merged(replace(kept, runs=other))
+    assert {label: sorted(runs) for label, runs in merged.runs.items()} == {
+        label: [0, 1, 2] for label in kept.runs
+    }
+    ids = set(json.loads(dumps(merged))["runs"])
+    assert newer.id in ids
+    assert kept.runs["2"][0].id not in ids
+    with pytest.raises(InputError, match="holds the results of"):
+        kept.merged(replace(kept, overrides=("data=synthetic",)))
+
+
+def test_kept_results_hold_no_path_of_a_machine():
+    words = ("data.root=/home/me/data/cmu", "data.root=outputs/data/cmu", "+data.body=/x/model.npz")
+    assert without_paths(words) == (
+        "data.root=.../cmu",
+        "data.root=outputs/data/cmu",
+        "+data.body=.../model.npz",
+    )
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"sweep": "a"}', '{"runs": {"a": {}}}'])
+def test_damaged_results_are_one_line(tmp_path: Path, text: str):
+    path = tmp_path / "bad.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match="memmlp results save"):
+        load_kept(path)
+
+
+def test_a_template_takes_numbers_and_verdicts_from_the_table(sweep: Sweep, kept: Kept):
+    made = source(sweep, kept)
+    template = (
+        'MPJPE {{ effect("t", "2", "stream", "MPJPE") }}; paper {{ paper("t", "2", "MPJPE") }}; '
+        '{{ value("t", "2", "stream", "MPJPE") }}. {{ verdict("t", "2, 4, 6", "window", "Jitter") }} '
+        '{{ seen("t", "stream", "MPJPE") }} {% if has("u") %}never{% endif %}\n'
+        '{{ title("t") }}\n{{ origin("t") }}\n{{ summary("t") }}\n{{ table("t") }}\n'
+    )
+    text = pages({"t": made}, {"README.md": template})["README.md"]
+    row = next(row for row in made.table.rows if row.label == "2")
+    effect = row.cells["stream"]["MPJPE"].effect
+    assert effect.verdict == Verdict.HOLDS
+    assert f"MPJPE +{effect.mean:.2f} [{effect.low:.2f}, {effect.high:.2f}], holds; paper +0.09" in text
+    assert f"{row.cells['stream']['MPJPE'].mean:.2f} ± " in text
+    assert f"{made.table.detectable('stream', 'MPJPE'):.2g} cm" in text
+    assert "`memmlp sweep table14 data=mocap`: 12 runs, commit 0123456, torch 2.0.0" in text
+    assert text.count("holds; paper +0.09") == 2
+    assert "never" not in text
+    assert "### Table 14: Placement of memory blocks in the backbone" in text
+
+
+@pytest.mark.parametrize(
+    ("template", "words"),
+    [
+        ('{{ effect("u", "2", "stream", "MPJPE") }}', "'u' is no results; allowed are t"),
+        ('{{ effect("t", "3", "stream", "MPJPE") }}', "'3' is no arm of t; allowed are 2, 2, 4"),
+        ('{{ effect("t", "2", "live", "MPJPE") }}', "'live' is no mode; allowed are stream, window"),
+        ('{{ effect("t", "2", "stream", "MPJ") }}', "'MPJ' is no metric of t"),
+        ("{{ nothing }}", "'nothing' is undefined"),
+        ("{{ effect(", "README.md"),
+        ('Memory lowers it: {{ effect("t", "2", "stream", "MPJPE") }}', "placeholders"),
+    ],
+)
+def test_bad_templates_are_one_line(sweep: Sweep, kept: Kept, template: str, words: str):
+    with pytest.raises(InputError, match=re.escape(words)) as raised:
+        pages({"t": source(sweep, kept)}, {"README.md": template})
+    assert str(raised.value).startswith("README.md")
+    assert "\n" not in str(raised.value)
+
+
+def test_a_template_cannot_stand_for_a_tables_page(sweep: Sweep, kept: Kept):
+    with pytest.raises(InputError, match=r"t\.md"):
+        pages({"t": source(sweep, kept)}, {"t.md": "words"})
+
+
+@pytest.mark.parametrize(
+    "sentence",
+    [
+        "Jitter is +1.47* here.",
+        r"Jitter is +1.47\* here.",
+        "MPJPE changes by 0.3 [0.1, 0.5] cm.",
+        "The memory lowers the position error by 0.17 cm.",
+        "The memory raises Jitter.",
+        "The memory loses against a GRU.",
+        "The effect is significant.",
+        "Placing it {{ effect('t', 'a', 'stream', 'MPJPE') }} further back is better.",
+        "| arm | MPJPE | the effect 0.2 holds |",
+        "- first\n- *manual* weights improve MPJRE",
+    ],
+)
+def test_a_planted_claim_is_found(sentence: str):
+    text = f"# Title\n\nThis is prose about 41 frames. {sentence}\n\nMore of it.\n"
+    found = claims(text)
+    assert len(found) == 1
+    assert found[0].line == 3 + sentence.count("\n")
+
+
+@pytest.mark.parametrize(
+    "sentence",
+    [
+        "The arm has {{ effect('t', 'a', 'stream', 'MPJPE') }}.",
+        "Table 4 is better than none.",
+        "`3.0* better` is code, [and this](https://x.org/better*3) an address.",
+        "<!-- 0.17 cm lower -->",
+        "A folder of 3 runs. It is better to keep them.",
+        "Frames [2, 4] are listed.",
+        "**30** clips, *in* order.",
+    ],
+)
+def test_what_claims_nothing_is_left_alone(sentence: str):
+    assert claims(f"{sentence}\n") == []
+
+
+def test_every_word_of_the_rule_is_found():
+    for word in (*WORDS, *NEVER):
+        assert len(claims(f"It {word} 0.3 cm.")) == 1
+
+
+def test_pages_of_the_clone_are_made_again_byte_for_byte():
+    templates = {path.name: path.read_text(encoding="utf-8") for path in (DOCS / "templates").glob("*.md")}
+    made = pages(sources(DOCS), templates)
+    assert "README.md" in made
+    for name, text in made.items():
+        assert (DOCS / name).read_bytes() == text.encode(), name
+
+
+def test_every_interval_of_the_clone_follows_from_what_is_kept():
+    """The pages' intervals, made by hand of the per-clip results: as many, and to the last printed digit."""
+    for name, one in sources(DOCS).items():
+        text, printed = (DOCS / f"{name}.md").read_text(encoding="utf-8"), []
+        content = json.loads((DOCS / "data" / f"{name}.json").read_text())
+        for row in one.table.rows:
+            for mode, cells in row.cells.items():
+                for metric, cell in cells.items():
+                    if cell.effect is not None and cell.effect.low is not None:
+                        interval = by_hand(content, row, one.table, mode, metric)
+                        assert (cell.effect.low, cell.effect.high) == pytest.approx(interval)
+                        printed.append(interval)
+        assert len(re.findall(r"\\\[[^\]]*\d, [^\]]*\d\\\]", text)) == len(printed)
+
+
+def by_hand(content: dict, row, table, mode: str, metric: str) -> tuple[float, float]:
+    """The interval of a row's difference from its control, from a file's content alone."""
+    branches = {other.label: other.branch for other in table.rows}
+    seeds = sorted(set(content["cells"][row.label]) & set(content["cells"][row.against]))
+    sides, groups = [], []
+    for label in (row.label, row.against):
+        runs = [content["runs"][content["cells"][label][seed]] for seed in seeds]
+        sides.append([run["errors"][mode][branches[label]][metric] for run in runs])
+        groups = [group for _, group in content["clips"][runs[0]["clips"]]]
+    difference = np.array(sides[0]) - np.array(sides[1])
+    effects = paired_effects(difference[None], np.array(groups))
+    return float(effects.low[0]), float(effects.high[0])
+
+
+def test_results_of_an_arm_that_was_another_are_refused(sweep: Sweep, kept: Kept):
+    """Its numbers would stand under a name that means something else now."""
+    arms = [replace(arm, overrides=("memory=gru",)) if arm.label == "2" else arm for arm in sweep.arms]
+    other = replace(sweep, arms=tuple(arms))
+    with pytest.raises(InputError, match="arm '2' was made with the overrides"):
+        kept.of(other)
+    with pytest.raises(InputError, match="arm '2' was made with the overrides"):
+        kept.merged(replace(kept, arms=overrides_of(other)))
+
+
+def test_prose_claims_nothing_by_hand():
+    for path in (ROOT / "README.md", *(DOCS / "templates").glob("*.md")):
+        assert claims(path.read_text(encoding="utf-8")) == [], path
+
+
+def test_by_hand_is_what_a_page_has(sweep: Sweep, kept: Kept):
+    """The test of the clone's intervals sees them: of results made here."""
+    content, table = json.loads(dumps(kept)), source(sweep, kept).table
+    row = table.rows[0]
+    effect = row.cells["stream"]["MPJPE"].effect
+    assert by_hand(content, row, table, "stream", "MPJPE") == pytest.approx(
+        (effect.low, effect.high), abs=1e-4
+    )
+    assert holm(np.array([effect.p]))[0] <= effect.holm
+
+
+def test_nothing_to_keep(sweep: Sweep):
+    assert Kept("table14", (), runs_of(sweep, nothing), {}).every == []

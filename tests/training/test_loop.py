@@ -1,0 +1,219 @@
+"""The training loop: learning, resuming bit for bit after a kill, stopping at NaN; checkpoints."""
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import pytest
+import tiny
+import torch
+
+from memmlp.common.errors import InputError, TrainingDiverged
+from memmlp.config.build import build_experiment
+from memmlp.config.compose import composed
+from memmlp.motion.dataset import WindowSampler
+from memmlp.networks import checkpoint
+from memmlp.networks.vqvae import VQVAE
+from memmlp.runs.run import Run
+from memmlp.training.codes import VQVAETask, perplexity
+from memmlp.training.loop import train
+from memmlp.training.losses import HandPosition, MotionLoss, Uncertainty
+from memmlp.training.network import MotionTask
+from memmlp.training.optim import SCHEDULES, Optim
+from memmlp.training.rollout import OwnPredictions, PersistentStreams, TeacherForcing
+
+OPTIM = Optim(steps=12, batch=4, lr=1e-3, final_lr=1e-4, schedule="cosine", checkpoint_every=5, log_every=4)
+ROLLOUTS = {
+    "forced": TeacherForcing,
+    "own": lambda: OwnPredictions(2),
+    "streams": lambda: PersistentStreams(6),
+}
+
+
+def motion_task(rollout: str = "own", optim: Optim = OPTIM, seed: int = 0) -> MotionTask:
+    model, made = tiny.model(seed=seed), ROLLOUTS[rollout]()
+    if isinstance(made, PersistentStreams):
+        made.begin(model)
+    loss = MotionLoss(Uncertainty(), HandPosition(), model.predictor.branches)
+    return MotionTask(model, loss, made, tiny.frames(), optim, seed, validate=lambda model: {"answer": 42.0})
+
+
+def reference_task(name: str, optim: Optim = OPTIM, seed: int = 0) -> MotionTask:
+    model, loss = tiny.reference(name, seed=seed), tiny.REFERENCE_LOSSES[name]()
+    return MotionTask(model, loss, TeacherForcing(), tiny.frames(), optim, seed, validate=lambda model: {})
+
+
+def vqvae_task(optim: Optim = OPTIM) -> VQVAETask:
+    torch.manual_seed(0)
+    model = VQVAE(codes=8, width=12, encoder_depth=1)
+    return VQVAETask(model, tiny.frame(), tiny.frames(), tiny.frames((30,), seed=9), optim, seed=0)
+
+
+def weights(run: Run) -> dict[str, torch.Tensor]:
+    return checkpoint.read(run.checkpoint)[0]
+
+
+TASKS = {
+    **{name: partial(motion_task, name) for name in ROLLOUTS},
+    **{name: partial(reference_task, name) for name in tiny.REFERENCES},
+    "vqvae": vqvae_task,
+}
+
+
+def test_the_weighting_of_the_data_decides_which_clips_a_step_sees():
+    """Clips of 60, 45 and 80 frames have 54, 39 and 74 windows of 7: by windows the last is drawn most."""
+    drawn = {}
+    for weighting in ("frames", "clips"):
+        experiment = build_experiment(composed([f"data.weighting={weighting}"]))
+        task = motion_task()
+        task = MotionTask(
+            task.model, task.loss, TeacherForcing(), task.frames, replace(OPTIM, batch=3000), 0,
+            task.validate, experiment.weighting,
+        )  # fmt: skip
+        drawn[weighting] = torch.bincount(task.sampler.draw(0)[0], minlength=3) / 3000
+    expected = {"frames": torch.tensor([54, 39, 74]) / 167, "clips": torch.ones(3) / 3}
+    for weighting, shares in expected.items():
+        torch.testing.assert_close(drawn[weighting], shares, atol=0.03, rtol=0)
+    assert torch.equal(motion_task().sampler.draw(3)[1], WindowSampler(tiny.frames(), 4, 7, 0).draw(3)[1])
+
+
+class Kill(Exception):
+    """Stands for a process that ends."""
+
+
+@pytest.mark.parametrize("make", [*ROLLOUTS, *tiny.REFERENCES, "vqvae"])
+def test_a_resumed_run_is_the_same_run(make, tmp_path):
+    """Stopped at step 7 of 12, two steps after the last checkpoint, and gone on by a new process' objects."""
+
+    def task():
+        return TASKS[make]()
+
+    whole, broken = Run(tmp_path / "a"), Run(tmp_path / "b")
+    for run in (whole, broken):
+        run.folder.mkdir()
+    train(task(), OPTIM, whole, 0, "whole")
+    victim = task()
+    step = victim.step
+
+    def dying(number: int):
+        if number == 7:
+            raise Kill
+        return step(number)
+
+    victim.step = dying
+    with pytest.raises(Kill):
+        train(victim, OPTIM, broken, 0, "broken")
+    torch.rand(99)
+    train(task(), OPTIM, broken, 0, "again")
+    expected, got = weights(whole), weights(broken)
+    assert expected.keys() == got.keys()
+    assert all(torch.equal(expected[name], got[name]) for name in expected)
+    assert [m.values for m in whole.metrics()] == [m.values for m in broken.metrics()]
+
+
+def test_what_is_drawn_after_training_is_the_same_after_a_resume_at_its_end(tmp_path):
+    """Such as the blends of an evaluation with memory.blend=sampled; within a step all draws are seeded."""
+    drawn = []
+    for _ in range(2):
+        train(motion_task(), OPTIM, Run(tmp_path), 0, "to the end, then nothing left to do")
+        drawn.append(torch.rand(3))
+        torch.rand(99)
+    assert torch.equal(*drawn)
+
+
+def test_another_seed_is_another_run(tmp_path):
+    runs = [Run(tmp_path / str(seed)) for seed in range(2)]
+    for seed, run in enumerate(runs):
+        run.folder.mkdir()
+        train(motion_task(seed=0), OPTIM, run, seed, "seed")
+    a, b = map(weights, runs)
+    assert not torch.equal(a["module.model.stem.weight"], b["module.model.stem.weight"])
+
+
+@pytest.mark.parametrize("make", [vqvae_task, motion_task, *(TASKS[name] for name in tiny.REFERENCES)])
+def test_it_learns_and_logs(make, tmp_path):
+    optim = replace(OPTIM, steps=60, lr=5e-3, final_lr=1e-3, batch=16, validate_every=30)
+    run = Run(tmp_path)
+    train(make(optim=optim), optim, run, 0, "learn")
+    log = [entry for entry in run.metrics() if entry.phase == "train"]
+    assert [entry.step for entry in log] == list(range(4, 61, 4))
+    assert log[-1].values["rotation"] < 0.8 * log[0].values["rotation"]
+    assert [entry.step for entry in run.metrics() if entry.phase == "val"] == [30, 60]
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_loss_that_is_no_number_stops_with_step_term_and_clips(bad, tmp_path):
+    task = motion_task("forced")
+    frames = task.frames.frames
+    start, length = int(task.frames.starts[1]), int(task.frames.lengths[1])
+    frames[start : start + length, 54 + 132 :] = bad
+    with pytest.raises(TrainingDiverged, match=r"step \d+, term .*position.*clip1") as stop:
+        train(task, OPTIM, Run(tmp_path), 0, "diverge")
+    assert "\n" not in str(stop.value)
+
+
+def trained(**changes) -> torch.Tensor:
+    """The stem after a few steps under changed settings."""
+    import tempfile
+
+    optim = replace(OPTIM, steps=4, **changes)
+    with tempfile.TemporaryDirectory() as folder:
+        task = motion_task("forced", optim)
+        train(task, optim, Run(Path(folder)), 0, "knob")
+        return task.model.stem.weight.detach()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"batch": 5}, {"lr": 2e-3}, {"final_lr": 5e-4}, {"schedule": "step", "drop_at": 0.5},
+        {"weight_decay": 0.5}, {"betas": (0.5, 0.9)}, {"decoupled": False, "weight_decay": 0.5},
+        {"clip_norm": 1e-9}, {"precision": "bf16"},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_every_knob_of_the_optimiser_changes_the_weights(changes):
+    assert not torch.equal(trained(**changes), trained())
+
+
+def test_compile_compiles_the_training_call(monkeypatch, tmp_path):
+    """With a stand-in for the slow compiler: the compiled call is the one that is trained."""
+    calls = []
+
+    def compiler(function):
+        return lambda *args: (calls.append(1), function(*args))[1]
+
+    monkeypatch.setattr(torch, "compile", compiler)
+    for compiled, expected in ((False, 0), (True, 3)):
+        optim = replace(OPTIM, steps=3, compile=compiled)
+        run = Run(tmp_path / str(compiled))
+        run.folder.mkdir()
+        train(motion_task("forced", optim), optim, run, 0, "compile")
+        assert len(calls) == expected
+
+
+def test_schedules():
+    def rates(name: str) -> list[float]:
+        return [SCHEDULES[name](step / 10, 0.1, 0.75) for step in range(10)]
+
+    assert rates("step") == [1.0] * 8 + [0.1] * 2
+    assert rates("cosine")[0] == 1
+    assert rates("cosine") == sorted(rates("cosine"), reverse=True)
+    assert rates("milestones") == pytest.approx([1, 1, 0.2, 0.2, 0.2, 0.04, 0.04, 0.008, 0.008, 0.008])
+
+
+def test_perplexity():
+    assert perplexity(torch.ones(8)) == pytest.approx(8)
+    assert perplexity(torch.tensor([5.0, 0, 0])) == pytest.approx(1)
+
+
+def test_a_checkpoint_survives_a_torn_write_and_refuses_damage(tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    checkpoint.write(path, {"a": torch.arange(3)}, {"step": 3})
+    (tmp_path / ".checkpoint.safetensors.1.tmp").write_bytes(b"half")
+    tensors, values = checkpoint.read(path)
+    assert values == {"step": 3}
+    assert torch.equal(tensors["a"], torch.arange(3))
+    path.write_bytes(path.read_bytes()[:20])
+    with pytest.raises(InputError, match="not a checkpoint"):
+        checkpoint.read(path)

@@ -1,0 +1,81 @@
+"""The loss terms against the paper's equations written out as loops, and their weighting."""
+
+import math
+
+import pytest
+import tiny
+import torch
+
+from memmlp.motion.body import LOWER, SPARSE_DIM
+from memmlp.training.losses import HandFK, HandPosition, Manual, MotionLoss, NoHand, Uncertainty
+
+BOTH = frozenset({"rotation", "position"})
+DRAW = torch.Generator().manual_seed(0)
+TRUTH = torch.stack([tiny.clip(9, seed) for seed in range(2)])
+MOTION = TRUTH[..., SPARSE_DIM:] + 0.1 * torch.randn(2, 9, 198, generator=DRAW)
+SPARSE = TRUTH[..., :SPARSE_DIM]
+FRAME = tiny.frame()
+
+
+def terms(hand=None, branches=BOTH):
+    loss = MotionLoss(Manual(), hand or HandPosition(), branches)
+    return loss.terms(MOTION, TRUTH[..., SPARSE_DIM:], SPARSE, FRAME)
+
+
+def test_terms_are_the_papers_equations():
+    """Eqs. 1-4, summed over joints and components, mean over time and batch."""
+    truth, batch, time = TRUTH[..., SPARSE_DIM:], 2, 9
+    expected = dict.fromkeys(["rotation", "rotation_velocity", "position", "velocity", "hand"], 0.0)
+    for b in range(batch):
+        for t in range(time):
+            error = MOTION[b, t] - truth[b, t]
+            for joint in range(22):
+                position = error[132 + 3 * joint : 135 + 3 * joint].abs().sum().item()
+                expected["rotation"] += error[6 * joint : 6 * joint + 6].abs().sum().item() / time / batch
+                expected["position"] += position / time / batch
+                expected["hand"] += position / time / batch if joint in (20, 21) else 0
+            if t + 1 < time:
+                step = (truth[b, t + 1] - truth[b, t]) - (MOTION[b, t + 1] - MOTION[b, t])
+                expected["rotation_velocity"] += step[:132].abs().sum().item() / (time - 1) / batch
+                for joint in LOWER:
+                    part = step[132 + 3 * joint : 135 + 3 * joint]
+                    expected["velocity"] += part.abs().sum().item() / (time - 1) / batch
+    assert {name: float(term) for name, term in terms().items()} == pytest.approx(expected, rel=1e-4)
+
+
+def test_hand_by_forward_kinematics_is_of_the_rotation_branch():
+    moved = MOTION.clone()
+    moved[..., 132:] += 1
+    loss = MotionLoss(Manual(), HandFK(), BOTH)
+    args = (TRUTH[..., SPARSE_DIM:], SPARSE, FRAME)
+    assert torch.equal(loss.terms(MOTION, *args)["hand"], loss.terms(moved, *args)["hand"])
+    assert float(loss.terms(TRUTH[..., SPARSE_DIM:], *args)["hand"]) == pytest.approx(0, abs=1e-4)
+
+
+def test_hand_off_and_rotation_only_leave_terms_out():
+    assert "hand" not in terms(NoHand())
+    rotation = frozenset({"rotation"})
+    assert set(terms(HandPosition(), rotation)) == {"rotation", "rotation_velocity"}
+    assert set(terms(HandFK(), rotation)) == {"rotation", "rotation_velocity", "hand"}
+
+
+def test_manual_weights_are_the_papers_and_each_counts():
+    names = ("rotation", "rotation_velocity", "position", "velocity", "hand")
+    ones = {name: torch.tensor(1.0) for name in names}
+    assert float(Manual()(ones)) == pytest.approx(1 + 30 + 0.5 + 0.1 + 0.1)
+    for name in names:
+        assert float(Manual(**{name: 7.0})(ones)) != pytest.approx(float(Manual()(ones)))
+
+
+def test_uncertainty_settles_where_the_weight_is_one_over_the_loss():
+    """The minimum of e^-s L + s is s = ln L."""
+    weighting = Uncertainty(lr=0.05)
+    weighting.build(["rotation", "position"])
+    optimiser = torch.optim.Adam(weighting.parameter_groups())
+    assert optimiser.param_groups[0]["lr"] == 0.05
+    for _ in range(400):
+        optimiser.zero_grad()
+        weighting({"rotation": torch.tensor(4.0), "position": torch.tensor(0.1)}).backward()
+        optimiser.step()
+    assert weighting.weights() == pytest.approx({"rotation": 1 / 4, "position": 10}, rel=1e-2)
+    assert weighting.s["rotation"].item() == pytest.approx(math.log(4), rel=1e-2)

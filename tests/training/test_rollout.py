@@ -1,0 +1,84 @@
+"""How the history of a training step comes about."""
+
+import pytest
+import tiny
+import torch
+
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.dataset import WindowSampler
+from memmlp.networks.memory import NoMemory
+from memmlp.training.rollout import OwnPredictions, PersistentStreams, TeacherForcing
+
+SPLIT = tiny.frames((60, 90))
+
+
+def sampler() -> WindowSampler:
+    return WindowSampler(SPLIT, batch=5, window=7, seed=0)
+
+
+@pytest.mark.parametrize("shift", ["frame", "window"])
+@pytest.mark.parametrize("make", [TeacherForcing, lambda: OwnPredictions(2), lambda: PersistentStreams(5)])
+def test_the_call_is_about_the_drawn_window(shift, make):
+    model, rollout = tiny.model(shift=shift), make()
+    if isinstance(rollout, PersistentStreams):
+        rollout.begin(model)
+    call = rollout.draw(model, SPLIT, sampler(), step=0)
+    clips, end = sampler().draw(0)
+    assert torch.equal(call.truth, SPLIT.segments(clips, end, model.frames))
+    assert torch.equal(call.sparse, call.truth[:, -model.stride :, :SPARSE_DIM])
+    before = SPLIT.segments(clips, end - model.stride, model.memory.length)[..., :SPARSE_DIM]
+    assert torch.equal(call.state["sparse"], before)
+    assert model.training or not isinstance(rollout, OwnPredictions)
+
+
+@pytest.mark.parametrize("shift", ["frame", "window"])
+def test_teacher_forcing_has_the_truth_and_zero_passes_have_nothing(shift):
+    model = tiny.model(shift=shift)
+    call = TeacherForcing().draw(model, SPLIT, sampler(), 0)
+    clips, end = sampler().draw(0)
+    truth = SPLIT.segments(clips, end - model.stride, model.memory.length)
+    torch.testing.assert_close(call.state["motion"], model.frame.encode(truth)[..., SPARSE_DIM:])
+    empty = OwnPredictions(0).draw(model, SPLIT, sampler(), 0)
+    assert float(empty.state["motion"].abs().sum()) == 0
+
+
+@torch.no_grad()
+def test_own_predictions_are_what_the_network_says():
+    """Two passes at shift one frame: the state after calling the network twice on an empty history."""
+    model = tiny.model(shift="frame")
+    clips, end = sampler().draw(3)
+    torch.manual_seed(next(s for s in range(99) if passes(s) == 2))
+    call = OwnPredictions(2).draw(model, SPLIT, sampler(), 3)
+    model.eval()
+    state = model.running_state(SPLIT.segments(clips, end - 3, model.memory.length)[..., :SPARSE_DIM])
+    for back in (2, 1):
+        _, state = model.advance(SPLIT.segments(clips, end - back, 1)[..., :SPARSE_DIM], state)
+    torch.testing.assert_close(call.state, state)
+
+
+def passes(seed: int) -> int:
+    torch.manual_seed(seed)
+    return int(torch.randint(3, ()))
+
+
+def test_streams_go_on_where_they_were():
+    model, rollout = tiny.model(shift="frame"), PersistentStreams(5)
+    rollout.begin(model)
+    first = rollout.draw(model, SPLIT, sampler(), 0)
+    ends = rollout.end.clone()
+    _, state = model.advance(first.sparse, first.state)
+    rollout.keep(state)
+    second = rollout.draw(model, SPLIT, sampler(), 1)
+    going = ends + 1 < SPLIT.lengths[first.clips]
+    assert going.any()
+    assert torch.equal(rollout.end[going], ends[going] + 1)
+    assert torch.equal(second.state["motion"][going], state["motion"][going])
+    assert set(rollout.state_dict()) >= {"clip", "end", "lives", "state_motion", "state_sparse"}
+
+
+def test_no_memory_needs_no_passes():
+    model = tiny.model(NoMemory)
+    calls = []
+    model.stem.register_forward_hook(lambda *args: calls.append(1))
+    OwnPredictions(3).draw(model, SPLIT, sampler(), 0)
+    assert calls == []
