@@ -28,8 +28,8 @@ from memmlp.evaluation import modes as evaluation
 from memmlp.evaluation.ik import LBFGS
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.coordinates import Heading, HeadRelative, World
-from memmlp.motion.dataset import Frames, WindowSampler
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.dataset import MotionDataset, WindowSampler
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import (
     CodeMemory,
     GRUMemory,
@@ -80,7 +80,7 @@ def summary(name: str, values: Tensor) -> Numbers:
     }
 
 
-def frames() -> Frames:
+def frames() -> MotionDataset:
     """Three clips, one shorter than most windows are not."""
     return tiny.frames((60, 45, 80))
 
@@ -93,17 +93,17 @@ def pair() -> tuple[Tensor, Tensor]:
 def features() -> Numbers:
     """Motion -> inputs and targets, and normalised ones."""
     clip = tiny.clip(12)
-    fitted = Frame.fit(World(), tiny.REST, clip)
+    fitted = Normalizer.fit(World(), tiny.REST, clip)
     return summary("frames", clip) | summary("encoded", fitted.encode(clip[None]))
 
 
 def coordinates(kind: type[World]) -> Numbers:
     """There and back."""
-    frame, clip = tiny.frame(kind()), tiny.clip(12)[None]
-    place = frame.place(clip[..., :SPARSE_DIM])
-    encoded = frame.encode(clip)
+    normalizer, clip = tiny.normalizer(kind()), tiny.clip(12)[None]
+    origin = normalizer.origin(clip[..., :SPARSE_DIM])
+    encoded = normalizer.encode(clip)
     motion = encoded[..., SPARSE_DIM:] + 0.1
-    return summary("encoded", encoded) | summary("decoded", frame.decode_motion(motion, place))
+    return summary("encoded", encoded) | summary("decoded", normalizer.decode_motion(motion, origin))
 
 
 def network(model: WindowModel) -> Numbers:
@@ -113,7 +113,7 @@ def network(model: WindowModel) -> Numbers:
     model.train()
     past, new = clip[:, : model.length], clip[:, model.length : model.length + model.frames]
     motion, _ = model.learn(new[..., :SPARSE_DIM], model.true_state(past), new)
-    terms = model.terms(new)
+    terms = model.auxiliary_losses(new)
     (motion.square().mean() + sum(terms.values(), torch.zeros(()))).backward()
     slopes = torch.cat([p.grad.flatten() for p in model.parameters() if p.grad is not None])
     found = summary("learned", motion) | summary("slopes", slopes)
@@ -135,7 +135,7 @@ def vqvae(codebook: str = "ema") -> Numbers:
     torch.manual_seed(3)
     model = VQVAE(codes=8, width=12, encoder_depth=2, codebook=codebook)
     optim = vqvae_optim(3, 16, 1e-3, 0.1)
-    task = VQVAETask(model, tiny.frame(), frames(), frames(), optim, seed=0)
+    task = VQVAETask(model, tiny.normalizer(), frames(), frames(), optim, seed=0)
     return _trained(task, optim) | task.validate()
 
 
@@ -173,14 +173,14 @@ class Line(WindowModel):
     branches = BOTH
 
     def __init__(self) -> None:
-        super().__init__(tiny.frame(World()), 7)
+        super().__init__(tiny.normalizer(World()), 7)
         self.map = nn.Linear(SPARSE_DIM, 198)
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         inputs, kept = self.taken_in(sparse, state)
         return self.map(inputs[:, -(newest or self.frames) :]), kept
 
-    def terms(self, truth: Tensor) -> Terms:
+    def auxiliary_losses(self, truth: Tensor) -> Terms:
         return {"own": self.map.bias.square().sum()}
 
 
@@ -191,7 +191,7 @@ class Squares(Loss):
         super().__init__()
         self.weighting = Fixed({"square": 2.0})
 
-    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         return {"square": (motion - truth).square().mean()}
 
 
@@ -225,7 +225,7 @@ def loss(make: Callable[[], Loss]) -> Numbers:
     predicted, true = pair()
     motion = predicted[..., SPARSE_DIM:].clone().requires_grad_()
     one = make()
-    total, terms = one(motion, true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], tiny.frame(Heading()))
+    total, terms = one(motion, true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], tiny.normalizer(Heading()))
     total.backward()
     groups = [len(group["params"]) for group in one.weighting.parameter_groups()]
     found = {name: float(term.detach()) for name, term in terms.items()} | {"learned": float(sum(groups))}
@@ -245,7 +245,7 @@ def hand(term: NoHand | HandPosition | HandFK) -> Numbers:
     """The hand term."""
     predicted, true = pair()
     terms = term(
-        predicted[..., SPARSE_DIM:], true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], tiny.frame(World())
+        predicted[..., SPARSE_DIM:], true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], tiny.normalizer(World())
     )
     return {name: float(value) for name, value in terms.items()} | {"terms": float(len(terms))}
 
@@ -253,7 +253,7 @@ def hand(term: NoHand | HandPosition | HandFK) -> Numbers:
 def measured() -> Numbers:
     """A clip's report, of both branches, and joints by forward kinematics among it."""
     predicted, true = tiny.clip(30, 1)[:, SPARSE_DIM:], tiny.clip(30, 5)
-    report = evaluation.clip_report(tiny.frame(World()), predicted, true)
+    report = evaluation.clip_report(tiny.normalizer(World()), predicted, true)
     found = {f"{branch} {name}": value for branch, of in report.items() for name, value in of.items()}
     turned = evaluation.local_rotations(predicted)
     return found | metrics.rotations_report(turned, evaluation.local_rotations(true[:, SPARSE_DIM:]))
@@ -273,7 +273,7 @@ def ik() -> Numbers:
     """A few frames brought to the position branch."""
     predicted, true = tiny.clip(6, 1), tiny.clip(6, 5)
     motion = torch.cat([predicted[:, SPARSE_DIM:][:, :132], true[:, SPARSE_DIM:][:, 132:]], 1)
-    (solved,) = LBFGS(4).solutions(tiny.frame(World()), motion, true[:, :SPARSE_DIM]).values()
+    (solved,) = LBFGS(4).solutions(tiny.normalizer(World()), motion, true[:, :SPARSE_DIM]).values()
     return summary("solved", solved)
 
 

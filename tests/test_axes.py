@@ -16,8 +16,8 @@ from memmlp.config.compose import composed
 from memmlp.deploy.export import export
 from memmlp.deploy.parity import TOLERANCE, parity
 from memmlp.evaluation import modes as evaluation
-from memmlp.motion.dataset import Frames
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.dataset import MotionDataset
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.pipeline.experiment import Experiment
 from memmlp.pipeline.run import codes_run
@@ -111,7 +111,7 @@ def train_and_stream(overrides: list[str]) -> Arm:
     run.folder.mkdir(parents=True)
     model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)
     test = data.open("test")
-    short = Frames(test.frames[:40], torch.tensor([0]), torch.tensor([40]), test.names[:1])
+    short = MotionDataset(test.frames[:40], torch.tensor([0]), torch.tensor([40]), test.names[:1])
     torch.manual_seed(0)
     results = evaluation.evaluate(model, short, experiment.evaluation.modes, 4, experiment.evaluation.ik)
     torch.manual_seed(0)
@@ -179,7 +179,7 @@ def network(overrides: list[str]) -> MemMLP:
     torch.manual_seed(0)
     architecture = build_experiment(composed(overrides)).architecture
     codes = architecture.vqvae() if architecture.uses_codes else None
-    model = architecture.build(Frame.raw(architecture.coordinates, tiny.REST), codes)
+    model = architecture.build(Normalizer.raw(architecture.coordinates, tiny.REST), codes)
     for name, buffer in model.named_buffers():
         if name.endswith("codebook.vectors"):
             buffer.normal_()

@@ -11,9 +11,9 @@ import torch
 
 from memmlp.motion.body import FRAME_DIM, builtin_rest_joints
 from memmlp.motion.coordinates import HeadRelative, World
-from memmlp.motion.dataset import Frames
+from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.features import motion_frames
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
 from memmlp.networks.mem_mlp import MemMLP
@@ -40,18 +40,20 @@ def clip(length: int, seed: int = 0, spread: float = 0.3) -> torch.Tensor:
     return motion_frames(torch.tensor(poses), torch.tensor(trans), REST).float()
 
 
-def frames(lengths: tuple[int, ...] = (60, 45, 80), seed: int = 0) -> Frames:
+def frames(lengths: tuple[int, ...] = (60, 45, 80), seed: int = 0) -> MotionDataset:
     """A split with clips of these lengths."""
     clips = [clip(length, seed + i) for i, length in enumerate(lengths)]
     starts = torch.tensor([0, *np.cumsum(lengths)[:-1]])
-    return Frames(torch.cat(clips), starts, torch.tensor(lengths), [f"clip{i}" for i in range(len(lengths))])
+    return MotionDataset(
+        torch.cat(clips), starts, torch.tensor(lengths), [f"clip{i}" for i in range(len(lengths))]
+    )
 
 
-def frame(coordinates: World | None = None) -> Frame:
+def normalizer(coordinates: World | None = None) -> Normalizer:
     """World <-> network space with made-up statistics."""
     draw = torch.Generator().manual_seed(5)
     std = 0.2 + torch.rand(FRAME_DIM, generator=draw)
-    return Frame(coordinates or HeadRelative(), REST, 0.1 * torch.randn(FRAME_DIM, generator=draw), std)
+    return Normalizer(coordinates or HeadRelative(), REST, 0.1 * torch.randn(FRAME_DIM, generator=draw), std)
 
 
 def vqvae() -> VQVAE:
@@ -88,7 +90,7 @@ def model(
     slot = memory(kind, **changes)
     torch.manual_seed(seed)
     head = predictor(1, memory_block=slot.memory_block, **SIZES)
-    return MemMLP(frame(coordinates), slot, head, depth=DEPTH, **SIZES).eval()
+    return MemMLP(normalizer(coordinates), slot, head, depth=DEPTH, **SIZES).eval()
 
 
 REFERENCES: dict[str, Callable[..., WindowModel]] = {
@@ -108,4 +110,4 @@ REFERENCE_LOSSES: dict[str, type[Loss]] = {
 def reference(name: str, coordinates: World | None = None, seed: int = 0, **changes) -> WindowModel:
     """A tiny reference network with random weights, in evaluation mode."""
     torch.manual_seed(seed)
-    return REFERENCES[name](frame(coordinates), **changes).eval()
+    return REFERENCES[name](normalizer(coordinates), **changes).eval()

@@ -13,13 +13,13 @@ from memmlp.live.stream import Pose, Stream
 from memmlp.motion.body import TRACKED
 from memmlp.motion.features import motion_frames
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.window_model import WindowModel
 
 
 def at_ease(network: WindowModel, frames: torch.Tensor) -> WindowModel:
     """The network with random weights, but about the mean pose of frames (N, 252), as a person stands."""
-    network.frame = Frame.fit(network.frame.coordinates, tiny.REST, frames)
+    network.normalizer = Normalizer.fit(network.normalizer.coordinates, tiny.REST, frames)
     return network
 
 

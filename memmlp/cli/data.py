@@ -120,11 +120,11 @@ def prepare(
     strict: bool,
 ) -> None:
     """Write the memory-mappable cache of a folder of AMASS npz files, and its manifest."""
-    from memmlp.motion.prepare import Source
+    from memmlp.motion.prepare import ClipFolder
     from memmlp.motion.prepare import prepare as run
 
     chosen = _split(split, val, test, seed, group)
-    _show_manifest(run(Source(root, chosen, body, min_frames, strict), out))
+    _show_manifest(run(ClipFolder(root, chosen, body, min_frames, strict), out))
 
 
 @data.command("inspect")

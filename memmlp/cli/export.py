@@ -13,7 +13,7 @@ from memmlp.cli.options import outputs_option
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from memmlp.networks.streaming import Stream
+    from memmlp.networks.streaming import StreamingGraph
 
 
 @click.command("export")
@@ -77,7 +77,7 @@ def export(
     from memmlp.deploy.export import export as export_network
     from memmlp.deploy.parity import TOLERANCE, parity
     from memmlp.live.full import export_full, full_parity
-    from memmlp.networks.streaming import Stream
+    from memmlp.networks.streaming import StreamingGraph
     from memmlp.runs.lookup import find_run
 
     found = find_run(outputs, run)
@@ -100,7 +100,7 @@ def export(
     network = GRAPHS[graph](model)
     test = data.open("test").clips()
     if precision == "int8":
-        if scope == "full" or not isinstance(network, Stream):
+        if scope == "full" or not isinstance(network, StreamingGraph):
             raise InputError("--precision int8: allowed with --scope network and a streaming graph")
         write_int8(network, out, found.id, data.open("train").clips(), test, max_growth / 100)
         return
@@ -117,7 +117,12 @@ def export(
 
 
 def write_int8(
-    network: Stream, out: Path, run_id: str, train: list[Tensor], test: list[Tensor], max_growth: float
+    network: StreamingGraph,
+    out: Path,
+    run_id: str,
+    train: list[Tensor],
+    test: list[Tensor],
+    max_growth: float,
 ) -> None:
     """Write the int8 file if it is as accurate as asked; say what it costs."""
     import tempfile
@@ -129,7 +134,7 @@ def write_int8(
         exact, quantised = Path(folder) / "fp32.onnx", Path(folder) / "int8.onnx"
         export_network(network, exact, run_id)
         quantise(exact, quantised, network.ends, train)
-        cost = compared(exact, quantised, network.frame, test)
+        cost = compared(exact, quantised, network.normalizer, test)
         said = ", ".join(
             f"{name} {cost['fp32'][name]:.2f} -> {cost['int8'][name]:.2f}" for name in ("MPJPE", "Jitter")
         )

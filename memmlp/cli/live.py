@@ -13,7 +13,7 @@ from memmlp.cli.options import Finite, outputs_option
 if TYPE_CHECKING:
     import numpy as np
 
-    from memmlp.live.player.sources import Clip, ClipSource, Source
+    from memmlp.live.player.sources import ClipSource, PoseSource, TrackedClip
 
 PORT = click.IntRange(1, 65535)
 
@@ -76,7 +76,7 @@ def live(
 
 def source_of(
     network: str, clip: str | None, udp: int | None, osc: int | None, space: str, hz: float, outputs: Path
-) -> Source:
+) -> PoseSource:
     """The source that the options name."""
     from memmlp.live.player.packets import from_json, from_osc
     from memmlp.live.player.sources import PacketSource
@@ -97,13 +97,13 @@ def clip_source(
     return ClipSource(clip_of(network, clip, outputs), hz, rounds)
 
 
-def clip_of(network: str, clip: str | None, outputs: Path) -> Clip:
+def clip_of(network: str, clip: str | None, outputs: Path) -> TrackedClip:
     """A test clip of a run, or an AMASS npz on the built-in body."""
     from memmlp.common.errors import InputError
-    from memmlp.live.player.sources import Clip
+    from memmlp.live.player.sources import TrackedClip
 
     if clip is not None and clip.endswith(".npz"):
-        return Clip(Path(clip).stem, npz_frames(Path(clip)))
+        return TrackedClip(Path(clip).stem, npz_frames(Path(clip)))
     if network.endswith(".onnx"):
         raise InputError(
             f"{network}: has no test clips; allowed with it are --clip FILE.npz, --udp and --osc"
@@ -112,7 +112,7 @@ def clip_of(network: str, clip: str | None, outputs: Path) -> Clip:
 
     test = opened(outputs, network).test
     index = 0 if clip is None else clip_index(test, clip)
-    return Clip(test.names[index], test.clip(index).numpy())
+    return TrackedClip(test.names[index], test.clip(index).numpy())
 
 
 def npz_frames(path: Path) -> np.ndarray:
@@ -143,7 +143,7 @@ def sent(source: ClipSource, udp: int | None, osc: int | None, space: str) -> No
     click.echo(f"{send(source, port, pack, space_of(space))} packets sent")
 
 
-def watched(network: str, source: Source, port: int, no_browser: bool, outputs: Path) -> None:
+def watched(network: str, source: PoseSource, port: int, no_browser: bool, outputs: Path) -> None:
     """Play the source through the network, and serve the page, until Ctrl-C."""
     import threading
     import webbrowser

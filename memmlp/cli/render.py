@@ -135,7 +135,7 @@ def predicted(run: Opened, clip: str, last: int, branch: str, mode: str) -> tupl
     motion = evaluation.MODES[mode](model, [frames])[0][:last]
     frames = frames[:last]
     positions = {
-        "rotation": lambda: model.frame.pose(motion, frames[:, :SPARSE_DIM]),
+        "rotation": lambda: model.normalizer.pose(motion, frames[:, :SPARSE_DIM]),
         "position": lambda: evaluation.joint_positions(motion),
     }[branch]()
     return evaluation.joint_positions(frames[:, SPARSE_DIM:]).numpy(), positions.numpy()

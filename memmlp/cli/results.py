@@ -14,7 +14,7 @@ from memmlp.cli.options import outputs_option
 from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
-    from memmlp.report.markdown import Source
+    from memmlp.report.markdown import KeptTable
     from memmlp.report.store import Kept
     from memmlp.tables.table import Table
 
@@ -100,15 +100,15 @@ def docs(folder: Path, check: bool) -> None:
     click.echo(f"{len(made)} pages, {len(differing)} {'differ' if check else 'written'}")
 
 
-def sources(folder: Path) -> dict[str, Source]:
+def sources(folder: Path) -> dict[str, KeptTable]:
     """The tables of all results that are kept below a folder, by the files' names."""
-    from memmlp.report.markdown import Source
+    from memmlp.report.markdown import KeptTable
     from memmlp.report.store import load_kept
 
     found = {}
     for path in sorted((folder / "data").glob("*.json")):
         kept = load_kept(path)
-        found[path.stem] = Source(kept, _table(kept))
+        found[path.stem] = KeptTable(kept, _table(kept))
     return found
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from memmlp.pipeline.experiment import Experiment
     from memmlp.search.spec import Search, Value
     from memmlp.search.study import Study
-    from memmlp.sweep.plan import Task
+    from memmlp.sweep.plan import RunTask
 
 
 @click.command("tune")
@@ -120,7 +120,7 @@ def _check_space(setup: Setup) -> str:
     return f"{first.id}, validated every {first.config['optim']['validate_every']} steps"  # and may be pruned
 
 
-def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[Task]]:
+def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]:
     """The runs of a trial with those values, seed by seed, the data prepared for them."""
     from memmlp.config.plan import tasks_of
 

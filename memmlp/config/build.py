@@ -25,12 +25,12 @@ from memmlp.evaluation.ik import IK, LBFGS, NoIK
 from memmlp.evaluation.stage import Evaluation
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.coordinates import Heading, HeadRelative, World
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.architecture import (
     VQVAE_SETTINGS,
     Architecture,
+    BaselineArchitecture,
     MemMLPArchitecture,
-    ReferenceArchitecture,
 )
 from memmlp.networks.memory import Memory
 from memmlp.networks.vqvae import VQVAE
@@ -84,7 +84,7 @@ def untrained(overrides: Sequence[str]) -> WindowModel:
     architecture = build_architecture(composed(list(overrides)))
     torch.manual_seed(0)
     codes = architecture.vqvae() if architecture.uses_codes else None
-    frame = Frame.raw(architecture.coordinates, torch.as_tensor(builtin_rest_joints()))
+    frame = Normalizer.raw(architecture.coordinates, torch.as_tensor(builtin_rest_joints()))
     return architecture.build(frame, codes).eval()
 
 
@@ -106,7 +106,7 @@ def build_architecture(cfg: DictConfig) -> Architecture:
     space = {"coordinates": COORDINATES[cfg.frame.coordinates](), "normalize": cfg.frame.normalize}
     vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in VQVAE_SETTINGS})
     if "_target_" in cfg.model:
-        return ReferenceArchitecture(**space, vqvae=vqvae, network=built(cfg.model))
+        return BaselineArchitecture(**space, vqvae=vqvae, network=built(cfg.model))
     memory, kind = built(cfg.memory), memory_class(cfg)
     return MemMLPArchitecture(
         **space,

@@ -7,11 +7,11 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from memmlp.config.components import built
-from memmlp.motion.prepare import Source
-from memmlp.motion.source import Motion
+from memmlp.motion.prepare import ClipFolder
+from memmlp.motion.source import MotionSource
 
 
-def build_motion(cfg: DictConfig) -> Motion:
+def build_motion(cfg: DictConfig) -> MotionSource:
     """Where the motion is; a synthetic folder's name has its length and seed, so it is never stale."""
     data, root = cfg.data, Path(cfg.data.root)
     generate = None
@@ -25,5 +25,5 @@ def build_motion(cfg: DictConfig) -> Motion:
             synthesize(folder, minutes=minutes, seed=seed)
 
     split = built(data.split)
-    source = Source(root, split, str(data.body), data.min_frames, data.strict)
-    return Motion(source, generate, Path(cfg.paths.outputs) / "cache")
+    source = ClipFolder(root, split, str(data.body), data.min_frames, data.strict)
+    return MotionSource(source, generate, Path(cfg.paths.outputs) / "cache")

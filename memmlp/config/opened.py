@@ -11,7 +11,7 @@ from torch import Tensor
 
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment, config_of, device
-from memmlp.motion.dataset import Frames
+from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.source import Prepared
 from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.identity import trained_by
@@ -27,7 +27,7 @@ class Opened(NamedTuple):
     data: Prepared
 
     @property
-    def test(self) -> Frames:
+    def test(self) -> MotionDataset:
         """The test clips, on the experiment's device."""
         return self.data.open("test").to(self.experiment.device)
 
@@ -54,12 +54,12 @@ def opened(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequen
     return Opened(run, experiment, data)
 
 
-def clip_of(test: Frames, name: str) -> Tensor:
+def clip_of(test: MotionDataset, name: str) -> Tensor:
     """All frames (N, 252) of a test clip. Raises InputError where there is none of that name."""
     return test.clip(clip_index(test, name))
 
 
-def clip_index(test: Frames, name: str) -> int:
+def clip_index(test: MotionDataset, name: str) -> int:
     """The place of a test clip. Raises InputError, which lists them, where there is none of that name."""
     if name not in test.names:
         raise InputError(f"--clip {name}: no such test clip; allowed are {', '.join(test.names)}")

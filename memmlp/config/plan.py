@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json, write_json
 from memmlp.config.shipped import shipped
-from memmlp.sweep.plan import Entry, Plan, Task, unique
+from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 from memmlp.sweep.spec import Arm, Sweep, load_sweep
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def orphans(sweep: Sweep, plan: Plan) -> list[Entry]:
 
 def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[str, Any]] | None]:
     """The plan, and what it relies on of the data; None where some is not prepared."""
-    cells: list[tuple[Entry, list[Task]]] = []
+    cells: list[tuple[Entry, list[RunTask]]] = []
     data: dict[str, dict[str, Any]] = {}
     complete = True
     for arm in sweep.runnable():
@@ -110,12 +110,12 @@ def _experiments(sweep: Sweep, arm: Arm, outputs: Path) -> Iterable[tuple[int, E
         raise InputError(f"sweep {sweep.name}, arm '{arm.label}': {error}") from None
 
 
-def tasks_of(experiment: Experiment, data: str) -> list[Task]:
+def tasks_of(experiment: Experiment, data: str) -> list[RunTask]:
     """The runs of an experiment on prepared data of that digest, the last one its own."""
     own = experiment.identity(data)
     above = own.upstream.id if own.upstream else None
-    upstream = [Task(above, "vqvae", experiment.config)] if above else []
-    return [*upstream, Task(own.id, "memmlp", experiment.config, above, experiment.stages, own.what)]
+    upstream = [RunTask(above, "vqvae", experiment.config)] if above else []
+    return [*upstream, RunTask(own.id, "memmlp", experiment.config, above, experiment.stages, own.what)]
 
 
 def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[str, Any]]) -> str | None:

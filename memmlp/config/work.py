@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from memmlp.common.errors import InputError
-from memmlp.sweep.plan import Plan, Task
+from memmlp.sweep.plan import Plan, RunTask
 from memmlp.sweep.worker import Cancelled, Presence, directed
 from memmlp.sweep.worker import work as work_on
 
@@ -25,7 +25,7 @@ def work_alone(path: str) -> None:
     work_on(Path(path), partial(perform, Path(path), 0), lambda: directed(Path(path)))
 
 
-def perform(path: Path, threads: int, plan: Plan, task: Task) -> None:
+def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
     """Bring the task's run to its end; Cancelled if the plan no longer wants it.
 
     threads: of torch, where the config leaves them open; 0 for torch's choice.
@@ -46,7 +46,7 @@ def perform(path: Path, threads: int, plan: Plan, task: Task) -> None:
         run(experiment, partial(check_wanted, path, task.id))
 
 
-def check_identity(experiment: Experiment, task: Task) -> None:
+def check_identity(experiment: Experiment, task: RunTask) -> None:
     """Raise InputError where this code takes the task's config for another run than the plan does."""
     from memmlp.config.plan import tasks_of
 

@@ -12,11 +12,11 @@ from memmlp.deploy import latency
 from memmlp.deploy.export import export
 from memmlp.deploy.parity import TOLERANCE, parity
 from memmlp.deploy.quantization import compared, quantise
-from memmlp.networks.streaming import Stream, streaming
+from memmlp.networks.streaming import StreamingGraph, streaming
 from memmlp.networks.window_model import WindowModel
 from memmlp.runs.deployed import Deployed
 
-GRAPHS: dict[str, Callable[[WindowModel], WindowModel | Stream]] = {
+GRAPHS: dict[str, Callable[[WindowModel], WindowModel | StreamingGraph]] = {
     "naive": lambda model: model,
     "streaming": streaming,
     "auto": lambda model: streaming(model) if model.settled else model,
@@ -41,7 +41,7 @@ class Deployment:
     def ship(
         self,
         model: WindowModel,
-        place: Deployed,
+        deployed: Deployed,
         run_id: str,
         train: Sequence[Tensor],
         test: Sequence[Tensor],
@@ -49,30 +49,35 @@ class Deployment:
         """Write a run's ONNX files, proved on the first test clip; their sizes, times and int8's accuracy.
 
         Args:
-            place: where the files go. run_id: of the run, for their metadata. train, test: clips (N, 252).
+            deployed: where the files go. run_id: of the run, for their metadata. train, test: clips (N, 252).
 
         Raises:
             RuntimeError: where ONNX Runtime's numbers are not torch's.
         """
-        place.folder.mkdir(parents=True, exist_ok=True)
+        deployed.folder.mkdir(parents=True, exist_ok=True)
         network = GRAPHS[self.graph](model)
-        export(network, place.onnx, run_id)
-        worst = parity(model, place.onnx, test[0])
+        export(network, deployed.onnx, run_id)
+        worst = parity(model, deployed.onnx, test[0])
         if not worst <= TOLERANCE:
             raise RuntimeError(
-                f"{place.onnx}: ONNX Runtime differs from torch by {worst:.2e} (> {TOLERANCE:.0e})"
+                f"{deployed.onnx}: ONNX Runtime differs from torch by {worst:.2e} (> {TOLERANCE:.0e})"
             )
-        record = latency.measure(place.onnx, self.latency_steps) | latency.size(model, network, place.onnx)
-        record |= {"graph": "streaming" if isinstance(network, Stream) else "naive", "onnx_parity": worst}
-        if self.precision == "int8" and isinstance(network, Stream):
-            record["int8"] = self._int8(network, place, train, test)
+        record = latency.measure(deployed.onnx, self.latency_steps) | latency.size(
+            model, network, deployed.onnx
+        )
+        record |= {
+            "graph": "streaming" if isinstance(network, StreamingGraph) else "naive",
+            "onnx_parity": worst,
+        }
+        if self.precision == "int8" and isinstance(network, StreamingGraph):
+            record["int8"] = self._int8(network, deployed, train, test)
         return record
 
     def _int8(
-        self, network: Stream, place: Deployed, train: Sequence[Tensor], test: Sequence[Tensor]
+        self, network: StreamingGraph, deployed: Deployed, train: Sequence[Tensor], test: Sequence[Tensor]
     ) -> dict[str, Any]:
         """Write the int8 file beside the float32 one: its accuracy, time and size."""
-        quantise(place.onnx, place.int8, network.ends, train)
-        cost = compared(place.onnx, place.int8, network.frame, test)
-        measured = latency.measure(place.int8, self.latency_steps)
-        return {**cost, **measured, "onnx_bytes": place.int8.stat().st_size}
+        quantise(deployed.onnx, deployed.int8, network.ends, train)
+        cost = compared(deployed.onnx, deployed.int8, network.normalizer, test)
+        measured = latency.measure(deployed.int8, self.latency_steps)
+        return {**cost, **measured, "onnx_bytes": deployed.int8.stat().st_size}

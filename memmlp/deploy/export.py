@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from memmlp import __version__
 from memmlp.deploy.parity import deterministic
 from memmlp.motion.body import FEATURES, FPS, JOINTS, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
-from memmlp.networks.streaming import Stream
+from memmlp.networks.streaming import StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
 OPSET = 18
@@ -28,7 +28,7 @@ OPSET = 18
 class StreamStep(nn.Module):
     """One step of the live stream with flat inputs and outputs."""
 
-    def __init__(self, model: WindowModel | Stream):
+    def __init__(self, model: WindowModel | StreamingGraph):
         super().__init__()
         self.model = model
         self.names = list(model.initial_state(1))
@@ -42,7 +42,7 @@ class StreamStep(nn.Module):
         return rotation, position, *(new[name] for name in self.names)
 
 
-def export(model: WindowModel | Stream, path: Path, run_id: str) -> None:
+def export(model: WindowModel | StreamingGraph, path: Path, run_id: str) -> None:
     """Write the model's streaming step, on the CPU in float32, as one ONNX file with its metadata."""
     step = StreamStep(model.cpu().eval())
     names = [f"state.{name}" for name in step.names]
@@ -90,12 +90,12 @@ def save(
     temporary.replace(path)
 
 
-def metadata(model: WindowModel | Stream, run_id: str) -> dict[str, str]:
+def metadata(model: WindowModel | StreamingGraph, run_id: str) -> dict[str, str]:
     """What a program needs to know to drive the file."""
     return {
         "joints": json.dumps(JOINTS),
         "parents": json.dumps(PARENTS),
-        "rest": json.dumps(model.frame.rest.tolist()),
+        "rest": json.dumps(model.normalizer.rest.tolist()),
         "branches": json.dumps(sorted(model.branches)),
         "fps": str(FPS),
         "T": str(model.frames),

@@ -19,7 +19,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from memmlp.deploy.session import OnnxStream
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.networks.streaming import Stream
+from memmlp.networks.streaming import StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
 WARM_UP = 30
@@ -93,7 +93,7 @@ def profile(path: Path, steps: int = 100) -> list[tuple[str, str, float, float]]
     return sorted(rows, key=lambda row: -row[2] * row[3])
 
 
-def size(model: WindowModel, step: WindowModel | Stream, path: Path) -> dict[str, Any]:
+def size(model: WindowModel, step: WindowModel | StreamingGraph, path: Path) -> dict[str, Any]:
     """Parameters, MACs and FLOPs of the network, which the papers count, MACs of the step, the file's bytes.
 
     A FLOP is a multiplication or an addition of the matrix products, a MAC one of each.
@@ -113,7 +113,7 @@ def size(model: WindowModel, step: WindowModel | Stream, path: Path) -> dict[str
 
 
 @torch.no_grad()
-def macs(model: WindowModel | Stream) -> int:
+def macs(model: WindowModel | StreamingGraph) -> int:
     """Multiply-adds of the matrix products of one streaming step."""
     with FlopCounterMode(display=False) as counter:
         model.advance(torch.zeros(1, 1, SPARSE_DIM), model.initial_state(1), 1)

@@ -45,7 +45,7 @@ def parity(model: WindowModel, path: Path, clip: Tensor) -> float:
     model, clip = model.cpu().eval(), clip.cpu()
     made, found = in_torch(model, clip), streamed(OnnxStream(path), clip)
     if "position" not in model.branches:
-        exact = copy.deepcopy(model.frame).double()
+        exact = copy.deepcopy(model.normalizer).double()
         positions = exact.pose(found.double(), clip[:, :SPARSE_DIM].double())
         made = torch.cat([made[:, ROTATION], positions.flatten(1)], 1)
     return float((made - found).abs().max())

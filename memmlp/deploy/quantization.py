@@ -22,7 +22,7 @@ from memmlp.deploy.parity import streamed
 from memmlp.deploy.session import OnnxStream
 from memmlp.evaluation.modes import rotations_report
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 
 MAX_GROWTH = 0.01
 """Of MPJPE, up to which int8 may stand for float32."""
@@ -97,7 +97,7 @@ def _inner_layers(graph: onnx.ModelProto, ends: Sequence[str]) -> list[str]:
     ]
 
 
-def accuracy(path: Path, frame: Frame, clips: Sequence[Tensor]) -> dict[str, float]:
+def accuracy(path: Path, normalizer: Normalizer, clips: Sequence[Tensor]) -> dict[str, float]:
     """Means over clips (N, 252) of the rotation branch's metrics, streamed in ONNX Runtime.
 
     At most 20,000 frames of them are streamed, of each clip the same share.
@@ -106,12 +106,12 @@ def accuracy(path: Path, frame: Frame, clips: Sequence[Tensor]) -> dict[str, flo
     rows = []
     for clip in clips:
         truth = clip[: max(int(share * len(clip)), 2)]
-        rows.append(rotations_report(frame, streamed(stream, truth), truth))
+        rows.append(rotations_report(normalizer, streamed(stream, truth), truth))
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
 
-def compared(exact: Path, quantised: Path, frame: Frame, clips: Sequence[Tensor]) -> dict[str, Any]:
+def compared(exact: Path, quantised: Path, normalizer: Normalizer, clips: Sequence[Tensor]) -> dict[str, Any]:
     """What int8 costs: metrics of both on test clips, MPJPE's growth, and whether it may be the default."""
-    before, after = (accuracy(path, frame, clips) for path in (exact, quantised))
+    before, after = (accuracy(path, normalizer, clips) for path in (exact, quantised))
     growth = after["MPJPE"] / before["MPJPE"] - 1
     return {"fp32": before, "int8": after, "growth": growth, "default": growth <= MAX_GROWTH}

@@ -15,7 +15,7 @@ from torch.autograd.functional import jacobian
 
 from memmlp.motion.body import HEAD, N_JOINTS, POSITION, ROTATION, SPARSE_POSITION
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics, matrix_to_sixd, sixd_to_matrix
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 
 Objective = Callable[[Tensor, Tensor], Tensor]
 
@@ -23,7 +23,7 @@ Objective = Callable[[Tensor, Tensor], Tensor]
 class NoIK:
     """No third result beside the two branches."""
 
-    def solutions(self, frame: Frame, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
+    def solutions(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
         """None."""
         return {}
 
@@ -50,22 +50,22 @@ class LBFGS:
     iterations: int = 15
     chunk: int = 4096
 
-    def solutions(self, frame: Frame, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
+    def solutions(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
         """The motion (N, 198) with the rotations that fit best, as "combined".
 
         Args:
             motion: predicted (N, 198), world. sparse: inputs (N, 54).
         """
         parts = zip(motion.split(self.chunk), sparse.split(self.chunk), strict=True)
-        rotations = torch.cat([self.solve(frame, *part) for part in parts])
+        rotations = torch.cat([self.solve(normalizer, *part) for part in parts])
         return {"combined": torch.cat([rotations, motion[:, POSITION]], -1)}
 
-    def solve(self, frame: Frame, motion: Tensor, sparse: Tensor) -> Tensor:
+    def solve(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> Tensor:
         """Rotations (N, 132) in 6D, frame by frame, whose joints are nearest to the position branch's."""
         start = sixd_to_matrix(motion[:, ROTATION].double().unflatten(-1, (N_JOINTS, 6)))
         head = sparse[:, SPARSE_POSITION][:, :3].double()
         target = motion[:, POSITION].double().unflatten(-1, (N_JOINTS, 3)) - head[:, None]
-        distance = JointDistance(start, target, frame.rest.double())
+        distance = JointDistance(start, target, normalizer.rest.double())
         increment = minimise(distance, torch.zeros_like(start[..., 0]).flatten(1), self.iterations)
         return matrix_to_sixd(distance.turned(increment)).flatten(1).to(motion.dtype)
 
@@ -112,7 +112,7 @@ class JointDistance:
         return positions - positions[:, HEAD : HEAD + 1]
 
 
-class Step(NamedTuple):
+class Curvature(NamedTuple):
     """A change of the variables and of the gradient (N, D), and 1 / their product (N,), 0 where useless."""
 
     x: Tensor
@@ -133,7 +133,7 @@ def minimise(objective: Objective, x: Tensor, iterations: int, history: int = 10
     """
     everyone = torch.arange(len(x), device=x.device)
     value, gradient = value_and_gradient(objective, x, everyone)
-    steps: list[Step] = []
+    steps: list[Curvature] = []
     for _ in range(iterations):
         direction = -two_loop(gradient, steps)
         after, value = line_search(objective, x, value, gradient, direction)
@@ -152,14 +152,14 @@ def value_and_gradient(objective: Objective, x: Tensor, rows: Tensor) -> tuple[T
     return value.detach(), gradient
 
 
-def curvature(x: Tensor, gradient: Tensor) -> Step:
+def curvature(x: Tensor, gradient: Tensor) -> Curvature:
     """The step of these changes; none for a row without positive curvature."""
     product = (x * gradient).sum(-1)
     useful = product > CURVATURE * gradient.square().sum(-1)
-    return Step(x, gradient, torch.where(useful, 1 / torch.where(useful, product, 1), 0))
+    return Curvature(x, gradient, torch.where(useful, 1 / torch.where(useful, product, 1), 0))
 
 
-def two_loop(gradient: Tensor, steps: list[Step]) -> Tensor:
+def two_loop(gradient: Tensor, steps: list[Curvature]) -> Tensor:
     """The inverse Hessian's estimate times the gradient (N, D)."""
     q, weights = gradient, []
     for step in reversed(steps):
@@ -172,7 +172,7 @@ def two_loop(gradient: Tensor, steps: list[Step]) -> Tensor:
     return q
 
 
-def first_guess(gradient: Tensor, steps: list[Step]) -> Tensor:
+def first_guess(gradient: Tensor, steps: list[Curvature]) -> Tensor:
     """The inverse Hessian (N,) as a number: from the newest useful step, at first at most 1 / |gradient|."""
     length = 1 / gradient.norm(dim=-1).clamp_min(1)
     for step in steps:

@@ -19,16 +19,16 @@ from memmlp.common.progress import track
 from memmlp.evaluation import metrics
 from memmlp.evaluation.ik import IK, NoIK
 from memmlp.motion.body import N_JOINTS, POSITION, ROTATION, SPARSE_DIM
-from memmlp.motion.dataset import Frames
+from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.geometry import sixd_to_matrix
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import State
 
 
-class Network(Protocol):
+class Evaluable(Protocol):
     """What can be evaluated: Mem-MLP, or anything that moves in time as it does."""
 
-    frame: Frame
+    normalizer: Normalizer
     frames: int
 
     @property
@@ -42,12 +42,12 @@ class Network(Protocol):
         """New inputs (B, n, 54) -> motion (B, newest or T, 198) in the world, and the new state."""
 
 
-def stream(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
+def stream(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
     """Motion (N, 198) in the world of clips' frames (N, 252), frame by frame."""
     return frame_by_frame(network, clips, 1)
 
 
-def window(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
+def window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
     """Motion (N, 198) in the world of clips' frames (N, 252), by non-overlapping windows."""
     if 0 < network.shift < network.frames:
         return frame_by_frame(network, clips, network.frames)
@@ -55,7 +55,7 @@ def window(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
 
 
 @torch.no_grad()
-def frame_by_frame(network: Network, clips: Sequence[Tensor], size: int) -> list[Tensor]:
+def frame_by_frame(network: Evaluable, clips: Sequence[Tensor], size: int) -> list[Tensor]:
     """Motion (N, 198) of clips (N, 252), of each `size` frames (and those left) as the last call made it."""
     order = sorted(range(len(clips)), key=lambda i: -len(clips[i]))
     lengths = [len(clips[i]) for i in order]
@@ -74,7 +74,7 @@ def frame_by_frame(network: Network, clips: Sequence[Tensor], size: int) -> list
 
 
 @torch.no_grad()
-def window_by_window(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
+def window_by_window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
     """Motion (N, 198) of clips (N, 252), T new frames at each call."""
     size = network.frames
     padded = [_at_least(clip[:, :SPARSE_DIM], size) for clip in clips]
@@ -92,11 +92,11 @@ def window_by_window(network: Network, clips: Sequence[Tensor]) -> list[Tensor]:
     return [whole[-len(clip) :] for whole, clip in zip(motion, clips, strict=True)]
 
 
-MODES: dict[str, Callable[[Network, Sequence[Tensor]], list[Tensor]]] = {"window": window, "stream": stream}
+MODES: dict[str, Callable[[Evaluable, Sequence[Tensor]], list[Tensor]]] = {"window": window, "stream": stream}
 
 
 def evaluate(
-    network: Network, frames: Frames, modes: Sequence[str], batch: int, ik: IK | None = None
+    network: Evaluable, frames: MotionDataset, modes: Sequence[str], batch: int, ik: IK | None = None
 ) -> dict[str, Any]:
     """Metrics of a split: `{"mean": {mode: {branch: {metric: value}}}, "clips": [...]}`.
 
@@ -110,32 +110,32 @@ def evaluate(
     ]
     for mode in modes:
         for row, clip, motion in zip(rows, clips, predict(network, clips, mode, batch), strict=True):
-            row[mode] = clip_report(network.frame, motion, clip, ik)
+            row[mode] = clip_report(network.normalizer, motion, clip, ik)
     return {"mean": {mode: _mean([row[mode] for row in rows]) for mode in modes}, "clips": rows}
 
 
-def predict(network: Network, clips: Sequence[Tensor], mode: str, batch: int) -> list[Tensor]:
+def predict(network: Evaluable, clips: Sequence[Tensor], mode: str, batch: int) -> list[Tensor]:
     """Motion (N, 198) of each clip (N, 252), at most `batch` clips side by side."""
     groups = [clips[i : i + batch] for i in range(0, len(clips), batch)]
     return [motion for group in groups for motion in MODES[mode](network, group)]
 
 
 def clip_report(
-    frame: Frame, motion: Tensor, truth: Tensor, ik: IK | None = None
+    normalizer: Normalizer, motion: Tensor, truth: Tensor, ik: IK | None = None
 ) -> dict[str, dict[str, float]]:
     """Metrics of both branches and of what `ik` makes of them, for motion (N, 198) and truth (N, 252)."""
     sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
     position = metrics.positions_report(joint_positions(motion), joint_positions(target))
-    report = {"rotation": rotations_report(frame, motion, truth), "position": position}
-    solved = (ik or NoIK()).solutions(frame, motion, sparse)
-    return report | {name: rotations_report(frame, result, truth) for name, result in solved.items()}
+    report = {"rotation": rotations_report(normalizer, motion, truth), "position": position}
+    solved = (ik or NoIK()).solutions(normalizer, motion, sparse)
+    return report | {name: rotations_report(normalizer, result, truth) for name, result in solved.items()}
 
 
-def rotations_report(frame: Frame, motion: Tensor, truth: Tensor) -> dict[str, float]:
+def rotations_report(normalizer: Normalizer, motion: Tensor, truth: Tensor) -> dict[str, float]:
     """Metrics of the rotations of motion (N, 198), their joints by forward kinematics; truth (N, 252)."""
     sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
     report = metrics.rotations_report(local_rotations(motion), local_rotations(target))
-    return report | metrics.positions_report(frame.pose(motion, sparse), joint_positions(target))
+    return report | metrics.positions_report(normalizer.pose(motion, sparse), joint_positions(target))
 
 
 def local_rotations(motion: Tensor) -> Tensor:
@@ -148,17 +148,17 @@ def joint_positions(motion: Tensor) -> Tensor:
     return motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
 
 
-def chunks(frames: Frames, length: int, least: int) -> list[Tensor]:
+def chunks(frames: MotionDataset, length: int, least: int) -> list[Tensor]:
     """A split's clips cut into pieces of `length` frames, those under `least` left out unless alone."""
     pieces = [piece for clip in frames.clips() for piece in clip.split(length)]
     return [p for p in pieces if len(p) >= least] or pieces
 
 
 @torch.no_grad()
-def quick_stream(network: Network, pieces: Sequence[Tensor]) -> dict[str, float]:
+def quick_stream(network: Evaluable, pieces: Sequence[Tensor]) -> dict[str, float]:
     """Stream-mode means over pieces of clips: for validation during training."""
     motions = stream(network, pieces)
-    mean = _mean([clip_report(network.frame, m, p) for m, p in zip(motions, pieces, strict=True)])
+    mean = _mean([clip_report(network.normalizer, m, p) for m, p in zip(motions, pieces, strict=True)])
     return {f"{branch} {name}": value for branch, values in mean.items() for name, value in values.items()}
 
 

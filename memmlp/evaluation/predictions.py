@@ -11,12 +11,12 @@ from memmlp.evaluation import modes
 from memmlp.evaluation.ik import IK
 from memmlp.evaluation.stage import Evaluation
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.dataset import Frames
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.dataset import MotionDataset
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.window_model import WindowModel
 
 
-def save_predictions(evaluation: Evaluation, model: WindowModel, test: Frames, folder: Path) -> None:
+def save_predictions(evaluation: Evaluation, model: WindowModel, test: MotionDataset, folder: Path) -> None:
     """Write `<folder>/<mode>/<clip>.npz` for every test clip: positions (N, 22, 3) and rotations."""
     clips = test.clips()
     for mode in evaluation.modes:
@@ -24,10 +24,12 @@ def save_predictions(evaluation: Evaluation, model: WindowModel, test: Frames, f
         for name, clip, motion in zip(test.names, clips, motions, strict=True):
             path = folder / mode / f"{name}.npz"
             path.parent.mkdir(parents=True, exist_ok=True)
-            np.savez(path, allow_pickle=False, **prediction_arrays(model.frame, clip, motion, evaluation.ik))
+            np.savez(
+                path, allow_pickle=False, **prediction_arrays(model.normalizer, clip, motion, evaluation.ik)
+            )
 
 
-def prediction_arrays(frame: Frame, clip: Tensor, motion: Tensor, ik: IK) -> dict[str, np.ndarray]:
+def prediction_arrays(normalizer: Normalizer, clip: Tensor, motion: Tensor, ik: IK) -> dict[str, np.ndarray]:
     """What a prediction file holds: metres in the world, local rotation matrices, float32.
 
     `predicted_positions` are those of the rotation branch by forward kinematics, the head on its tracker;
@@ -35,13 +37,13 @@ def prediction_arrays(frame: Frame, clip: Tensor, motion: Tensor, ik: IK) -> dic
     """
     sparse, truth = clip[:, :SPARSE_DIM], clip[:, SPARSE_DIM:]
     arrays = {
-        "predicted_positions": frame.pose(motion, sparse),
+        "predicted_positions": normalizer.pose(motion, sparse),
         "predicted_positions_of_position_branch": modes.joint_positions(motion),
         "true_positions": modes.joint_positions(truth),
         "predicted_rotations": modes.local_rotations(motion),
         "true_rotations": modes.local_rotations(truth),
     }
-    for name, solved in ik.solutions(frame, motion, sparse).items():
-        arrays[f"{name}_positions"] = frame.pose(solved, sparse)
+    for name, solved in ik.solutions(normalizer, motion, sparse).items():
+        arrays[f"{name}_positions"] = normalizer.pose(solved, sparse)
         arrays[f"{name}_rotations"] = modes.local_rotations(solved)
     return {name: tensor.cpu().numpy() for name, tensor in arrays.items()}

@@ -12,7 +12,7 @@ import torch
 from memmlp.evaluation import modes
 from memmlp.evaluation.ik import IK
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.dataset import Frames
+from memmlp.motion.dataset import MotionDataset
 from memmlp.networks.window_model import WindowModel
 
 PICTURE_FRAMES = 600  # the picture shows the first 10 s of the first test clip
@@ -32,7 +32,7 @@ class Evaluation:
     ik: IK
     seed: int
 
-    def report(self, model: WindowModel, test: Frames, mode: str) -> dict[str, Any]:
+    def report(self, model: WindowModel, test: MotionDataset, mode: str) -> dict[str, Any]:
         """The metrics in a mode: `{"mean": {branch: {metric: value}}, "clips": [...]}`, a row a clip."""
         torch.manual_seed(self.seed)  # the modes are alike in whatever order they are made
         found = modes.evaluate(model, test, [mode], self.batch, self.ik)
@@ -40,13 +40,13 @@ class Evaluation:
         return {"mean": found["mean"][mode], "clips": rows}
 
 
-def picture(model: WindowModel, test: Frames, path: Path) -> None:
+def picture(model: WindowModel, test: MotionDataset, path: Path) -> None:
     """Draw the start of the first test clip, streamed."""
     from memmlp.render.figure import poses_png  # with matplotlib: half a second that planning needs not
 
-    device = model.frame.rest.device
+    device = model.normalizer.rest.device
     clip = test.clip(0)[:PICTURE_FRAMES].to(device)
     motion = modes.stream(model, [clip])[0]
-    predicted = model.frame.pose(motion, clip[:, :SPARSE_DIM])
+    predicted = model.normalizer.pose(motion, clip[:, :SPARSE_DIM])
     truth = modes.joint_positions(clip[:, SPARSE_DIM:])
     poses_png(path, truth.cpu().numpy(), predicted.cpu().numpy(), test.names[0])

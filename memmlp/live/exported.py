@@ -9,14 +9,14 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.deploy.session import OnnxStream
-from memmlp.live.rotations import Skeleton
+from memmlp.live.rotations import BodyTree
 from memmlp.motion.body import FEATURES
 
 NEEDED = ("joints", "parents", "rest", "fps", "T", "branches", "features")
 AGAIN = "export it again with memmlp export RUN --out FILE.onnx"
 
 
-class Network(OnnxStream):
+class ExportedNetwork(OnnxStream):
     """An ONNX file of scope `network`. Raises InputError where a file is none, or lacks what must be known.
 
     Attributes:
@@ -44,7 +44,7 @@ class Network(OnnxStream):
             raise InputError(f"{self.path}: its inputs are not those of this version of memmlp; {AGAIN}")
         try:
             rest = np.array(json.loads(meta["rest"]), np.float64)
-            self.skeleton = Skeleton(json.loads(meta["joints"]), json.loads(meta["parents"]), rest)
+            self.skeleton = BodyTree(json.loads(meta["joints"]), json.loads(meta["parents"]), rest)
             self.fps, self.frames = float(meta["fps"]), int(meta["T"])
             self.branches = frozenset(json.loads(meta["branches"]))
         except (ValueError, TypeError, LookupError):

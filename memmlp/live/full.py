@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from memmlp.deploy.export import metadata, save
 from memmlp.deploy.parity import in_torch
 from memmlp.deploy.session import OnnxStream
-from memmlp.live.rotations import Skeleton
+from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import Space, space_of
 from memmlp.motion.body import (
     HEAD,
@@ -36,7 +36,7 @@ from memmlp.motion.body import (
 )
 from memmlp.motion.features import sparse_features
 from memmlp.motion.geometry import sixd_to_matrix
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.streaming import Stream
 from memmlp.networks.window_model import WindowModel
 
@@ -64,7 +64,7 @@ class FullStep(nn.Module):
         self.names = list(model.initial_state(1))
         self.register_buffer("world", torch.tensor(space.world, dtype=torch.float32))
         self.register_buffer("body", torch.tensor(space.body, dtype=torch.float32))
-        skeleton = Skeleton(JOINTS, PARENTS, model.frame.rest.double().cpu().numpy())
+        skeleton = BodyTree(JOINTS, PARENTS, model.normalizer.rest.double().cpu().numpy())
         self.ancestors = [torch.tensor(ancestor) for ancestor in skeleton.ancestors]
         self.register_buffer("offsets", torch.tensor(skeleton.offsets, dtype=torch.float32)[None, ..., None])
 
@@ -151,12 +151,12 @@ def full_parity(model: WindowModel, path: Path, clip: Tensor, space: str = "amas
     sparse = sparse_features(rotations, positions)
     made = [stream.step(*(part[index : index + 1] for part in given)) for index in range(len(positions))]
     found = [np.concatenate(parts) for parts in zip(*made[1:], strict=True)]
-    expected = _expected(model.frame, in_torch(model, sparse), sparse, there)
+    expected = _expected(model.normalizer, in_torch(model, sparse), sparse, there)
     return float(np.max([np.abs(a - b).max() for a, b in zip(expected, found, strict=True)]))
 
 
-def _expected(frame: Frame, motion: Tensor, sparse: Tensor, space: Space) -> list[np.ndarray]:
+def _expected(frame: Normalizer, motion: Tensor, sparse: Tensor, space: Space) -> list[np.ndarray]:
     """Rotations, positions and joints in a space, of world motion (N, 198) at inputs (N, 54)."""
     local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6))).numpy()
-    positions = [frame.pose(motion, sparse), motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))]
+    positions = [normalizer.pose(motion, sparse), motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))]
     return [space.pose_out(local), *(space.positions_out(part.numpy()) for part in positions)]

@@ -76,7 +76,7 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.add.reduce(a * b, 0)
 
 
-class Skeleton:
+class BodyTree:
     """Joints, their tree and their rest pose; forward kinematics of one frame.
 
     Every joint's transform is multiplied by that of its ancestor 1, 2, 4, ... joints above, so that a tree of

@@ -16,7 +16,7 @@ from memmlp.motion.body import FPS
 TENTHS = 10
 
 
-class Motion(NamedTuple):
+class TrackedMotion(NamedTuple):
     """Trackers and the truth: (N, 3, 3) metres, (N, 3, 3, 3), and joints (N, 22, 3), AMASS' world."""
 
     positions: np.ndarray
@@ -44,7 +44,7 @@ def repetitions(length: int, least: int) -> int:
     return TENTHS * -(-least // (TENTHS * length))
 
 
-def soak(stream: Stream, motion: Motion, times: int) -> Soaked:
+def soak(stream: Stream, motion: TrackedMotion, times: int) -> Soaked:
     """Stream a motion `times` times in a row, a multiple of ten, without a reset or a gap in between.
 
     Each tenth holds the same frames. What is not the same is how the first of all begins: fresh, while every

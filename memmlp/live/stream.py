@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from memmlp.common.errors import InputError
-from memmlp.live.exported import Network
+from memmlp.live.exported import ExportedNetwork
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
 from memmlp.live.spaces import space_of
 from memmlp.live.trackers import Features, Lost, Trackers, t_pose
@@ -103,7 +103,7 @@ class Stream:
         self.space = space_of(space)
         if rotations not in OUTPUTS:
             raise InputError(f"rotations={rotations}: allowed: {', '.join(OUTPUTS)}")
-        self.network = Network(_file(source))
+        self.network = ExportedNetwork(_file(source))
         if ik is not None and "position" not in self.network.branches:
             raise InputError(f"ik: {self.network.path} has no position branch to fit to; allowed is ik=None")
         self.offsets = None if offsets is None else checked_offsets(offsets)
@@ -214,16 +214,16 @@ class Solver:
         import torch
 
         from memmlp.motion.coordinates import World
-        from memmlp.motion.normalizer import Frame
+        from memmlp.motion.normalizer import Normalizer
 
-        self.ik, self.frame = ik, Frame.raw(World(), torch.tensor(rest))
+        self.ik, self.normalizer = ik, Normalizer.raw(World(), torch.tensor(rest))
 
     def __call__(self, rotation6d: np.ndarray, position: np.ndarray, sparse: np.ndarray) -> np.ndarray:
         """Rotations (22, 6) nearest to positions (22, 3), from rotations (22, 6), at inputs (54,)."""
         import torch
 
         motion = torch.from_numpy(np.concatenate([rotation6d.reshape(1, -1), position.reshape(1, -1)], 1))
-        return self.ik.solve(self.frame, motion, torch.from_numpy(sparse[None])).numpy().reshape(-1, 6)
+        return self.ik.solve(self.normalizer, motion, torch.from_numpy(sparse[None])).numpy().reshape(-1, 6)
 
 
 def read_trackers(trackers: Sequence[Tracker]) -> tuple[np.ndarray, np.ndarray, Lost]:

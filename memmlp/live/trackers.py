@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from memmlp.live.rotations import Skeleton, slerp, turned_by
+from memmlp.live.rotations import BodyTree, slerp, turned_by
 from memmlp.motion.body import (
     SPARSE_ANGULAR_VELOCITY,
     SPARSE_DIM,
@@ -57,7 +57,7 @@ def between(a: Tracked, b: Tracked, time: float) -> Tracked:
     return Tracked(time, positions, slerp(a.rotations, b.rotations, weight))
 
 
-def t_pose(skeleton: Skeleton, place: np.ndarray, heading: float) -> Tracked:
+def t_pose(skeleton: BodyTree, place: np.ndarray, heading: float) -> Tracked:
     """The three joints of a person in T-pose whose head is at `place` (3,), in AMASS' world.
 
     heading: radians to the left of looking along -Y, where the person's left is +X.
@@ -87,7 +87,7 @@ class Hold:
         recovery: seconds in which a tracker that returns is brought to where it is; 0 to jump.
     """
 
-    def __init__(self, skeleton: Skeleton, recovery: float = RECOVERY):
+    def __init__(self, skeleton: BodyTree, recovery: float = RECOVERY):
         self.skeleton, self.recovery = skeleton, recovery
         self.reset()
 
@@ -153,7 +153,7 @@ class Taken(NamedTuple):
     restarted: bool
 
 
-class Grid:
+class Resampler:
     """Samples -> frames at 1 / fps from the first sample on.
 
     Args:
@@ -202,8 +202,8 @@ class Trackers:
         skeleton: the network's. fps: its frames per second.
     """
 
-    def __init__(self, skeleton: Skeleton, fps: float):
-        self.hold, self.grid = Hold(skeleton), Grid(fps)
+    def __init__(self, skeleton: BodyTree, fps: float):
+        self.hold, self.grid = Hold(skeleton), Resampler(fps)
 
     def reset(self) -> None:
         """A fresh start."""

@@ -21,32 +21,32 @@ from memmlp.motion.body import (
 class World:
     """Positions and directions as they are: the most literal reading of the paper.
 
-    The coordinates slot: `place` says, from the inputs of a frame alone, where its local coordinates lie;
+    The coordinates slot: `origin` says, from the inputs of a frame alone, where its local coordinates lie;
     `sparse_in`, `motion_in` and `motion_out` carry inputs and motion there and back.
     """
 
-    def place(self, sparse: Tensor) -> Tensor:
+    def origin(self, sparse: Tensor) -> Tensor:
         """The origin (..., 3), metres, of the local coordinates of inputs (..., 54)."""
         return torch.zeros_like(sparse[..., :3])
 
-    def sparse_in(self, sparse: Tensor, place: Tensor) -> Tensor:
+    def sparse_in(self, sparse: Tensor, origin: Tensor) -> Tensor:
         """World inputs (..., 54) in local coordinates."""
-        position = sparse[..., SPARSE_POSITION] - _tile(place, len(TRACKED))
+        position = sparse[..., SPARSE_POSITION] - _tile(origin, len(TRACKED))
         return torch.cat([sparse[..., : SPARSE_POSITION.start], position, sparse[..., SPARSE_VELOCITY]], -1)
 
-    def motion_in(self, motion: Tensor, place: Tensor) -> Tensor:
+    def motion_in(self, motion: Tensor, origin: Tensor) -> Tensor:
         """World motion (..., 198) in local coordinates."""
-        return torch.cat([motion[..., ROTATION], motion[..., POSITION] - _tile(place, N_JOINTS)], -1)
+        return torch.cat([motion[..., ROTATION], motion[..., POSITION] - _tile(origin, N_JOINTS)], -1)
 
-    def motion_out(self, motion: Tensor, place: Tensor) -> Tensor:
+    def motion_out(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Local motion (..., 198) in the world."""
-        return torch.cat([motion[..., ROTATION], motion[..., POSITION] + _tile(place, N_JOINTS)], -1)
+        return torch.cat([motion[..., ROTATION], motion[..., POSITION] + _tile(origin, N_JOINTS)], -1)
 
 
 class HeadRelative(World):
     """Horizontal positions relative to the head of the same frame; heights stay (reading 20)."""
 
-    def place(self, sparse: Tensor) -> Tensor:
+    def origin(self, sparse: Tensor) -> Tensor:
         """The head's position on the floor (..., 3), metres."""
         head = sparse[..., SPARSE_POSITION][..., :3]
         return head * head.new_tensor([1.0, 1.0, 0.0])
@@ -60,44 +60,44 @@ class Heading(HeadRelative):
     which is defined but where the head is upside down.
     """
 
-    def place(self, sparse: Tensor) -> Tensor:
+    def origin(self, sparse: Tensor) -> Tensor:
         """The head's position on the floor and cosine and sine of its heading (..., 5)."""
         first, second = sparse[..., 0:3], sparse[..., 3:6]  # columns of the head's rotation, body frame
         up = torch.linalg.cross(first, second, dim=-1)  # the rest pose has Y up and faces Z
         # A = R Rx(-90 deg) is the rotation from upright; its twist is atan2(a10 - a01, a00 + a11).
         cosine, sine = first[..., 0] - up[..., 1], first[..., 1] + up[..., 0]
         heading = F.normalize(torch.stack([cosine, sine], -1), dim=-1)
-        return torch.cat([super().place(sparse), heading], -1)
+        return torch.cat([super().origin(sparse), heading], -1)
 
-    def sparse_in(self, sparse: Tensor, place: Tensor) -> Tensor:
+    def sparse_in(self, sparse: Tensor, origin: Tensor) -> Tensor:
         """World inputs (..., 54) in local coordinates."""
-        sparse = super().sparse_in(sparse, place[..., :3])
+        sparse = super().sparse_in(sparse, origin[..., :3])
         turned = [
-            _turn(sparse[..., SPARSE_ROTATION], place, -1),
+            _turn(sparse[..., SPARSE_ROTATION], origin, -1),
             sparse[..., SPARSE_ANGULAR_VELOCITY],
-            _turn(sparse[..., SPARSE_POSITION], place, -1),
-            _turn(sparse[..., SPARSE_VELOCITY], place, -1),
+            _turn(sparse[..., SPARSE_POSITION], origin, -1),
+            _turn(sparse[..., SPARSE_VELOCITY], origin, -1),
         ]
         return torch.cat(turned, -1)
 
-    def motion_in(self, motion: Tensor, place: Tensor) -> Tensor:
+    def motion_in(self, motion: Tensor, origin: Tensor) -> Tensor:
         """World motion (..., 198) in local coordinates."""
-        return self._turned(super().motion_in(motion, place[..., :3]), place, -1)
+        return self._turned(super().motion_in(motion, origin[..., :3]), origin, -1)
 
-    def motion_out(self, motion: Tensor, place: Tensor) -> Tensor:
+    def motion_out(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Local motion (..., 198) in the world."""
-        return super().motion_out(self._turned(motion, place, 1), place[..., :3])
+        return super().motion_out(self._turned(motion, origin, 1), origin[..., :3])
 
-    def _turned(self, motion: Tensor, place: Tensor, way: int) -> Tensor:
+    def _turned(self, motion: Tensor, origin: Tensor, way: int) -> Tensor:
         """The root's rotation and the positions turned; the other rotations are local anyway."""
         root, body = motion[..., :6], motion[..., 6 : ROTATION.stop]
-        return torch.cat([_turn(root, place, way), body, _turn(motion[..., POSITION], place, way)], -1)
+        return torch.cat([_turn(root, origin, way), body, _turn(motion[..., POSITION], origin, way)], -1)
 
 
-def _turn(vectors: Tensor, place: Tensor, way: int) -> Tensor:
-    """Vectors (..., 3 n) turned about the vertical by the heading of a place (..., 5), or back (way -1)."""
+def _turn(vectors: Tensor, origin: Tensor, way: int) -> Tensor:
+    """Vectors (..., 3 n) turned about the vertical by the heading of an origin (..., 5), or back (way -1)."""
     x, y, z = vectors.unflatten(-1, (-1, 3)).unbind(-1)
-    cosine, sine = place[..., 3:4], way * place[..., 4:5]
+    cosine, sine = origin[..., 3:4], way * origin[..., 4:5]
     return torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], -1).flatten(-2)
 
 

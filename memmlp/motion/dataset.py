@@ -17,7 +17,7 @@ from memmlp.motion.splits import PARTS
 WEIGHTINGS = ("frames", "clips")
 
 
-class Frames:
+class MotionDataset:
     """All clips of one split, one after the other.
 
     Attributes:
@@ -39,7 +39,7 @@ class Frames:
         self.groups = groups or list(names)
 
     @classmethod
-    def open(cls, cache: Path, split: str) -> Frames:
+    def open(cls, cache: Path, split: str) -> MotionDataset:
         """A split of a prepared cache, memory-mapped; `.to(device)` holds it on a device.
 
         Raises InputError where the cache is unfinished or damaged, or the split has no clip.
@@ -56,10 +56,10 @@ class Frames:
         lengths = torch.tensor([clip.length for clip in clips])
         return cls(frames, starts, lengths, [clip.name for clip in clips], [clip.group for clip in clips])
 
-    def to(self, device: torch.device | str) -> Frames:
+    def to(self, device: torch.device | str) -> MotionDataset:
         """The same frames on a device."""
         tensors = (self.frames.to(device), self.starts.to(device), self.lengths.to(device))
-        return Frames(*tensors, list(self.names), list(self.groups))
+        return MotionDataset(*tensors, list(self.names), list(self.groups))
 
     def __len__(self) -> int:
         """Number of clips."""
@@ -106,7 +106,7 @@ class WindowSampler:
         weighting: "frames": every window of the split is equally likely; "clips": every clip is.
     """
 
-    def __init__(self, frames: Frames, batch: int, window: int, seed: int, weighting: str = "frames"):
+    def __init__(self, frames: MotionDataset, batch: int, window: int, seed: int, weighting: str = "frames"):
         if weighting not in WEIGHTINGS:
             raise InputError(f"data.weighting: {weighting!r}; allowed: {', '.join(WEIGHTINGS)}")
         self.batch, self.seed, self.device = batch, seed, frames.frames.device

@@ -19,7 +19,7 @@ from memmlp.motion.body import load_rest_joints
 from memmlp.motion.bvh import Bvh, find_bvh, read_bvh
 from memmlp.motion.clip import FRAME_RATE_RANGE, write_clip
 from memmlp.motion.retarget import retarget
-from memmlp.motion.skeleton import Skeleton, find_skeleton, is_number, load_skeleton
+from memmlp.motion.skeleton import SkeletonMap, find_skeleton, is_number, load_skeleton
 
 RECORD = "import.json"
 HEADER = "the header's"
@@ -138,7 +138,7 @@ def _import_file(
     path: Path,
     relative: Path,
     folder: Path,
-    skeleton: Skeleton | None,
+    skeleton: SkeletonMap | None,
     fps: Mapping[str, float],
     rest: np.ndarray,
 ) -> Imported:
@@ -161,7 +161,7 @@ def _import_file(
     )
 
 
-def _rate(bvh: Bvh, skeleton: Skeleton, relative: Path, fps: Mapping[str, float]) -> tuple[float, str]:
+def _rate(bvh: Bvh, skeleton: SkeletonMap, relative: Path, fps: Mapping[str, float]) -> tuple[float, str]:
     """The true frame rate and where it is from: given (the nearest folder counts), known, or the header's."""
     for folder in relative.parents:
         if _key(folder) in fps:

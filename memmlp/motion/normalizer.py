@@ -19,7 +19,7 @@ from memmlp.motion.coordinates import World
 from memmlp.motion.geometry import forward_kinematics, sixd_to_matrix
 
 
-class Frame(nn.Module):
+class Normalizer(nn.Module):
     """World <-> network space: the choice of coordinates, and z-scores where statistics are given.
 
     Args:
@@ -42,12 +42,12 @@ class Frame(nn.Module):
         self.register_buffer("std", std.float().clamp_min(self.MIN_STD))
 
     @classmethod
-    def raw(cls, coordinates: World, rest: Tensor) -> Frame:
+    def raw(cls, coordinates: World, rest: Tensor) -> Normalizer:
         """The frame without normalisation."""
         return cls(coordinates, rest, torch.zeros(FRAME_DIM), torch.ones(FRAME_DIM))
 
     @classmethod
-    def fit(cls, coordinates: World, rest: Tensor, frames: Tensor, chunk: int = 65536) -> Frame:
+    def fit(cls, coordinates: World, rest: Tensor, frames: Tensor, chunk: int = 65536) -> Normalizer:
         """The frame with the z-scores of training frames (F, 252), read chunk by chunk."""
         plain = cls.raw(coordinates, rest).to(frames.device)
         count = len(frames)
@@ -60,27 +60,27 @@ class Frame(nn.Module):
             square += (plain.encode(part).double() - mean).square().sum(0)
         return cls(coordinates, rest.cpu(), mean.cpu(), (square / count).sqrt().cpu())
 
-    def place(self, sparse: Tensor) -> Tensor:
+    def origin(self, sparse: Tensor) -> Tensor:
         """Where (..., 3 or 5) the local coordinates of inputs (..., 54) lie."""
-        return self.coordinates.place(sparse)
+        return self.coordinates.origin(sparse)
 
     def encode(self, frames: Tensor) -> Tensor:
         """World frames [X | Theta] (..., 252) -> network space (..., 252)."""
         sparse, motion = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:]
-        place = self.place(sparse)
-        return torch.cat([self.encode_sparse(sparse, place), self.encode_motion(motion, place)], -1)
+        origin = self.origin(sparse)
+        return torch.cat([self.encode_sparse(sparse, origin), self.encode_motion(motion, origin)], -1)
 
-    def encode_sparse(self, sparse: Tensor, place: Tensor) -> Tensor:
+    def encode_sparse(self, sparse: Tensor, origin: Tensor) -> Tensor:
         """World inputs (..., 54) -> network space (..., 54)."""
-        return (self.coordinates.sparse_in(sparse, place) - self.mean[:SPARSE_DIM]) / self.std[:SPARSE_DIM]
+        return (self.coordinates.sparse_in(sparse, origin) - self.mean[:SPARSE_DIM]) / self.std[:SPARSE_DIM]
 
-    def encode_motion(self, motion: Tensor, place: Tensor) -> Tensor:
+    def encode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
         """World motion (..., 198) -> network space (..., 198)."""
-        return (self.coordinates.motion_in(motion, place) - self.mean[SPARSE_DIM:]) / self.std[SPARSE_DIM:]
+        return (self.coordinates.motion_in(motion, origin) - self.mean[SPARSE_DIM:]) / self.std[SPARSE_DIM:]
 
-    def decode_motion(self, motion: Tensor, place: Tensor) -> Tensor:
+    def decode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Network space (..., 198) -> world motion (..., 198)."""
-        return self.coordinates.motion_out(motion * self.std[SPARSE_DIM:] + self.mean[SPARSE_DIM:], place)
+        return self.coordinates.motion_out(motion * self.std[SPARSE_DIM:] + self.mean[SPARSE_DIM:], origin)
 
     def pose(self, motion: Tensor, sparse: Tensor) -> Tensor:
         """Joint positions (..., 22, 3), metres, world, from the rotations of world motion (..., 198).
@@ -98,7 +98,7 @@ class Frame(nn.Module):
         The positions follow from the rotations (`pose`), without gradient.
         """
         motion = F.pad(rotation, (0, MOTION_DIM - ROTATION.stop))
-        world = self.decode_motion(motion, self.place(sparse))
+        world = self.decode_motion(motion, self.origin(sparse))
         with torch.no_grad():
             positions = self.pose(world, sparse).flatten(-2)
         return torch.cat([world[..., ROTATION], positions], -1)

@@ -38,7 +38,7 @@ ITEM_BYTES = FRAME_DIM * 4
 
 
 @dataclass(frozen=True)
-class Source:
+class ClipFolder:
     """What a cache is made from.
 
     Attributes:
@@ -163,13 +163,13 @@ class Manifest:
         return [clip for clip in self.clips if clip.split == split]
 
 
-def prepare(source: Source, out: Path) -> Manifest:
+def prepare(source: ClipFolder, out: Path) -> Manifest:
     """Make the cache in `out`, or find it there finished; concurrent callers wait for one another.
 
     Raises InputError for a root without usable clips, an impossible split, a bad file under `strict`, a
     folder that can't be written or too small a disk.
     """
-    source = Source(Path(source.root), source.split, str(source.body), source.min_frames, source.strict)
+    source = ClipFolder(Path(source.root), source.split, str(source.body), source.min_frames, source.strict)
     if source.min_frames < 2:
         raise InputError(
             f"data.min_frames: {source.min_frames}; allowed: 2 or more (one frame has no velocity)"
@@ -187,7 +187,7 @@ def prepare(source: Source, out: Path) -> Manifest:
         raise InputError(f"{out}: cannot write the cache there ({error.strerror or error})") from error
 
 
-def finished(source: Source, out: Path) -> Manifest | None:
+def finished(source: ClipFolder, out: Path) -> Manifest | None:
     """The manifest of a finished, up-to-date cache of the source in `out`, if there is one."""
     try:
         return _finished(out, _request(source, load_rest_joints(str(source.body))))
@@ -212,7 +212,7 @@ def survey(root: Path, min_frames: int = 2, strict: bool = False) -> Survey:
     return Survey(tuple(clips), tuple(skipped), ignored)
 
 
-def _make(source: Source, rest: np.ndarray, request: str, out: Path) -> Manifest:
+def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Manifest:
     """Read, split, write."""
     found = survey(source.root, source.min_frames, source.strict)
     if not found.clips:
@@ -241,7 +241,7 @@ def _make(source: Source, rest: np.ndarray, request: str, out: Path) -> Manifest
     return manifest
 
 
-def _write(source: Source, rest: np.ndarray, manifest: Manifest, out: Path) -> None:
+def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) -> None:
     """The arrays under temporary names, then their names, then the manifest."""
     (out / MANIFEST).unlink(missing_ok=True)
     frames = {part: int(manifest.totals[part]["frames"]) for part in PARTS}
@@ -366,7 +366,7 @@ def _digest(clips: Sequence[ClipRecord], rest: np.ndarray, min_frames: int) -> s
     return _hash([FRAMES, min_frames, rest.tolist(), sources])
 
 
-def _request(source: Source, rest: np.ndarray) -> str:
+def _request(source: ClipFolder, rest: np.ndarray) -> str:
     """Digest of settings and sources by path, size and time: no source is opened."""
     files = [(file, *_stamp(source.root / file)) for file in _sources(source.root)]
     code = [FORMAT, FRAMES, RECIPES["features"]]

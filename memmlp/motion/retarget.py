@@ -21,7 +21,7 @@ from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS, PARENTS
 from memmlp.motion.bvh import Bvh
 from memmlp.motion.clip import Clip
-from memmlp.motion.skeleton import HIPS, LEGS, LIMBS, Z_UP, Skeleton
+from memmlp.motion.skeleton import HIPS, LEGS, LIMBS, Z_UP, SkeletonMap
 
 FOLLOWERS = (7, 8, 10, 11, 20, 21)  # they keep the correction of the bone before them
 ZERO_POSE_LIMIT = 100.0  # degrees between a limb in the source's zero pose and in the T-pose
@@ -48,7 +48,7 @@ class Retargeting:
     anchor: np.ndarray
 
 
-def fit(bvh: Bvh, skeleton: Skeleton, rest: np.ndarray) -> Retargeting:
+def fit(bvh: Bvh, skeleton: SkeletonMap, rest: np.ndarray) -> Retargeting:
     """Fit the hierarchy to a body's rest joints (22, 3), metres.
 
     Raises InputError where joints are missing or stand in another order than the body's, or where the zero
@@ -64,7 +64,7 @@ def fit(bvh: Bvh, skeleton: Skeleton, rest: np.ndarray) -> Retargeting:
 
 
 def retarget(
-    bvh: Bvh, skeleton: Skeleton, rest: np.ndarray, *, name: str = "bvh", fps: float | None = None
+    bvh: Bvh, skeleton: SkeletonMap, rest: np.ndarray, *, name: str = "bvh", fps: float | None = None
 ) -> Clip:
     """The motion on a body with the rest joints (22, 3), metres, in the world (Z up).
 
@@ -88,7 +88,7 @@ def retarget(
     return Clip(name, poses, trans, fps or bvh.fps)
 
 
-def _nodes(bvh: Bvh, skeleton: Skeleton) -> np.ndarray:
+def _nodes(bvh: Bvh, skeleton: SkeletonMap) -> np.ndarray:
     """Each body joint's node (22,), its parent's where it has none."""
     missing = sorted(set(skeleton.joints.values()) - set(bvh.nodes))
     if missing:

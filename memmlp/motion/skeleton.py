@@ -23,7 +23,7 @@ REQUIRED = ("pelvis", "head", *(JOINTS[joint] for joint in sorted({*LIMBS, *LIMB
 
 
 @dataclass(frozen=True)
-class Skeleton:
+class SkeletonMap:
     """A source skeleton's map.
 
     Attributes:
@@ -53,7 +53,7 @@ def shipped_skeletons() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in SKELETONS.glob("*.yaml")))
 
 
-def load_skeleton(which: str) -> Skeleton:
+def load_skeleton(which: str) -> SkeletonMap:
     """A shipped map by name, or a user's by its path. Raises InputError for a file that is no map."""
     path = SKELETONS / f"{which}.yaml" if which in shipped_skeletons() else Path(which)
     if not path.is_file():
@@ -65,10 +65,10 @@ def load_skeleton(which: str) -> Skeleton:
         brief = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: {brief}; allowed: a readable YAML map") from error
     _check_map(path, content)
-    return Skeleton(**content)
+    return SkeletonMap(**content)
 
 
-def find_skeleton(bvh: Bvh) -> Skeleton:
+def find_skeleton(bvh: Bvh) -> SkeletonMap:
     """The one shipped map whose nodes the file has all. Raises InputError where there is none, or several."""
     maps = [load_skeleton(name) for name in shipped_skeletons()]
     fitting = [skeleton for skeleton in maps if set(skeleton.joints.values()) <= set(bvh.nodes)]

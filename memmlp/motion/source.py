@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from filelock import FileLock
 
-from memmlp.motion.prepare import Manifest, Source, finished, prepare
+from memmlp.motion.prepare import ClipFolder, Manifest, finished, prepare
 
 if TYPE_CHECKING:
-    from memmlp.motion.dataset import Frames
+    from memmlp.motion.dataset import MotionDataset
 
 
 class Prepared(NamedTuple):
@@ -27,15 +27,15 @@ class Prepared(NamedTuple):
         """The digest of the data, which stands for it in every identity."""
         return self.manifest.digest
 
-    def open(self, split: str) -> Frames:
-        """A split of the cache, memory-mapped (`Frames.open`)."""
-        from memmlp.motion.dataset import Frames  # with torch, which finding finished work needs not
+    def open(self, split: str) -> MotionDataset:
+        """A split of the cache, memory-mapped (`MotionDataset.open`)."""
+        from memmlp.motion.dataset import MotionDataset  # with torch, which finding finished work needs not
 
-        return Frames.open(self.cache, split)
+        return MotionDataset.open(self.cache, split)
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionSource:
     """A folder of clips with its split and body, generated where it is synthetic, and its cache.
 
     Attributes:
@@ -44,7 +44,7 @@ class Motion:
         caches: folder of all caches.
     """
 
-    source: Source
+    source: ClipFolder
     generate: Callable[[Path], object] | None
     caches: Path
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from memmlp.motion.coordinates import World
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.prepare import Manifest
 from memmlp.networks import checkpoint
 from memmlp.networks.mem_mlp import MemMLP
@@ -46,16 +46,16 @@ class Architecture:
         """Whether the network has a VQ-VAE of its own, trained with it."""
         return False
 
-    def build(self, frame: Frame, codes: VQVAE | None) -> WindowModel:
+    def build(self, normalizer: Normalizer, codes: VQVAE | None) -> WindowModel:
         """The network with fresh weights."""
         raise NotImplementedError
 
-    def frame(self, manifest: Manifest, frames: Tensor) -> Frame:
+    def normalizer(self, manifest: Manifest, frames: Tensor) -> Normalizer:
         """World <-> network space, with the statistics of the training frames (F, 252) where asked."""
         rest = torch.as_tensor(np.asarray(manifest.rest), dtype=torch.float32)
         if self.normalize:
-            return Frame.fit(self.coordinates, rest, frames)
-        return Frame.raw(self.coordinates, rest)
+            return Normalizer.fit(self.coordinates, rest, frames)
+        return Normalizer.raw(self.coordinates, rest)
 
     def load_codes(self, weights: Path) -> VQVAE:
         """The trained VQ-VAE of a file of weights."""
@@ -67,7 +67,7 @@ class Architecture:
         """The trained network of a file of weights. Raises InputError where it is damaged."""
         tensors, _ = checkpoint.read(weights)
         codes = self.vqvae() if self.uses_codes else None
-        model = self.build(Frame.raw(self.coordinates, torch.zeros(22, 3)), codes)
+        model = self.build(Normalizer.raw(self.coordinates, torch.zeros(22, 3)), codes)
         checkpoint.load_module("model", model, tensors)
         return model.eval()
 
@@ -93,20 +93,20 @@ class MemMLPArchitecture(Architecture):
         """Whether the memory has a VQ-VAE of its own."""
         return self.memory_kind.trains_codes
 
-    def build(self, frame: Frame, codes: VQVAE | None) -> MemMLP:
+    def build(self, normalizer: Normalizer, codes: VQVAE | None) -> MemMLP:
         """The network with fresh weights."""
         sizes = {"hidden": self.hidden, "frames": self.frames}
         memory = self.memory(codes=codes, depth=self.depth, **sizes)
         predictor = self.predictor(memory_block=memory.memory_block, **sizes)
-        return MemMLP(frame, memory, predictor, depth=self.depth, **sizes)
+        return MemMLP(normalizer, memory, predictor, depth=self.depth, **sizes)
 
 
 @dataclass(frozen=True)
-class ReferenceArchitecture(Architecture):
+class BaselineArchitecture(Architecture):
     """A network without slots: its constructor, all but world <-> network space given."""
 
-    network: Callable[[Frame], WindowModel]
+    network: Callable[[Normalizer], WindowModel]
 
-    def build(self, frame: Frame, codes: VQVAE | None) -> WindowModel:
+    def build(self, normalizer: Normalizer, codes: VQVAE | None) -> WindowModel:
         """The network with fresh weights."""
-        return self.network(frame)
+        return self.network(normalizer)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.motion.body import MOTION_DIM, ROTATION
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import MLPBlock
 
 MakeBlock = Callable[[], nn.Module]
@@ -72,7 +72,7 @@ class TwoBranch(nn.Module):
         self.rotation = self.kind(ROTATION.stop, depth, hidden, frames, memory_block)
         self.position = self.kind(MOTION_DIM - ROTATION.stop, depth, hidden, frames, memory_block)
 
-    def forward(self, h: Tensor, past: object, sparse: Tensor, frame: Frame, newest: int) -> Tensor:
+    def forward(self, h: Tensor, past: object, sparse: Tensor, normalizer: Normalizer, newest: int) -> Tensor:
         """Hidden state (B, T, d), what the memory recalls -> motion (B, newest, 198) in network space."""
         return torch.cat([self.rotation(h, past, newest), self.position(h, past, newest)], -1)
 
@@ -97,11 +97,11 @@ class RotationOnly(nn.Module):
         super().__init__()
         self.rotation = self.kind(ROTATION.stop, depth, hidden, frames, memory_block)
 
-    def forward(self, h: Tensor, past: object, sparse: Tensor, frame: Frame, newest: int) -> Tensor:
+    def forward(self, h: Tensor, past: object, sparse: Tensor, normalizer: Normalizer, newest: int) -> Tensor:
         """As TwoBranch's; world inputs (B, T, 54) place the body."""
         rotation, sparse = self.rotation(h, past, newest), sparse[..., -newest:, :]
         with torch.no_grad():
-            motion = frame.encode_motion(frame.posed(rotation, sparse), frame.place(sparse))
+            motion = normalizer.encode_motion(normalizer.posed(rotation, sparse), normalizer.origin(sparse))
         position = motion[..., ROTATION.stop :]
         return torch.cat([rotation, position], -1)
 

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.motion.body import FRAME_DIM, ROTATION, SPARSE_DIM
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 
 
 class Quantised(NamedTuple):
@@ -149,20 +149,20 @@ class VQVAE(nn.Module):
         quantised: Quantised = self.codebook.learn(latent)
         return self.decoder(straight_through(latent, quantised.codes)), quantised
 
-    def loss_terms(self, frames: Tensor, frame: Frame) -> tuple[dict[str, Tensor], Tensor]:
+    def loss_terms(self, frames: Tensor, normalizer: Normalizer) -> tuple[dict[str, Tensor], Tensor]:
         """Eq. 1 of the reconstruction and the codebook's loss, and the chosen indices (B,); it learns.
 
         Args:
-            frames: (B, 252) in the network space of `frame`.
+            frames: (B, 252) in the network space of `normalizer`.
         """
         rotations, quantised = self.reconstruct(frames)
-        terms = {"rotation": rotation_error(rotations, frames, frame), "codebook": quantised.loss}
+        terms = {"rotation": rotation_error(rotations, frames, normalizer), "codebook": quantised.loss}
         return terms, quantised.indices
 
 
-def rotation_error(rotations: Tensor, frames: Tensor, frame: Frame) -> Tensor:
+def rotation_error(rotations: Tensor, frames: Tensor, normalizer: Normalizer) -> Tensor:
     """Eq. 1 in the world's units, for rotations (B, 132) and frames (B, 252) of network space."""
-    error = (rotations - frames[:, SPARSE_DIM:][:, ROTATION]) * frame.std[SPARSE_DIM:][ROTATION]
+    error = (rotations - frames[:, SPARSE_DIM:][:, ROTATION]) * normalizer.std[SPARSE_DIM:][ROTATION]
     return error.abs().sum(-1).mean()
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import State
 
 
@@ -17,7 +17,7 @@ class WindowModel(nn.Module):
     the buffer of inputs.
 
     Args:
-        frame: world <-> network space.
+        normalizer: world <-> network space.
         frames: T, the window's length.
 
     Attributes:
@@ -26,9 +26,9 @@ class WindowModel(nn.Module):
 
     branches: frozenset[str] = frozenset({"rotation"})
 
-    def __init__(self, frame: Frame, frames: int):
+    def __init__(self, normalizer: Normalizer, frames: int):
         super().__init__()
-        self.frame = frame
+        self.normalizer = normalizer
         self.frames = frames
 
     @property
@@ -54,7 +54,7 @@ class WindowModel(nn.Module):
     def initial_state(self, batch: int = 1) -> State:
         """A fresh start: zeros. At the first call the first frame stands for all before it."""
         state = {"sparse": torch.zeros(batch, self.length, SPARSE_DIM), "started": torch.zeros(batch, 1)}
-        return {name: tensor.to(self.frame.mean) for name, tensor in state.items()}
+        return {name: tensor.to(self.normalizer.mean) for name, tensor in state.items()}
 
     def running_state(self, sparse: Tensor) -> State:
         """A state after world inputs (B, length, 54) that carries no history of motion yet."""
@@ -92,7 +92,7 @@ class WindowModel(nn.Module):
         """
         return self.advance(sparse, state)
 
-    def terms(self, truth: Tensor) -> dict[str, Tensor]:
+    def auxiliary_losses(self, truth: Tensor) -> dict[str, Tensor]:
         """Losses of its own at true world frames (B, T, 252), added to the loss of the motion."""
         return {}
 

@@ -10,7 +10,7 @@ import torch
 
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.stage import Evaluation
-from memmlp.motion.source import Motion
+from memmlp.motion.source import MotionSource
 from memmlp.networks.architecture import VQVAE_SETTINGS, Architecture
 from memmlp.runs.identity import Identity, deployment_id, evaluation_id
 from memmlp.runs.tracking import Tracker
@@ -35,7 +35,7 @@ class Experiment:
     outputs: Path
     device: torch.device
     force: bool
-    data: Motion
+    data: MotionSource
     architecture: Architecture
     codes: CodesTraining
     training: NetworkTraining

@@ -40,7 +40,7 @@ class Chapter:
         return caption(self.table)
 
 
-class Entry:
+class ReportedRun:
     """A finished run, and the rows it stands in."""
 
     def __init__(self, measured: Measured):
@@ -94,13 +94,13 @@ def published(accuracies: Sweep, latencies: Sweep) -> list[Point]:
     return points
 
 
-def _entries(chapters: Sequence[Chapter]) -> list[Entry]:
+def _entries(chapters: Sequence[Chapter]) -> list[ReportedRun]:
     """Each finished run once."""
-    entries: dict[str, Entry] = {}
+    entries: dict[str, ReportedRun] = {}
     for chapter in chapters:
         for label, runs in chapter.runs.items():
             for seed, measured in runs.items():
-                entry = entries.setdefault(measured.id, Entry(measured))
+                entry = entries.setdefault(measured.id, ReportedRun(measured))
                 entry.places.append(f"{chapter.sweep.name}: {label}, seed {seed}")
     return list(entries.values())
 
@@ -238,7 +238,7 @@ def _curve(log: Sequence[Metrics], phase: str, name: str) -> Curve:
     return Curve([step for step, _ in points], [value for _, value in points])
 
 
-def _latency(entries: Sequence[Entry]) -> str:
+def _latency(entries: Sequence[ReportedRun]) -> str:
     """Time, work and size of each run's streaming step."""
     if not entries:
         return ""
@@ -273,7 +273,7 @@ def _number(values: Mapping[str, float], key: str, scale: float, form: str) -> s
     return format(values[key] / scale, form) if key in values else "-"
 
 
-def _runs(entries: Sequence[Entry]) -> str:
+def _runs(entries: Sequence[ReportedRun]) -> str:
     """The runs, and what their configs differ in from the commonest value of each key."""
     if not entries:
         return ""

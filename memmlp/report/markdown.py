@@ -22,14 +22,14 @@ ORIGIN = {
 }  # fmt: skip
 
 
-class Source(NamedTuple):
+class KeptTable(NamedTuple):
     """What a page is made of: results that were kept, and the table that they come to today."""
 
     kept: Kept
     table: Table
 
 
-def pages(sources: Mapping[str, Source], templates: Mapping[str, str]) -> dict[str, str]:
+def pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -> dict[str, str]:
     """The texts of all pages by file name.
 
     Args:
@@ -68,7 +68,7 @@ def _filled(name: str, text: str, words: Words) -> str:
         raise InputError(f"{name}: {error}") from None
 
 
-def _table_page(source: Source) -> str:
+def _table_page(source: KeptTable) -> str:
     return f"{MARK}\n\n{markdown(source.table)}\n{origin_words(source.kept)}\n"
 
 
@@ -92,7 +92,7 @@ def _recipes(runs: Iterable[Measured]) -> str:
 class Words:
     """What templates can say. Every method raises InputError, telling what is allowed, for a wrong name."""
 
-    def __init__(self, sources: Mapping[str, Source]):
+    def __init__(self, sources: Mapping[str, KeptTable]):
         self.sources = sources
 
     def functions(self) -> dict[str, object]:

@@ -21,12 +21,12 @@ from memmlp.search.spec import Objective, Value
 from memmlp.search.study import Study, values
 from memmlp.sweep.board import total_steps
 from memmlp.sweep.controller import LOOK, Fleet
-from memmlp.sweep.plan import Entry, Plan, Task, unique
+from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 
 HOPELESS = 5  # trials that fail before any other ends
 DROPPED = (TrialState.PRUNED, TrialState.FAIL)  # states of trials whose runs nobody wants any more
 
-Compose = Callable[[Mapping[str, Value]], Sequence[Sequence[Task]]]
+Compose = Callable[[Mapping[str, Value]], Sequence[Sequence[RunTask]]]
 """From a trial's values to each seed's tasks, its run's the last; InputError where they make no sense."""
 
 
@@ -39,11 +39,11 @@ class Going:
     """
 
     trial: Trial
-    seeds: Sequence[Sequence[Task]]
+    seeds: Sequence[Sequence[RunTask]]
     wanted: int = 0
 
     @property
-    def tasks(self) -> list[Task]:
+    def tasks(self) -> list[RunTask]:
         """The tasks that are to be done by now."""
         return [task for tasks in self.seeds[: self.wanted] for task in tasks]
 

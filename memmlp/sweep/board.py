@@ -14,7 +14,7 @@ from rich.text import Text
 
 from memmlp.runs.log import Metrics
 from memmlp.runs.run import Run
-from memmlp.sweep.plan import Plan, Task
+from memmlp.sweep.plan import Plan, RunTask
 
 COLOURS = {"done": "green", "running": "cyan", "failed": "red", "blocked": "red", "lost": "yellow"}
 WORDS = {"new": "waiting", "stopped": "waiting, begun", "lost": "lost, to be taken over"}
@@ -65,19 +65,19 @@ class Board(Screen):
         return [f"{done} of {len(states)} done; {_change(plan, t, states[t.key])}" for t in changed]
 
 
-def _change(plan: Plan, task: Task, state: str) -> str:
+def _change(plan: Plan, task: RunTask, state: str) -> str:
     """What became of a task, and why."""
     reason = plan.run_of(task).failure if state == "failed" else None
     return f"{name(plan, task)}: {WORDS.get(state, state)}{f', {reason}' if reason else ''}"
 
 
-def name(plan: Plan, task: Task) -> str:
+def name(plan: Plan, task: RunTask) -> str:
     """The task as a person knows it: arm and seed, of a VQ-VAE the seeds whose runs need it."""
     cells = [f"{entry.label} seed {entry.seed}" for entry in plan.entries if entry.key == task.key]
     return cells[0] if cells else f"VQ-VAE {task.id}{_seeds(plan, task)}"
 
 
-def _seeds(plan: Plan, upstream: Task) -> str:
+def _seeds(plan: Plan, upstream: RunTask) -> str:
     """The seeds of the entries that need that run."""
     users = {task.id for task in plan.tasks if task.upstream == upstream.id}
     seeds = sorted({entry.seed for entry in plan.entries if entry.id in users})
@@ -105,7 +105,7 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
     return Group(table, *below)
 
 
-def cell(plan: Plan, task: Task, state: str) -> Text:
+def cell(plan: Plan, task: RunTask, state: str) -> Text:
     """A run in a few characters."""
     run = plan.run_of(task)
     if state == "running":
@@ -115,7 +115,7 @@ def cell(plan: Plan, task: Task, state: str) -> Text:
     return Text(WORDS.get(state, state), style=COLOURS.get(state, ""))
 
 
-def _upstream(plan: Plan, task: Task, state: str) -> Text:
+def _upstream(plan: Plan, task: RunTask, state: str) -> Text:
     return Text(f"{name(plan, task)}: ") + cell(plan, task, state)
 
 
@@ -125,7 +125,7 @@ def result(run: Run) -> str:
     return f"{value:.2f} cm" if isinstance(value, int | float) else ""
 
 
-def total_steps(task: Task) -> int:
+def total_steps(task: RunTask) -> int:
     """Steps of the task's training."""
     return int(task.config["vqvae" if task.kind == "vqvae" else "optim"]["steps"])
 

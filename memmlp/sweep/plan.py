@@ -16,7 +16,7 @@ from memmlp.runs.run import Run
 
 
 @dataclass(frozen=True)
-class Task:
+class RunTask:
     """One run to be brought to its end.
 
     Attributes:
@@ -69,7 +69,7 @@ class Plan:
     name: str
     outputs: Path
     entries: tuple[Entry, ...]
-    tasks: tuple[Task, ...]
+    tasks: tuple[RunTask, ...]
     open: bool = False
     cancelled: tuple[str, ...] = ()
     fail_fast: bool = False
@@ -83,11 +83,11 @@ class Plan:
     def _by_cell(self) -> dict[tuple[str, int], str]:
         return {(entry.label, entry.seed): entry.id for entry in self.entries}
 
-    def run_of(self, task: Task | Entry) -> Run:
+    def run_of(self, task: RunTask | Entry) -> Run:
         """The run of a task."""
         return Run.of(self.outputs, task.id)
 
-    def complete(self, task: Task | Entry) -> bool:
+    def complete(self, task: RunTask | Entry) -> bool:
         """Whether the run is trained and all of its stages that are wanted were made."""
         run = self.run_of(task)
         return run.done and all(map(run.has, task.stages))
@@ -100,7 +100,7 @@ class Plan:
                 states[task.key] = "blocked"
         return states
 
-    def left(self) -> list[Task]:
+    def left(self) -> list[RunTask]:
         """The tasks that are neither done nor failed nor blocked nor cancelled; none of a stopped plan."""
         if self.stopped:
             return []
@@ -128,7 +128,7 @@ class Plan:
         try:
             content = json.loads(path.read_bytes())
             content["entries"] = tuple(Entry(**_stages(entry)) for entry in content["entries"])
-            content["tasks"] = tuple(Task(**_stages(task)) for task in content["tasks"])
+            content["tasks"] = tuple(RunTask(**_stages(task)) for task in content["tasks"])
             content["cancelled"] = tuple(content["cancelled"])
             return cls(**{**content, "outputs": Path(content["outputs"])})
         except (OSError, ValueError, KeyError, TypeError) as error:
@@ -140,7 +140,7 @@ def _stages(fields: dict[str, Any]) -> dict[str, Any]:
     return fields | {"stages": tuple(fields.get("stages", ()))}
 
 
-def unique(tasks: Iterable[Task]) -> tuple[Task, ...]:
+def unique(tasks: Iterable[RunTask]) -> tuple[RunTask, ...]:
     """Each task once, in the order given, an upstream run right before the first task that needs it."""
     known = {task.key: task for task in tasks}
     order = (key for task in known.values() for key in (task.upstream, task.key) if key in known)

@@ -15,13 +15,13 @@ from filelock import FileLock, Timeout
 
 from memmlp.common.errors import InputError, TrainingDiverged
 from memmlp.runs.run import Run
-from memmlp.sweep.plan import Plan, Task
+from memmlp.sweep.plan import Plan, RunTask
 
 PAUSE = 0.5  # seconds between looks at a plan whose tasks are all in other hands
 ABANDONED = 600.0  # seconds without a sign of life after which an open plan's controller counts as dead
 DEATHS = 10  # workers that died at the same step of a run before it counts as failed
 
-Perform = Callable[[Plan, Task], None]
+Perform = Callable[[Plan, RunTask], None]
 
 
 class Cancelled(Exception):
@@ -47,7 +47,7 @@ def directed(path: Path) -> bool:
     return not Plan.load(path).open or time.time() - path.stat().st_mtime < ABANDONED
 
 
-def attempt(plan: Plan, task: Task, perform: Perform) -> bool:
+def attempt(plan: Plan, task: RunTask, perform: Perform) -> bool:
     """Bring a task's run to its end, if nobody else is at it and its upstream run is done."""
     run = plan.run_of(task)
     if task.upstream and not Run.of(plan.outputs, task.upstream).done:
@@ -64,7 +64,7 @@ def attempt(plan: Plan, task: Task, perform: Perform) -> bool:
     return True
 
 
-def _perform(plan: Plan, task: Task, run: Run, perform: Perform) -> None:
+def _perform(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
     """Perform the task; what goes wrong is left with the run, for the other tasks have no part in it."""
     try:
         perform(plan, task)

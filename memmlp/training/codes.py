@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from memmlp.motion.dataset import Frames, WindowSampler
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.dataset import MotionDataset, WindowSampler
+from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architecture import Architecture
@@ -43,10 +43,10 @@ class CodesTraining:
         """
         frames, validation = (data.open(split).to(device) for split in ("train", "val"))
         torch.manual_seed(self.seed)
-        frame = architecture.frame(data.manifest, frames.frames).to(device)
+        normalizer = architecture.normalizer(data.manifest, frames.frames).to(device)
         model = architecture.vqvae().to(device)
         optim = self.optim(len(frames.frames))
-        task = VQVAETask(model, frame, frames, validation, optim, self.seed)
+        task = VQVAETask(model, normalizer, frames, validation, optim, self.seed)
         train(task, optim, run, self.seed, "VQ-VAE")
         checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
         return task.validate()
@@ -56,9 +56,15 @@ class VQVAETask:
     """Eq. 1 on the reconstructed rotations plus the codebook's loss (App. A)."""
 
     def __init__(
-        self, model: VQVAE, frame: Frame, frames: Frames, validation: Frames, optim: Optim, seed: int
+        self,
+        model: VQVAE,
+        normalizer: Normalizer,
+        frames: MotionDataset,
+        validation: MotionDataset,
+        optim: Optim,
+        seed: int,
     ):
-        self.model, self.frame, self.frames, self.validation = model, frame, frames, validation
+        self.model, self.normalizer, self.frames, self.validation = model, normalizer, frames, validation
         self.module: nn.Module = model
         self.sampler = WindowSampler(frames, batch=optim.batch, window=1, seed=seed)
         self.used = torch.zeros(len(model.codebook.vectors))
@@ -70,8 +76,8 @@ class VQVAETask:
     def step(self, step: int) -> StepResult:
         """The loss on a batch of single frames."""
         clips, end = self.sampler.draw(step)
-        frames = self.frame.encode(self.frames.segments(clips, end, 1))[:, 0]
-        terms, indices = self.model.loss_terms(frames, self.frame)
+        frames = self.normalizer.encode(self.frames.segments(clips, end, 1))[:, 0]
+        terms, indices = self.model.loss_terms(frames, self.normalizer)
         self.used = torch.bincount(indices, minlength=len(self.used)).float()
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)
 
@@ -82,10 +88,10 @@ class VQVAETask:
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
         """Eq. 1 and the perplexity on validation frames."""
-        frames = self.frame.encode(self.validation.frames)
+        frames = self.normalizer.encode(self.validation.frames)
         vectors, index = self.model.codebook(self.model.encoder(frames))
         used = torch.bincount(index, minlength=len(self.used)).float()
-        error = rotation_error(self.model.decoder(vectors), frames, self.frame)
+        error = rotation_error(self.model.decoder(vectors), frames, self.normalizer)
         return {"rotation": float(error), "perplexity": perplexity(used)}
 
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from memmlp.common.errors import TrainingDiverged
 from memmlp.common.progress import progress
-from memmlp.motion.dataset import Frames
+from memmlp.motion.dataset import MotionDataset
 from memmlp.networks import checkpoint
 from memmlp.runs.run import Run
 from memmlp.training.optim import Optim
@@ -33,7 +33,7 @@ class StepResult:
     clips: Tensor
 
 
-class Task(Protocol):
+class TrainingTask(Protocol):
     """What is trained."""
 
     @property
@@ -41,7 +41,7 @@ class Task(Protocol):
         """All that a checkpoint must carry."""
 
     @property
-    def frames(self) -> Frames:
+    def frames(self) -> MotionDataset:
         """The training split."""
 
     def parameter_groups(self) -> list[dict]:
@@ -69,7 +69,9 @@ def unwatched(step: int, values: dict[str, float]) -> None:
     """Lets every run go on."""
 
 
-def train(task: Task, optim: Optim, run: Run, seed: int, description: str, watch: Watch = unwatched) -> None:
+def train(
+    task: TrainingTask, optim: Optim, run: Run, seed: int, description: str, watch: Watch = unwatched
+) -> None:
     """Train to `optim.steps`, from the run's checkpoint where there is one, and leave the last checkpoint.
 
     `watch` is called after each validation with the step and its values, and may raise to stop.
@@ -89,7 +91,7 @@ def train(task: Task, optim: Optim, run: Run, seed: int, description: str, watch
                 watch(step + 1, validation)
 
 
-def train_step(task: Task, optim: Optim, optimiser: torch.optim.Optimizer, step: int) -> StepResult:
+def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimizer, step: int) -> StepResult:
     """One step of the optimiser."""
     task.module.train()
     for group in optimiser.param_groups:
@@ -108,7 +110,7 @@ def train_step(task: Task, optim: Optim, optimiser: torch.optim.Optimizer, step:
     return result
 
 
-def check_finite(task: Task, result: StepResult, step: int) -> None:
+def check_finite(task: TrainingTask, result: StepResult, step: int) -> None:
     """Stop where the loss is no number."""
     if torch.isfinite(result.loss):
         return
@@ -121,7 +123,7 @@ def check_finite(task: Task, result: StepResult, step: int) -> None:
 
 
 def record(
-    task: Task, optim: Optim, run: Run, step: int, result: StepResult, bar: Progress, row: TaskID
+    task: TrainingTask, optim: Optim, run: Run, step: int, result: StepResult, bar: Progress, row: TaskID
 ) -> dict[str, float]:
     """Log and show a finished step, and validate where it is time; the validation's values, or none."""
     last = step == optim.steps
@@ -139,7 +141,7 @@ def record(
     return {}
 
 
-def save(task: Task, optimiser: torch.optim.Optimizer, run: Run, step: int) -> None:
+def save(task: TrainingTask, optimiser: torch.optim.Optimizer, run: Run, step: int) -> None:
     """Write all that a later process needs to go on after `step` steps."""
     rates = [group["initial_lr"] for group in optimiser.param_groups]
     tensors = checkpoint.module_tensors("module", task.module) | checkpoint.optimiser_tensors(optimiser)
@@ -147,7 +149,7 @@ def save(task: Task, optimiser: torch.optim.Optimizer, run: Run, step: int) -> N
     checkpoint.write(run.checkpoint, tensors, {"step": step, "initial_lr": rates})
 
 
-def resume(task: Task, optimiser: torch.optim.Optimizer, run: Run) -> int:
+def resume(task: TrainingTask, optimiser: torch.optim.Optimizer, run: Run) -> int:
     """Put the run's checkpoint back; the number of steps done."""
     tensors, values = checkpoint.read(run.checkpoint)
     checkpoint.load_module("module", task.module, tensors)

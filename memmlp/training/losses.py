@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from memmlp.motion.body import FRAME_DIM, HANDS, LOWER, N_JOINTS, POSITION, ROOT, ROTATION, SPARSE_DIM
 from memmlp.motion.coordinates import World
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 
 Terms = dict[str, Tensor]
 
@@ -33,7 +33,7 @@ class NoHand:
 
     branch = "position"
 
-    def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+    def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         """No term."""
         return {}
 
@@ -43,7 +43,7 @@ class HandPosition:
 
     branch = "position"
 
-    def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+    def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         """The term, from motion and truth (B, T, 198)."""
         hands = list(HANDS)
         return {"hand": l1((joints(motion) - joints(truth))[:, :, hands])}
@@ -54,10 +54,10 @@ class HandFK:
 
     branch = "rotation"
 
-    def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+    def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         """The term, from motion and truth (B, T, 198) and inputs (B, T, 54)."""
         hands = list(HANDS)
-        return {"hand": l1(frame.pose(motion, sparse)[:, :, hands] - joints(truth)[:, :, hands])}
+        return {"hand": l1(normalizer.pose(motion, sparse)[:, :, hands] - joints(truth)[:, :, hands])}
 
 
 Hand = NoHand | HandPosition | HandFK
@@ -159,13 +159,15 @@ class Loss(nn.Module):
 
     weighting: Weighting
 
-    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         """Each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
         raise NotImplementedError
 
-    def forward(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> tuple[Tensor, Terms]:
+    def forward(
+        self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer
+    ) -> tuple[Tensor, Terms]:
         """The loss and its unweighted terms."""
-        terms = self.terms(motion, truth, sparse, frame)
+        terms = self.terms(motion, truth, sparse, normalizer)
         return self.weighting(terms), terms
 
 
@@ -180,11 +182,11 @@ class MotionLoss(Loss):
         super().__init__()
         self.weighting, self.hand, self.branches = weighting, hand, branches
         probe = torch.zeros(1, 2, FRAME_DIM)
-        frame = Frame.raw(World(), torch.zeros(N_JOINTS, 3))
+        normalizer = Normalizer.raw(World(), torch.zeros(N_JOINTS, 3))
         motion = probe[..., SPARSE_DIM:]
-        weighting.build(list(self.terms(motion, motion, probe[..., :SPARSE_DIM], frame)))
+        weighting.build(list(self.terms(motion, motion, probe[..., :SPARSE_DIM], normalizer)))
 
-    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         """Each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
         terms: Terms = {}
         if "rotation" in self.branches:
@@ -192,7 +194,7 @@ class MotionLoss(Loss):
         if "position" in self.branches:
             terms |= position_terms(motion, truth)
         if self.hand.branch in self.branches:
-            terms |= self.hand(motion, truth, sparse, frame)
+            terms |= self.hand(motion, truth, sparse, normalizer)
         return terms
 
 
@@ -222,10 +224,10 @@ class AGRoLLoss(Loss):
         self.error = ERRORS[error]
         self.weighting = Fixed({"rotation": 1.0})
 
-    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         """The one term, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
-        place = frame.place(sparse)
-        error = frame.encode_motion(motion, place) - frame.encode_motion(truth, place)
+        origin = normalizer.origin(sparse)
+        error = normalizer.encode_motion(motion, origin) - normalizer.encode_motion(truth, origin)
         return {"rotation": self.error(error[..., ROTATION])}
 
 
@@ -262,10 +264,10 @@ class AvatarPoserLoss(Loss):
         weights = {"orientation": orientation, "rotation": rotation, "position": position}
         self.weighting, self.anchored = Fixed(weights), ANCHORS[anchor]
 
-    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, frame: Frame) -> Terms:
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         """Each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
         error = (motion - truth)[..., ROTATION].abs()
-        position = self.anchored(frame.pose(motion, sparse)) - self.anchored(joints(truth))
+        position = self.anchored(normalizer.pose(motion, sparse)) - self.anchored(joints(truth))
         return {
             "orientation": error[..., :6].mean(),
             "rotation": error[..., 6:].mean(),

@@ -11,7 +11,7 @@ from torch import nn
 
 from memmlp.evaluation import modes
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.dataset import Frames, WindowSampler
+from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architecture import Architecture
@@ -59,7 +59,7 @@ class NetworkTraining:
         frames = data.open("train").to(device)
         torch.manual_seed(self.seed)
         frozen = architecture.load_codes(codes) if codes else None
-        model = architecture.build(architecture.frame(data.manifest, frames.frames), frozen).to(device)
+        model = architecture.build(architecture.normalizer(data.manifest, frames.frames), frozen).to(device)
         self.rollout.begin(model)
         pieces = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)
         task = MotionTask(
@@ -85,7 +85,7 @@ class MotionTask:
         model: WindowModel,
         loss: Loss,
         rollout: Rollout,
-        frames: Frames,
+        frames: MotionDataset,
         optim: Optim,
         seed: int,
         validate: Callable[[WindowModel], dict[str, float]],
@@ -108,8 +108,8 @@ class MotionTask:
         motion, state = self.learn(call.sparse, call.state, call.truth)
         self.rollout.keep(state)
         true = call.truth[:, -motion.shape[1] :]
-        loss, terms = self.loss(motion, true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], self.model.frame)
-        own = self.model.terms(call.truth)
+        loss, terms = self.loss(motion, true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], self.model.normalizer)
+        own = self.model.auxiliary_losses(call.truth)
         return StepResult(sum(own.values(), loss), terms | own, call.clips)
 
     def report(self) -> dict[str, float]:

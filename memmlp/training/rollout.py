@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.dataset import Frames, WindowSampler
+from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.networks.memory import State
 from memmlp.networks.window_model import WindowModel
 
@@ -35,7 +35,7 @@ class Rollout(nn.Module):
     def begin(self, model: WindowModel) -> None:
         """Make room for what is kept between steps of that network's training; here nothing is."""
 
-    def draw(self, model: WindowModel, frames: Frames, sampler: WindowSampler, step: int) -> Call:
+    def draw(self, model: WindowModel, frames: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """The call of a training step."""
         raise NotImplementedError
 
@@ -46,7 +46,7 @@ class Rollout(nn.Module):
 class TeacherForcing(Rollout):
     """The true history: the paper's training (Sec. 3.2.1)."""
 
-    def draw(self, model: WindowModel, frames: Frames, sampler: WindowSampler, step: int) -> Call:
+    def draw(self, model: WindowModel, frames: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """The call of a training step."""
         clips, end = sampler.draw(step)
         past, stride = model.length, model.stride
@@ -65,7 +65,7 @@ class OwnPredictions(Rollout):
         super().__init__()
         self.max_passes = max_passes
 
-    def draw(self, model: WindowModel, frames: Frames, sampler: WindowSampler, step: int) -> Call:
+    def draw(self, model: WindowModel, frames: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """The call of a training step."""
         clips, end = sampler.draw(step)
         past, stride = model.length, model.stride
@@ -105,7 +105,7 @@ class PersistentStreams(Rollout):
         for name, tensor in model.initial_state(1).items():
             self.register_buffer(f"state_{name}", tensor.repeat(self.streams, *[1] * (tensor.dim() - 1)))
 
-    def draw(self, model: WindowModel, frames: Frames, sampler: WindowSampler, step: int) -> Call:
+    def draw(self, model: WindowModel, frames: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """The call of a training step: the next streams, each one stride further."""
         clips, end = sampler.draw(step)
         who = (step * len(clips) + torch.arange(len(clips), device=clips.device)) % self.streams

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from memmlp.cli.bench.calibration import SHARES, Cell, Sample, Shares, broken, draw, grid, simulate
+from memmlp.cli.bench.calibration import SHARES, GridRow, Shares, Simulated, broken, draw, grid, simulate
 from memmlp.common.files import read_json
 from memmlp.statistics.crossed import error
 
@@ -17,14 +17,18 @@ MODULE = sys.modules["memmlp.cli.bench.calibration"]  # the package has the comm
 
 def test_the_grid_is_all_that_have_two_groups():
     assert len(grid()) == 40
-    assert Cell(3, 10, 10) not in grid()
-    assert Cell(10, 536, 10) in grid()
-    assert [cell.capped for cell in (Cell(2, 40, 1), Cell(3, 4, 1), Cell(3, 10, 2))] == [False, False, True]
+    assert GridRow(3, 10, 10) not in grid()
+    assert GridRow(10, 536, 10) in grid()
+    assert [cell.capped for cell in (GridRow(2, 40, 1), GridRow(3, 4, 1), GridRow(3, 10, 2))] == [
+        False,
+        False,
+        True,
+    ]
 
 
-@pytest.mark.parametrize("cell", [Cell(5, 10, 1), Cell(5, 11, 2)])
-def test_mixtures_are_those_of_whole_differences(cell: Cell):
-    sample = Sample(np.random.default_rng(3), cell, 24)
+@pytest.mark.parametrize("cell", [GridRow(5, 10, 1), GridRow(5, 11, 2)])
+def test_mixtures_are_those_of_whole_differences(cell: GridRow):
+    sample = Simulated(np.random.default_rng(3), cell, 24)
     rng = np.random.default_rng(3)
     of_seeds = np.sqrt(cell.seeds) * rng.normal(size=(24, cell.seeds))
     fixed, noise, _ = draw(rng, cell, 24)
@@ -43,7 +47,7 @@ def test_mixtures_are_those_of_whole_differences(cell: Cell):
 
 @pytest.mark.parametrize("name", SHARES)
 def test_means_have_a_variance_of_one(name: str):
-    sample = Sample(np.random.default_rng(0), Cell(3, 11, 2), 24000)
+    sample = Simulated(np.random.default_rng(0), GridRow(3, 11, 2), 24000)
     known, mean = sample.mixed(SHARES[name], 3)
     assert mean.var() == pytest.approx(1, abs=0.06)
     a, b, e = known.variances.mean(1)
@@ -51,13 +55,13 @@ def test_means_have_a_variance_of_one(name: str):
 
 
 def test_a_cell_is_the_same_again_and_another_with_another_seed():
-    cell = Cell(3, 4, 2)
+    cell = GridRow(3, 4, 2)
     assert simulate(cell, 20, 1) == simulate(cell, 20, 1)
     assert simulate(cell, 20, 1) != simulate(cell, 20, 2)
 
 
 def test_looks_spend_fewer_seeds_where_effects_are_plain():
-    told = simulate(Cell(10, 40, 1), 20, 0)["campaign"]
+    told = simulate(GridRow(10, 40, 1), 20, 0)["campaign"]
     assert told["decided"] > 0.95
     assert told["seeds"] < 9
     assert told["error"] <= 0.05
@@ -74,7 +78,7 @@ def test_a_broken_promise_is_told():
 
 
 def test_the_command(memmlp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(MODULE, "grid", lambda: [Cell(3, 10, 2), Cell(5, 536, 10)])
+    monkeypatch.setattr(MODULE, "grid", lambda: [GridRow(3, 10, 2), GridRow(5, 536, 10)])
     file = tmp_path / "rates.json"
     ran = memmlp("bench", "calibration", "--quick", "--tables", "30", "--json", str(file), "--markdown")
     assert ran.code == 0, ran.err

@@ -23,7 +23,7 @@ from memmlp.config.shipped import shipped
 def jobs(monkeypatch: pytest.MonkeyPatch) -> list[DictConfig]:
     """The configs that `memmlp train` would train."""
     seen: list[DictConfig] = []
-    monkeypatch.setattr("memmlp.cli.train._train", seen.append)
+    monkeypatch.setattr("memmlp.cli.train.run_training", seen.append)
     return seen
 
 
@@ -31,7 +31,7 @@ def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
     def fail(cfg: DictConfig) -> None:
         raise error
 
-    monkeypatch.setattr("memmlp.cli.train._train", fail)
+    monkeypatch.setattr("memmlp.cli.train.run_training", fail)
 
 
 QUICK = """
@@ -153,7 +153,7 @@ def test_a_failed_job_does_not_stop_the_others(memmlp: Memmlp, monkeypatch: pyte
         if cfg.seed < 2:
             raise InputError(f"seed {cfg.seed} is bad")
 
-    monkeypatch.setattr("memmlp.cli.train._train", job)
+    monkeypatch.setattr("memmlp.cli.train.run_training", job)
     ran = memmlp("train", "-m", "seed=0,1,2")
     assert seeds == [0, 1, 2]
     assert ran.code == 2

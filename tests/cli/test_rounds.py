@@ -13,7 +13,7 @@ from conftest import Memmlp, one_line
 from fake_runs import CLIPS, fake_run
 
 from memmlp.runs.run import Run
-from memmlp.sweep.plan import Entry, Plan, Task
+from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.spec import Sweep
 
 ARMS = {"full": [], "worse": ["a=1"], "same": ["a=2"]}
@@ -35,7 +35,7 @@ class Runs:
     def planned(self, sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
         cells = [(arm.label, seed) for arm in sweep.runnable() for seed in sweep.seeds_of(arm)]
         entries = [Entry(label, seed, self._id(label, seed)) for label, seed in cells]
-        tasks = [Task(entry.id, "memmlp", {"optim": {"steps": 1}}) for entry in entries]
+        tasks = [RunTask(entry.id, "memmlp", {"optim": {"steps": 1}}) for entry in entries]
         return Plan(sweep.name, self.outputs, tuple(entries), tuple(tasks))
 
     def _id(self, label: str, seed: int) -> str:

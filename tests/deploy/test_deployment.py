@@ -91,15 +91,15 @@ def test_int8_is_near_and_keeps_the_metadata(tmp_path):
 def test_int8_may_stand_for_float32_only_if_it_is_as_good(pair, tmp_path):
     model = tiny.model()
     exact, quantised = pair
-    cost = compared(exact, quantised, model.frame, CLIPS)
+    cost = compared(exact, quantised, model.normalizer, CLIPS)
     assert cost["growth"] == pytest.approx(cost["int8"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
     assert cost["default"] == (cost["growth"] <= 0.01)
     other = tmp_path / "other.onnx"  # of two networks the better one may stand for the other alone
     export(streaming(tiny.model(seed=1)), other, "0")
-    both = [compared(*pair, model.frame, CLIPS) for pair in ((exact, other), (other, exact))]
+    both = [compared(*pair, model.normalizer, CLIPS) for pair in ((exact, other), (other, exact))]
     assert sorted(cost["default"] for cost in both) == [False, True]
     assert (1 + both[0]["growth"]) * (1 + both[1]["growth"]) == pytest.approx(1)
-    assert compared(exact, exact, model.frame, CLIPS)["default"]
+    assert compared(exact, exact, model.normalizer, CLIPS)["default"]
 
 
 def test_accuracy_is_that_of_the_evaluation(pair):
@@ -107,10 +107,10 @@ def test_accuracy_is_that_of_the_evaluation(pair):
 
     model = tiny.model()
     exact, _ = pair
-    found = accuracy(exact, model.frame, CLIPS)
+    found = accuracy(exact, model.normalizer, CLIPS)
     motions = evaluation.stream(model, CLIPS)
     rows = [
-        evaluation.rotations_report(model.frame, motion, clip)
+        evaluation.rotations_report(model.normalizer, motion, clip)
         for motion, clip in zip(motions, CLIPS, strict=True)
     ]
     for name, value in found.items():
@@ -140,7 +140,7 @@ def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
     place.latency.write_text(written)
     assert made.verify() == []
     place.int8.write_bytes(b"")
-    assert made.verify() == [f"deployments/{place.folder.name}/step.int8.onnx"]
+    assert made.verify() == [f"deployments/{deployed.folder.name}/step.int8.onnx"]
 
     line = ["export", made.id, "--out", "int8.onnx", "--precision", "int8"]
     assert "MPJPE" in memmlp(*line, "--max-growth", "50").out

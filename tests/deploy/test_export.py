@@ -50,14 +50,14 @@ def test_parity_sees_a_difference(exported):
 def test_almost_parallel_columns_are_no_failure(tmp_path):
     """As an untrained network makes them: the joints of rotations that agree may be far apart."""
     model, path = tiny.reference("agrol_mlp"), tmp_path / "step.onnx"
-    mean, std = (t[SPARSE_DIM:][ROTATION].view(22, 6) for t in (model.frame.mean, model.frame.std))
+    mean, std = (t[SPARSE_DIM:][ROTATION].view(22, 6) for t in (model.normalizer.mean, model.normalizer.std))
     mean[9, 3:], std[9] = mean[9, :3], 4e-3
     export(model, path, "0123456789abcdef")
     with torch.no_grad():
         model.head.bias.view(22, 6)[9, 3] += 1e-3  # 4e-6 of the rotation, the rounding of a large network
     assert parity(model, path, CLIP) <= TOLERANCE
     assert float((in_torch(model, CLIP) - streamed(OnnxStream(path), CLIP)).abs().max()) > TOLERANCE
-    model.frame.rest[15] += 0.01  # of the joints alone
+    model.normalizer.rest[15] += 0.01  # of the joints alone
     assert parity(model, path, CLIP) > TOLERANCE
 
 
@@ -82,9 +82,9 @@ def test_zeros_are_a_fresh_start(exported):
     _, path = exported
     stream = OnnxStream(path)
     sparse = CLIP[:5, None, :SPARSE_DIM].numpy()
-    first = [stream.step(frame)[1] for frame in sparse]
+    first = [stream.step(normalizer)[1] for normalizer in sparse]
     stream.reset()
-    again = [stream.step(frame)[1] for frame in sparse]
+    again = [stream.step(normalizer)[1] for normalizer in sparse]
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
 
 

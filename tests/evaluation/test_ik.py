@@ -13,7 +13,7 @@ from memmlp.evaluation.predictions import prediction_arrays
 from memmlp.motion.body import HEAD, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import axis_angle_to_matrix, matrix_to_sixd
 
-FRAME = tiny.frame()
+FRAME = tiny.normalizer()
 TRUTH = tiny.clip(40)
 SPARSE, MOTION = TRUTH[:, :SPARSE_DIM], TRUTH[:, SPARSE_DIM:]
 LEAVES = [10, 11, 15, 20, 21]
@@ -149,10 +149,10 @@ def test_evaluation_reports_a_third_branch_with_the_rotation_branchs_metrics():
 def test_the_combined_report_is_of_the_solved_rotations():
     model, clip = tiny.model(), tiny.clip(25)
     motion = stream(model, [clip])[0]
-    report = clip_report(model.frame, motion, clip, LBFGS(5))
-    solved = LBFGS(5).solutions(model.frame, motion, clip[:, :SPARSE_DIM])["combined"]
-    assert report["combined"] == clip_report(model.frame, solved, clip)["rotation"]
-    positions = model.frame.pose(solved, clip[:, :SPARSE_DIM])
+    report = clip_report(model.normalizer, motion, clip, LBFGS(5))
+    solved = LBFGS(5).solutions(model.normalizer, motion, clip[:, :SPARSE_DIM])["combined"]
+    assert report["combined"] == clip_report(model.normalizer, solved, clip)["rotation"]
+    positions = model.normalizer.pose(solved, clip[:, :SPARSE_DIM])
     truth = clip[:, SPARSE_DIM:][:, POSITION].unflatten(-1, (N_JOINTS, 3))
     assert report["combined"]["MPJPE"] == float(metrics.position_error(positions, truth))
     torch.testing.assert_close(positions[:, HEAD], truth[:, HEAD], atol=1e-5, rtol=0)

@@ -68,7 +68,7 @@ class Copy:
     shift = 0
 
     def __init__(self, clips, error=0.0, frames=7):
-        self.frame, self.frames, self.error = tiny.frame(), frames, error
+        self.normalizer, self.frames, self.error = tiny.normalizer(), frames, error
         self.table = {tuple(row[:SPARSE_DIM].tolist()): row[SPARSE_DIM:] for clip in clips for row in clip}
 
     def initial_state(self, batch=1):
@@ -174,5 +174,5 @@ def test_validation_streams_through_pieces():
     pieces = chunks(split, 24, least=10)
     assert [len(piece) for piece in pieces] == [24, 24, 20]
     values = quick_stream(model, pieces)
-    reports = [clip_report(model.frame, stream(model, [p])[0], p)["rotation"]["MPJPE"] for p in pieces]
+    reports = [clip_report(model.normalizer, stream(model, [p])[0], p)["rotation"]["MPJPE"] for p in pieces]
     assert values["rotation MPJPE"] == pytest.approx(np.mean(reports), rel=1e-4)

@@ -23,7 +23,7 @@ from memmlp.deploy.export import export
 from memmlp.evaluation.ik import LBFGS
 from memmlp.evaluation.modes import joint_positions, local_rotations, stream
 from memmlp.live.rotations import matrix_to_quaternion
-from memmlp.live.soak import Motion, repetitions, soak
+from memmlp.live.soak import TrackedMotion, repetitions, soak
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Offsets, Stream
 from memmlp.live.trackers import t_pose
@@ -68,7 +68,7 @@ def largest_difference(network, file: Path, person: wearer.Person) -> float:
     poses = wearer.play(Stream(file), person.positions, person.rotations)[1:]
     motion = stream(network, [person.frames])[0]
     pairs = [
-        (wearer.joints(poses), network.frame.pose(motion, person.frames[:, :SPARSE_DIM])),
+        (wearer.joints(poses), network.normalizer.pose(motion, person.frames[:, :SPARSE_DIM])),
         (np.stack([pose.joints for pose in poses]), joint_positions(motion)),
         (np.stack([pose.rotations for pose in poses]), local_rotations(motion)),
     ]
@@ -122,8 +122,8 @@ def test_inverse_kinematics_bring_the_pose_to_the_position_branch(network, file)
     solved = wearer.play(Stream(file, ik=LBFGS()), PERSON.positions[:20], PERSON.rotations[:20])
     frames = PERSON.frames[:19]
     motion = stream(network, [frames])[0]
-    expected = LBFGS().solutions(network.frame, motion, frames[:, :SPARSE_DIM])["combined"]
-    there = network.frame.pose(expected, frames[:, :SPARSE_DIM]).numpy()
+    expected = LBFGS().solutions(network.normalizer, motion, frames[:, :SPARSE_DIM])["combined"]
+    there = network.normalizer.pose(expected, frames[:, :SPARSE_DIM]).numpy()
     targets = np.stack([pose.joints for pose in solved])
     assert wearer.apart(wearer.joints(solved[1:]), there).max() < 0.1
     assert (
@@ -306,7 +306,7 @@ def test_calibration_finds_how_the_devices_sit(name, file):
 
 
 def test_a_long_stream_neither_drifts_nor_grows(file):
-    motion = Motion(
+    motion = TrackedMotion(
         PERSON.positions[1:], PERSON.rotations[1:], joint_positions(PERSON.frames[:, SPARSE_DIM:]).numpy()
     )
     stream = Stream(file)

@@ -9,7 +9,7 @@ from memmlp.motion.body import FRAME_DIM, ROTATION, SPARSE_DIM, builtin_rest_joi
 from memmlp.motion.coordinates import Heading, HeadRelative, World
 from memmlp.motion.features import motion_frames
 from memmlp.motion.geometry import axis_angle_to_matrix, matrix_to_axis_angle
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 
 REST = torch.tensor(builtin_rest_joints(), dtype=torch.float64)
 
@@ -29,13 +29,13 @@ def motion(yaw: float = 0.0, shift: tuple[float, float] = (0.0, 0.0)) -> torch.T
 @pytest.mark.parametrize("coordinates", [World(), HeadRelative(), Heading()])
 def test_there_and_back(coordinates):
     frames = motion(yaw=2.0, shift=(3.0, -1.0))
-    frame = Frame.fit(coordinates, REST, frames)
+    normalizer = Normalizer.fit(coordinates, REST, frames)
     sparse, theta = frames[:, :SPARSE_DIM], frames[:, SPARSE_DIM:]
-    place = frame.place(sparse)
+    origin = normalizer.origin(sparse)
     torch.testing.assert_close(
-        frame.decode_motion(frame.encode_motion(theta, place), place), theta, atol=1e-5, rtol=0
+        normalizer.decode_motion(normalizer.encode_motion(theta, origin), origin), theta, atol=1e-5, rtol=0
     )
-    assert not torch.allclose(frame.encode(frames), frames, atol=0.1)
+    assert not torch.allclose(normalizer.encode(frames), frames, atol=0.1)
 
 
 @pytest.mark.parametrize(
@@ -43,16 +43,16 @@ def test_there_and_back(coordinates):
     [(World(), False, False), (HeadRelative(), True, False), (Heading(), True, True)],
 )
 def test_what_it_is_blind_to(coordinates, blind_to_place, blind_to_heading):
-    frame = Frame.raw(coordinates, REST)
-    here = frame.encode(motion())
-    assert torch.allclose(here, frame.encode(motion(shift=(5.0, 2.0))), atol=1e-4) == blind_to_place
-    assert torch.allclose(here, frame.encode(motion(yaw=1.3)), atol=1e-4) == blind_to_heading
+    normalizer = Normalizer.raw(coordinates, REST)
+    here = normalizer.encode(motion())
+    assert torch.allclose(here, normalizer.encode(motion(shift=(5.0, 2.0))), atol=1e-4) == blind_to_place
+    assert torch.allclose(here, normalizer.encode(motion(yaw=1.3)), atol=1e-4) == blind_to_heading
 
 
 def test_statistics_are_those_of_the_training_frames():
     frames = motion()
-    encoded = Frame.fit(HeadRelative(), REST, frames, chunk=7).encode(frames)
-    varies = Frame.raw(HeadRelative(), REST).encode(frames).std(0, unbiased=False) > 1e-3
+    encoded = Normalizer.fit(HeadRelative(), REST, frames, chunk=7).encode(frames)
+    varies = Normalizer.raw(HeadRelative(), REST).encode(frames).std(0, unbiased=False) > 1e-3
     torch.testing.assert_close(encoded.mean(0), torch.zeros(FRAME_DIM), atol=1e-3, rtol=0)
     torch.testing.assert_close(
         encoded.std(0, unbiased=False)[varies], torch.ones(int(varies.sum())), atol=1e-3, rtol=0
@@ -61,7 +61,7 @@ def test_statistics_are_those_of_the_training_frames():
 
 def test_pose_puts_the_head_on_its_tracker():
     frames = motion()
-    frame = Frame.raw(World(), REST)
-    positions = frame.pose(frames[:, SPARSE_DIM:], frames[:, :SPARSE_DIM])
+    normalizer = Normalizer.raw(World(), REST)
+    positions = normalizer.pose(frames[:, SPARSE_DIM:], frames[:, :SPARSE_DIM])
     truth = frames[:, SPARSE_DIM:][:, ROTATION.stop :].unflatten(-1, (22, 3))
     torch.testing.assert_close(positions, truth, atol=1e-5, rtol=0)

@@ -15,9 +15,9 @@ from memmlp.common.errors import InputError
 from memmlp.motion import prepare as module
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.clip import Clip, write_clip
-from memmlp.motion.dataset import Frames, WindowSampler
+from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.features import motion_frames
-from memmlp.motion.prepare import Manifest, Source, prepare
+from memmlp.motion.prepare import ClipFolder, Manifest, prepare
 from memmlp.motion.splits import SeededSplit
 from memmlp.runs.recipes import RECIPES
 
@@ -37,8 +37,8 @@ def root(tmp_path: Path) -> Path:
     return tmp_path / "clips"
 
 
-def source(root: Path, **changes) -> Source:
-    return replace(Source(root, SeededSplit(0.2, 0.2), min_frames=20), **changes)
+def source(root: Path, **changes) -> ClipFolder:
+    return replace(ClipFolder(root, SeededSplit(0.2, 0.2), min_frames=20), **changes)
 
 
 def test_the_cache_holds_the_clips_frames(root, tmp_path):
@@ -57,7 +57,7 @@ def test_the_cache_holds_the_clips_frames(root, tmp_path):
         assert record.resampling == ("every 2. frame" if seed == 3 else "kept")
         poses, trans = (x[::step].astype(np.float32).astype(np.float64) for x in (clip.poses, clip.trans))
         expected = motion_frames(torch.tensor(poses), torch.tensor(trans), rest).float()
-        split = Frames.open(tmp_path / "cache", record.split)
+        split = MotionDataset.open(tmp_path / "cache", record.split)
         torch.testing.assert_close(split.clip(split.names.index(record.name)), expected, atol=1e-5, rtol=0)
 
 
@@ -138,7 +138,7 @@ def test_every_clip_knows_its_group(root, tmp_path):
     assert manifest.groups == expected
     assert Manifest.load(tmp_path / "cache").groups == expected
     for part in ("train", "val", "test"):
-        frames = Frames.open(tmp_path / "cache", part).to("cpu")
+        frames = MotionDataset.open(tmp_path / "cache", part).to("cpu")
         assert frames.groups == [expected[name] for name in frames.names]
     alone = prepare(source(root), tmp_path / "alone")
     assert alone.groups == {name: name for name in expected}
@@ -191,10 +191,10 @@ def test_nothing_to_prepare_is_one_line(tmp_path):
 
 
 @pytest.fixture
-def frames() -> Frames:
+def frames() -> MotionDataset:
     lengths = torch.tensor([5, 12, 30])
     numbers = torch.arange(47.0)[:, None].expand(-1, 252)
-    return Frames(numbers, torch.tensor([0, 5, 17]), lengths, ["a", "b", "c"])
+    return MotionDataset(numbers, torch.tensor([0, 5, 17]), lengths, ["a", "b", "c"])
 
 
 def test_segments_end_where_asked_and_repeat_the_first_frame(frames):

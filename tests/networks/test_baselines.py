@@ -1,4 +1,4 @@
-"""The reference networks: published sizes, their parts computed independently, streams, export, refusals."""
+"""The baselines: published sizes, their parts computed independently, streams, export, refusals."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from memmlp.deploy.parity import TOLERANCE, parity
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import MOTION_DIM, PARENTS, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.coordinates import Heading, World
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.agrol import TimeEmbedding
 from memmlp.networks.baselines.avatar_poser import Attention, EncoderLayer
 from memmlp.networks.baselines.diffusion import Diffusion, cosine_schedule
@@ -40,7 +40,7 @@ SHORT = [
 def built(*overrides: str) -> WindowModel:
     """The network of a command line, with random weights."""
     architecture = build_experiment(composed(list(overrides))).architecture
-    return architecture.build(Frame.raw(architecture.coordinates, tiny.REST), None).eval()
+    return architecture.build(Normalizer.raw(architecture.coordinates, tiny.REST), None).eval()
 
 
 # Parameters: as counted by hand in the docstrings, and as Table 16 prints them. MACs of a streaming step:
@@ -131,7 +131,7 @@ def test_agrol_windows_see_nothing_of_other_windows():
 def test_positions_are_forward_kinematics_of_the_rotations(name):
     model = tiny.reference(name, Heading())
     motion = evaluation.stream(model, [CLIP])[0]
-    expected = model.frame.pose(motion, CLIP[:, :SPARSE_DIM]).flatten(1)
+    expected = model.normalizer.pose(motion, CLIP[:, :SPARSE_DIM]).flatten(1)
     torch.testing.assert_close(motion[:, ROTATION.stop :], expected, atol=1e-5, rtol=0)
 
 
@@ -163,10 +163,10 @@ def test_ddim_is_an_independent_numpy_computation(steps):
     ]  # fmt: skip
     alphas = np.cumprod(1 - np.array(betas))
     x, times = noise, [20 * k // steps - 1 for k in range(steps, 0, -1)]
-    for place, t in enumerate(times):
+    for origin, t in enumerate(times):
         clean = 0.7 * x + 0.1 + 0.01 * t
         epsilon = (x - np.sqrt(alphas[t]) * clean) / np.sqrt(1 - alphas[t])
-        after = alphas[times[place + 1]] if place + 1 < steps else 1.0
+        after = alphas[times[origin + 1]] if origin + 1 < steps else 1.0
         x = np.sqrt(after) * clean + np.sqrt(1 - after) * epsilon
     assert times[0] == 19
     np.testing.assert_allclose(found.numpy(), x, atol=1e-5)
@@ -197,7 +197,7 @@ def test_the_denoiser_learns_from_the_noised_truth_of_the_window():
     torch.manual_seed(0)
     motion, _ = model.learn(truth[:, -1:, :SPARSE_DIM], state, truth)
     (noisy, time, encoded), *_ = seen
-    frames = model.frame.encode(truth)
+    frames = model.normalizer.encode(truth)
     signal = model.diffusion.signal[time][:, None, None]
     noise = (noisy - signal.sqrt() * frames[..., SPARSE_DIM:][..., ROTATION]) / (1 - signal).sqrt()
     assert motion.shape == (64, 7, MOTION_DIM)
@@ -266,14 +266,14 @@ DRAWN = [torch.randn(2, 3, MOTION_DIM, generator=torch.Generator().manual_seed(i
 @pytest.mark.parametrize("error", ["norm", "square"])
 def test_agrols_loss_is_that_of_its_code_or_of_its_paper(error):
     """The mean over frames and joints of each joint's L2 norm, or the mean of squares, in network space."""
-    (motion, truth), frame = DRAWN, tiny.frame(World())
-    loss, terms = AGRoLLoss(error)(motion, truth, SPARSE[:, :3].expand(2, -1, -1), frame)
-    scaled = (motion - truth)[..., ROTATION].numpy() / frame.std[SPARSE_DIM:][ROTATION].numpy()
+    (motion, truth), normalizer = DRAWN, tiny.normalizer(World())
+    loss, terms = AGRoLLoss(error)(motion, truth, SPARSE[:, :3].expand(2, -1, -1), normalizer)
+    scaled = (motion - truth)[..., ROTATION].numpy() / normalizer.std[SPARSE_DIM:][ROTATION].numpy()
     norms = [np.sqrt((scaled[b, t, 6 * j : 6 * j + 6] ** 2).sum()) for b, t, j in np.ndindex(2, 3, 22)]
     expected = {"norm": np.mean(norms), "square": np.mean(scaled**2)}
     assert float(loss) == pytest.approx(expected[error], rel=1e-4)
     assert set(terms) == {"rotation"}
-    assert float(AGRoLLoss()(motion, truth, SPARSE[:, :3].expand(2, -1, -1), frame)[0]) == pytest.approx(
+    assert float(AGRoLLoss()(motion, truth, SPARSE[:, :3].expand(2, -1, -1), normalizer)[0]) == pytest.approx(
         expected["norm"], rel=1e-4
     )
 
@@ -281,9 +281,9 @@ def test_agrols_loss_is_that_of_its_code_or_of_its_paper(error):
 @pytest.mark.parametrize("anchor", ["pelvis", "head"])
 def test_avatar_posers_loss_compares_bodies_at_the_pelvis_or_at_the_tracker(anchor):
     """Joint by joint down the tree, in NumPy; by default as its released code has it."""
-    (motion, truth), frame = DRAWN, tiny.frame(World())
+    (motion, truth), normalizer = DRAWN, tiny.normalizer(World())
     sparse = SPARSE[:, :3].expand(2, -1, -1)
-    loss, terms = AvatarPoserLoss(anchor=anchor)(motion, truth, sparse, frame)
+    loss, terms = AvatarPoserLoss(anchor=anchor)(motion, truth, sparse, normalizer)
     difference = (motion - truth)[..., ROTATION].numpy()
     errors = []
     for b, t in np.ndindex(2, 3):
@@ -300,7 +300,9 @@ def test_avatar_posers_loss_compares_bodies_at_the_pelvis_or_at_the_tracker(anch
     assert {name: float(term) for name, term in terms.items()} == pytest.approx(expected, rel=1e-4)
     weights = {"orientation": 0.02, "rotation": 1.0, "position": 1.0}
     assert float(loss) == pytest.approx(sum(weights[name] * expected[name] for name in weights), rel=1e-4)
-    assert (float(AvatarPoserLoss()(motion, truth, sparse, frame)[0]) == float(loss)) == (anchor == "pelvis")
+    assert (float(AvatarPoserLoss()(motion, truth, sparse, normalizer)[0]) == float(loss)) == (
+        anchor == "pelvis"
+    )
 
 
 def posed(rotation: np.ndarray) -> np.ndarray:
@@ -321,18 +323,18 @@ def posed(rotation: np.ndarray) -> np.ndarray:
 
 def test_reference_networks_see_what_their_authors_give_them():
     """World coordinates, and z-scores of the diffusion model alone; what is asked for wins."""
-    features = {name: tuple(composed([f"model={name}"]).frame.values()) for name in NAMES}
+    features = {name: tuple(composed([f"model={name}"]).normalizer.values()) for name in NAMES}
     raw = ("world", False)
     assert features == {"agrol_mlp": raw, "avatar_poser": raw, "agrol_diffusion": ("world", True)}
-    asked = composed(["model=agrol_mlp", "frame.coordinates=heading", "frame.normalize=true"]).frame
+    asked = composed(["model=agrol_mlp", "frame.coordinates=heading", "frame.normalize=true"]).normalizer
     assert tuple(asked.values()) == ("heading", True)
-    assert tuple(composed([]).frame.values()) == ("heading", True)
+    assert tuple(composed([]).normalizer.values()) == ("heading", True)
 
 
 def test_avatar_posers_loss_on_positions_reaches_the_rotations():
     motion = CLIP[None, :3, SPARSE_DIM:].clone().requires_grad_()
     truth = tiny.clip(3, seed=9)[None, :, SPARSE_DIM:]
-    AvatarPoserLoss(0, 0, 1)(motion, truth, SPARSE[:, :3], tiny.frame())[0].backward()
+    AvatarPoserLoss(0, 0, 1)(motion, truth, SPARSE[:, :3], tiny.normalizer())[0].backward()
     assert float(motion.grad[..., ROTATION].abs().sum()) > 0
 
 

@@ -9,7 +9,7 @@ from memmlp.evaluation.modes import stream, window
 from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM, builtin_rest_joints
 from memmlp.motion.coordinates import Heading, HeadRelative, World
 from memmlp.motion.dataset import WindowSampler
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory
 from memmlp.networks.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
@@ -46,8 +46,8 @@ def test_paper_profile_has_the_papers_parameters():
     memory = CodeMemory(
         (2, 4, 6, 8), 192, "window", "first", "residual", 0.5, codes=VQVAE(), depth=8, **sizes
     )
-    frame = Frame.raw(HeadRelative(), torch.tensor(builtin_rest_joints()))
-    model = MemMLP(frame, memory, TwoBranch(2, **sizes), depth=8, **sizes)
+    normalizer = Normalizer.raw(HeadRelative(), torch.tensor(builtin_rest_joints()))
+    model = MemMLP(normalizer, memory, TwoBranch(2, **sizes), depth=8, **sizes)
     assert model.count_parameters() == 4_117_118
     assert abs(model.count_parameters() / 4.10e6 - 1) < 0.03
 
@@ -81,11 +81,11 @@ def test_memory_sees_the_shifted_past(shift):
     outputs = run(model, SPARSE)
     back, size, t = {"frame": 1, "window": model.frames}[shift], model.frames, 30
     span = slice(t - back - size + 1, t - back + 1)
-    place = model.frame.place(SPARSE)
-    torch.testing.assert_close(seen[t].sparse, model.frame.encode_sparse(SPARSE, place)[:, span])
+    origin = model.normalizer.origin(SPARSE)
+    torch.testing.assert_close(seen[t].sparse, model.normalizer.encode_sparse(SPARSE, origin)[:, span])
     own = torch.stack([output[0, -1] for output in outputs])[None]
     torch.testing.assert_close(
-        seen[t].motion, model.frame.encode_motion(own, place)[:, span], atol=1e-5, rtol=0
+        seen[t].motion, model.normalizer.encode_motion(own, origin)[:, span], atol=1e-5, rtol=0
     )
 
 
@@ -98,11 +98,11 @@ def test_the_past_of_a_call_of_a_window_is_the_window_before(shift):
     model.blocks[1].register_forward_hook(lambda module, args, output: seen.append(args[1]))
     size, sparse = model.frames, SPARSE[:, : 3 * model.frames]
     outputs = run(model, sparse, new=size)
-    place = model.frame.place(sparse)[:, size : 2 * size]
-    before = model.frame.encode_sparse(sparse[:, size : 2 * size], place)
+    origin = model.normalizer.origin(sparse)[:, size : 2 * size]
+    before = model.normalizer.encode_sparse(sparse[:, size : 2 * size], origin)
     torch.testing.assert_close(seen[2].sparse, before)
     torch.testing.assert_close(
-        seen[2].motion, model.frame.encode_motion(outputs[1], place), atol=1e-5, rtol=0
+        seen[2].motion, model.normalizer.encode_motion(outputs[1], origin), atol=1e-5, rtol=0
     )
 
 
@@ -113,14 +113,14 @@ def test_in_window_mode_a_memory_recalls_what_it_was_trained_on(shift, back):
     model, clip, seen = tiny.model(CodeMemory, shift=shift), tiny.clip(24), []
     model.blocks[1].register_forward_hook(lambda module, args, output: seen.append(args[1].sparse))
     found, size = window(model, [clip])[0], model.frames
-    encoded = model.frame.encode(clip)[None, :, :SPARSE_DIM]
+    encoded = model.normalizer.encode(clip)[None, :, :SPARSE_DIM]
     kept = seen[size - 1 :: size] if shift == "frame" else seen
     for t, past in zip(range(size - 1, 24, size), kept, strict=False):
         expected = torch.cat([encoded[:, :1].expand(-1, back + size, -1), encoded], 1)[:, t + 1 :][:, :size]
         torch.testing.assert_close(past, expected)
     trained = TeacherForcing().draw(model, tiny.frames((24,)), WindowSampler(tiny.frames((24,)), 4, 7, 0), 0)
     model.advance(trained.sparse, trained.state)
-    inputs = model.frame.encode(trained.truth)[..., :SPARSE_DIM]
+    inputs = model.normalizer.encode(trained.truth)[..., :SPARSE_DIM]
     torch.testing.assert_close(seen[-1][:, back:], inputs[:, :-back])
     assert found.shape == (24, MOTION_DIM)
 
@@ -142,9 +142,9 @@ def test_latest_history_is_the_last_output():
     seen = []
     model.blocks[1].register_forward_hook(lambda module, args, output: seen.append(args[1]))
     outputs, t, size = run(model, SPARSE), 30, model.frames
-    place = model.frame.place(SPARSE)[:, t - size : t]
+    origin = model.normalizer.origin(SPARSE)[:, t - size : t]
     torch.testing.assert_close(
-        seen[t].motion, model.frame.encode_motion(outputs[t - 1], place), atol=1e-5, rtol=0
+        seen[t].motion, model.normalizer.encode_motion(outputs[t - 1], origin), atol=1e-5, rtol=0
     )
 
 
@@ -225,7 +225,7 @@ def test_rotation_only_positions_are_forward_kinematics():
     model = tiny.model(predictor=RotationOnly)
     motion = run(model, SPARSE)[-1]
     window = SPARSE[:, -model.frames :]
-    expected = model.frame.pose(motion, window).flatten(-2)
+    expected = model.normalizer.pose(motion, window).flatten(-2)
     torch.testing.assert_close(motion[..., ROTATION.stop :], expected, atol=1e-5, rtol=0)
     assert motion.shape[-1] == MOTION_DIM
 

@@ -55,7 +55,7 @@ def test_the_recurrent_feature_is_norm_layer_silu_over_the_whole_stream(kind):
     seen = []
     model.blocks[1].register_forward_hook(lambda module, args, output: seen.append(args[1]))
     outputs(model, SPARSE, 1)
-    encoded = model.frame.encode_sparse(SPARSE, model.frame.place(SPARSE))
+    encoded = model.normalizer.encode_sparse(SPARSE, model.normalizer.origin(SPARSE))
     first = model.memory.recurrences[0]
     expected = torch.nn.functional.silu(first.layer(first.norm(encoded))[0])
     block = model.blocks[1]
@@ -70,7 +70,7 @@ def test_teacher_forcing_starts_the_hidden_state_from_the_input_before_the_windo
     clips, end = sampler.draw(0)
     assert torch.equal(call.sparse, SPLIT.segments(clips, end, 7)[..., :SPARSE_DIM])
     before = SPLIT.segments(clips, end - 7, 1)
-    encoded = model.frame.encode(before)[:, 0, :SPARSE_DIM]
+    encoded = model.normalizer.encode(before)[:, 0, :SPARSE_DIM]
     layer = model.memory.recurrences[1]
     torch.testing.assert_close(call.state["hidden"][:, 1], layer.first(layer.norm(encoded)))
     assert all(float(call.state[name].abs().sum()) == 0 for name in set(call.state) & {"cell", "features"})
@@ -180,16 +180,16 @@ def test_joint_codes_are_entries_of_the_codebook_and_a_frozen_copy_gives_the_sam
 @torch.no_grad()
 def test_the_vqvaes_terms_are_eq_1_in_the_worlds_units_and_the_codebooks_loss():
     model = tiny.vqvae()
-    frames = tiny.frame().encode(tiny.clip(20))
+    frames = tiny.normalizer().encode(tiny.clip(20))
     latent = model.encoder(frames)
     nearest = torch.cdist(latent, model.codebook.vectors).argmin(-1)
     model.codebook.started.fill_(True)
     rotations = model.decoder(model.codebook.vectors[nearest])
-    std, mean = (tensor[54:186] for tensor in (tiny.frame().std, tiny.frame().mean))
-    place = tiny.frame().place(tiny.clip(20)[:, :54])
-    truth = tiny.frame().coordinates.motion_in(tiny.clip(20)[:, 54:], place)[:, :132]
+    std, mean = (tensor[54:186] for tensor in (tiny.normalizer().std, tiny.normalizer().mean))
+    origin = tiny.normalizer().origin(tiny.clip(20)[:, :54])
+    truth = tiny.normalizer().coordinates.motion_in(tiny.clip(20)[:, 54:], origin)[:, :132]
     expected = l1((rotations * std + mean - truth)[:, None])
-    terms, indices = model.loss_terms(frames, tiny.frame())
+    terms, indices = model.loss_terms(frames, tiny.normalizer())
     torch.testing.assert_close(terms["rotation"], expected, rtol=1e-5, atol=0)
     assert torch.equal(indices, nearest)
     assert set(terms) == {"rotation", "codebook"}

@@ -37,9 +37,9 @@ def largest_difference(model, sparse: torch.Tensor) -> float:
     """Over a stream of (1, N, 54), each with its own history."""
     live = streaming(model)
     whole, carried, worst = model.initial_state(1), live.initial_state(), 0.0
-    for frame in sparse.split(1, 1):
-        expected, whole = model.advance(frame, whole, 1)
-        found, carried = live.advance(frame, carried)
+    for normalizer in sparse.split(1, 1):
+        expected, whole = model.advance(normalizer, whole, 1)
+        found, carried = live.advance(normalizer, carried)
         worst = max(worst, float((expected - found).abs().max()))
     return worst
 

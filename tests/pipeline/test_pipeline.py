@@ -18,7 +18,7 @@ from PIL import Image
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.config.shipped import shipped
-from memmlp.motion.dataset import Frames
+from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline.run import codes_run
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
@@ -151,7 +151,7 @@ def test_a_nan_on_a_later_clip_is_not_exported(home, memmlp, monkeypatch):
     found = iter([1e-6, float("nan")])
     monkeypatch.setattr("memmlp.deploy.parity.parity", lambda *_: next(found))
     monkeypatch.setattr("memmlp.deploy.export.export", lambda model, path, run: path.write_bytes(b""))
-    monkeypatch.setattr(Frames, "clips", lambda self: [None, None])
+    monkeypatch.setattr(MotionDataset, "clips", lambda self: [None, None])
     ran = memmlp("export", motion_run(home).id, "--out", "never.onnx", "--clips", "0")
     assert (ran.code, "not written" in ran.err) == (1, True)
     assert not list(home.glob("*never*")) + list(home.glob(".export-*"))

@@ -14,7 +14,7 @@ from fake_runs import CLIPS, fake_run, fake_sweep, nothing, runs_of
 from memmlp.cli.results import sources
 from memmlp.common.errors import InputError
 from memmlp.report.claims import NEVER, WORDS, claims
-from memmlp.report.markdown import Source, pages
+from memmlp.report.markdown import KeptTable, pages
 from memmlp.report.store import Kept, dumps, load_kept, overrides_of, save, without_paths
 from memmlp.statistics import Verdict, holm, paired_effects
 from memmlp.sweep.spec import Sweep, load_sweep
@@ -36,8 +36,8 @@ def kept(sweep: Sweep, tmp_path: Path) -> Kept:
     return Kept("table14", ("data=mocap",), runs_of(sweep, find), overrides_of(sweep))
 
 
-def source(sweep: Sweep, kept: Kept) -> Source:
-    return Source(kept, collect(sweep, kept.of(sweep), command=kept.command))
+def source(sweep: Sweep, kept: Kept) -> KeptTable:
+    return KeptTable(kept, collect(sweep, kept.of(sweep), command=kept.command))
 
 
 def test_kept_results_make_the_runs_table(sweep: Sweep, kept: Kept, tmp_path: Path):

@@ -19,7 +19,7 @@ from memmlp.config.compose import composed
 from memmlp.config.schema import restored
 from memmlp.deploy.deployment import GRAPHS
 from memmlp.evaluation import modes as evaluation
-from memmlp.motion.dataset import Frames
+from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline.experiment import Experiment
 from memmlp.pipeline.run import codes_run
 from memmlp.runs.identity import NEUTRAL, Identity, deployment_id, evaluation_id, flatten
@@ -121,7 +121,7 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
     run.folder.mkdir(parents=True)
     model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)
     found = data.open("test")
-    short = Frames(
+    short = MotionDataset(
         found.frames[:30], torch.tensor([0]), torch.tensor([30]), found.names[:1], found.groups[:1]
     )
     settings = experiment.evaluation
@@ -146,7 +146,7 @@ class Silent:
         """Nothing."""
 
 
-def shipped(experiment: Experiment, model: Any, clip: Frames) -> list[Any]:
+def shipped(experiment: Experiment, model: Any, clip: MotionDataset) -> list[Any]:
     """What a deployment shows: the graph's kind and numbers, its files, how often it is timed."""
     network = GRAPHS[experiment.deployment.graph](model)
     state, motions = network.initial_state(1), []

@@ -23,7 +23,7 @@ from memmlp.search.board import figures
 from memmlp.search.director import Director
 from memmlp.search.spec import Search, Value, parse_search
 from memmlp.search.study import Study, journal, mend
-from memmlp.sweep.plan import Plan, Task
+from memmlp.sweep.plan import Plan, RunTask
 
 STEPS = 30
 SPACE = {
@@ -45,9 +45,11 @@ def opened(folder: Path, **changes: Any) -> Study:
     return Study.own(search(**changes), "mine", folder)
 
 
-def compose(values: Mapping[str, Value], seeds: int = 1) -> list[list[Task]]:
+def compose(values: Mapping[str, Value], seeds: int = 1) -> list[list[RunTask]]:
     configs = [{"optim": {"steps": STEPS}, "values": dict(values), "seed": seed} for seed in range(seeds)]
-    return [[Task(run_id("memmlp", config, data="d", upstream=None), "memmlp", config)] for config in configs]
+    return [
+        [RunTask(run_id("memmlp", config, data="d", upstream=None), "memmlp", config)] for config in configs
+    ]
 
 
 def director(study: Study, folder: Path, composed: Callable = compose) -> Director:
@@ -129,7 +131,7 @@ def test_a_director_killed_while_it_asks_loses_and_repeats_nothing(
         calls += 1
         return whole(*arguments)
 
-    def composed(values: Mapping[str, Value]) -> list[list[Task]]:
+    def composed(values: Mapping[str, Value]) -> list[list[RunTask]]:
         if moment == 2:
             raise KeyboardInterrupt
         return compose(values)
@@ -260,7 +262,7 @@ def test_a_failed_run_fails_its_trial_and_the_search_goes_on(tmp_path: Path):
 
 
 def test_values_that_make_no_sense_fail_their_trial_and_hopeless_searches_end(tmp_path: Path):
-    def refused(values: Mapping[str, Value]) -> list[list[Task]]:
+    def refused(values: Mapping[str, Value]) -> list[list[RunTask]]:
         raise InputError("hand=position needs positions")
 
     study = opened(tmp_path, n_trials=20)

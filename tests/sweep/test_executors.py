@@ -14,7 +14,7 @@ from memmlp.sweep import controller
 from memmlp.sweep.board import Board
 from memmlp.sweep.controller import PATIENCE, Fleet
 from memmlp.sweep.executors import Ray, Requeued, Submitit, sbatch
-from memmlp.sweep.plan import Plan, Task
+from memmlp.sweep.plan import Plan, RunTask
 
 
 def touch(path: str) -> None:
@@ -123,7 +123,7 @@ def test_the_first_failure_ends_the_workers_where_that_is_wanted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fail_fast: bool
 ):
     monkeypatch.setattr(controller, "LOOK", 0)
-    one, two = (Task(name * 16, "memmlp", {}) for name in "12")
+    one, two = (RunTask(name * 16, "memmlp", {}) for name in "12")
     plan = Plan("trial", tmp_path, (), (one, two), fail_fast=fail_fast)
     shelf = Shelf(Living)
 

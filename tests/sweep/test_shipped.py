@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 
 from memmlp.config.build import build_experiment, untrained
 from memmlp.config.compose import composed
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 from memmlp.runs.identity import flatten
 from memmlp.sweep.spec import Arm, Sweep, load_sweep
 from memmlp.training.loop import train_step
@@ -202,8 +202,8 @@ def test_an_arm_of_the_decomposition_trains(arm: Arm):
     experiment = build_experiment(composed([*DECOMPOSITION.overrides(arm), "profile=tiny"]))
     torch.manual_seed(0)
     architecture, frames = experiment.architecture, tiny.frames((60, 70))
-    frame = Frame.raw(architecture.coordinates, tiny.REST)
-    model = architecture.build(frame, architecture.vqvae() if architecture.uses_codes else None)
+    normalizer = Normalizer.raw(architecture.coordinates, tiny.REST)
+    model = architecture.build(normalizer, architecture.vqvae() if architecture.uses_codes else None)
     before = model.stem.weight.clone()
     loss, rollout = experiment.training.loss(model.branches), experiment.training.rollout
     optim = replace(experiment.training.optim, steps=1)

@@ -17,27 +17,27 @@ from memmlp.common.errors import InputError, TrainingDiverged
 from memmlp.config.work import check_wanted
 from memmlp.runs.run import Run
 from memmlp.sweep import worker
-from memmlp.sweep.plan import Entry, Plan, Task, unique
+from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 from memmlp.sweep.worker import Cancelled, Presence, attempt, work
 
-CODES = Task("c" * 16, "vqvae", {})
+CODES = RunTask("c" * 16, "vqvae", {})
 ONE, TWO, ALONE = (
-    Task(str(n) * 16, "memmlp", {}, above) for n, above in ((1, CODES.id), (2, CODES.id), (3, None))
+    RunTask(str(n) * 16, "memmlp", {}, above) for n, above in ((1, CODES.id), (2, CODES.id), (3, None))
 )
 
 
-def plan(outputs: Path, *tasks: Task, **changes) -> Plan:
+def plan(outputs: Path, *tasks: RunTask, **changes) -> Plan:
     entries = tuple(Entry(f"arm {task.id[0]}", 0, task.id) for task in tasks if task.kind == "memmlp")
     return Plan("trial", outputs, entries, unique(tasks), **changes)
 
 
-def saved(outputs: Path, *tasks: Task, **changes) -> Path:
+def saved(outputs: Path, *tasks: RunTask, **changes) -> Path:
     path = outputs / "plan.json"
     plan(outputs, *tasks, **changes).save(path)
     return path
 
 
-def finish(plan: Plan, task: Task) -> None:
+def finish(plan: Plan, task: RunTask) -> None:
     run = plan.run_of(task)
     run.begin(task.kind, {}, data="d", upstream=task.upstream)
     run.results_path.write_text("{}")
@@ -47,7 +47,7 @@ def finish(plan: Plan, task: Task) -> None:
 def test_upstream_runs_come_first_and_each_task_once(tmp_path: Path):
     seen: list[str] = []
 
-    def perform(plan: Plan, task: Task) -> None:
+    def perform(plan: Plan, task: RunTask) -> None:
         assert task.upstream is None or Run.of(plan.outputs, task.upstream).done
         seen.append(task.id)
         finish(plan, task)
@@ -60,8 +60,8 @@ def test_upstream_runs_come_first_and_each_task_once(tmp_path: Path):
 
 
 def test_an_upstream_run_stands_right_before_the_first_that_needs_it():
-    other = Task("d" * 16, "vqvae", {})
-    four = Task("4" * 16, "memmlp", {}, other.id)
+    other = RunTask("d" * 16, "vqvae", {})
+    four = RunTask("4" * 16, "memmlp", {}, other.id)
     assert unique([CODES, ONE, ALONE, other, four, CODES, TWO]) == (CODES, ONE, ALONE, other, four, TWO)
     assert unique([ALONE, TWO, ONE, CODES]) == (ALONE, CODES, TWO, ONE)
 
@@ -69,7 +69,7 @@ def test_an_upstream_run_stands_right_before_the_first_that_needs_it():
 def test_a_plan_that_ends_with_its_first_failure(tmp_path: Path):
     begun: list[str] = []
 
-    def perform(plan: Plan, task: Task) -> None:
+    def perform(plan: Plan, task: RunTask) -> None:
         begun.append(task.id)
         if task == ONE:
             raise InputError("a bad key")
@@ -95,7 +95,7 @@ def test_a_failure_is_left_with_its_run_and_the_others_go_on(tmp_path: Path):
         ALONE.id: ValueError("a\nbug"),
     }
 
-    def perform(plan: Plan, task: Task) -> None:
+    def perform(plan: Plan, task: RunTask) -> None:
         if task.id in errors:
             raise errors[task.id]
         finish(plan, task)
@@ -114,7 +114,7 @@ def test_a_failure_is_left_with_its_run_and_the_others_go_on(tmp_path: Path):
 
 
 def test_what_needs_a_failed_run_is_blocked(tmp_path: Path):
-    def perform(plan: Plan, task: Task) -> None:
+    def perform(plan: Plan, task: RunTask) -> None:
         raise InputError("no")
 
     path = saved(tmp_path, CODES, ONE, ALONE)
@@ -123,7 +123,7 @@ def test_what_needs_a_failed_run_is_blocked(tmp_path: Path):
 
 
 def test_a_cancelled_run_is_left_as_it_is(tmp_path: Path):
-    def perform(plan: Plan, task: Task) -> None:
+    def perform(plan: Plan, task: RunTask) -> None:
         plan.run_of(task).begin("memmlp", {}, data="d", upstream=None)
         saved(tmp_path, ALONE, cancelled=(ALONE.id,))
         raise Cancelled
@@ -139,7 +139,7 @@ def test_a_worker_stays_while_its_plan_is_open_and_wanted(tmp_path: Path, monkey
     path = saved(tmp_path, open=True)
     done: list[str] = []
 
-    def perform(plan: Plan, task: Task) -> None:
+    def perform(plan: Plan, task: RunTask) -> None:
         done.append(task.id)
         finish(plan, task)
 
@@ -202,7 +202,7 @@ def test_a_run_that_kills_its_workers_fails_at_last(tmp_path: Path):
 
 
 def test_many_workers_perform_each_task_exactly_once(tmp_path: Path):
-    tasks = [Task(f"{n:016x}", "memmlp", {}, CODES.id if n % 2 else None) for n in range(12)]
+    tasks = [RunTask(f"{n:016x}", "memmlp", {}, CODES.id if n % 2 else None) for n in range(12)]
     path = saved(tmp_path, CODES, *tasks)
     code = (
         "import os, sys, time; from pathlib import Path; from memmlp.sweep.worker import work\n"

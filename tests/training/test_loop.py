@@ -46,7 +46,7 @@ def reference_task(name: str, optim: Optim = OPTIM, seed: int = 0) -> MotionTask
 def vqvae_task(optim: Optim = OPTIM) -> VQVAETask:
     torch.manual_seed(0)
     model = VQVAE(codes=8, width=12, encoder_depth=1)
-    return VQVAETask(model, tiny.frame(), tiny.frames(), tiny.frames((30,), seed=9), optim, seed=0)
+    return VQVAETask(model, tiny.normalizer(), tiny.frames(), tiny.frames((30,), seed=9), optim, seed=0)
 
 
 def weights(run: Run) -> dict[str, torch.Tensor]:

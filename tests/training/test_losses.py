@@ -14,7 +14,7 @@ DRAW = torch.Generator().manual_seed(0)
 TRUTH = torch.stack([tiny.clip(9, seed) for seed in range(2)])
 MOTION = TRUTH[..., SPARSE_DIM:] + 0.1 * torch.randn(2, 9, 198, generator=DRAW)
 SPARSE = TRUTH[..., :SPARSE_DIM]
-FRAME = tiny.frame()
+FRAME = tiny.normalizer()
 
 
 def terms(hand=None, branches=BOTH):

@@ -37,7 +37,7 @@ def test_teacher_forcing_has_the_truth_and_zero_passes_have_nothing(shift):
     call = TeacherForcing().draw(model, SPLIT, sampler(), 0)
     clips, end = sampler().draw(0)
     truth = SPLIT.segments(clips, end - model.stride, model.memory.length)
-    torch.testing.assert_close(call.state["motion"], model.frame.encode(truth)[..., SPARSE_DIM:])
+    torch.testing.assert_close(call.state["motion"], model.normalizer.encode(truth)[..., SPARSE_DIM:])
     empty = OwnPredictions(0).draw(model, SPLIT, sampler(), 0)
     assert float(empty.state["motion"].abs().sum()) == 0
 

@@ -10,9 +10,9 @@ import click
 from memmlp.cli.options import outputs_option
 
 if TYPE_CHECKING:
-    from memmlp.live.soak import Motion
+    from memmlp.live.soak import TrackedMotion
     from memmlp.live.stream import Stream
-    from memmlp.motion.dataset import Frames
+    from memmlp.motion.dataset import MotionDataset
 
 
 @click.command("avatar")
@@ -136,7 +136,7 @@ def soak(run: str | None, onnx: Path | None, hours: float, outputs: Path) -> Non
     click.echo(f"memory {result.growth / 2**20:+.2f} MiB from the end of the first tenth to the end")
 
 
-def _test_clips(outputs: Path, run: str) -> Frames:
+def _test_clips(outputs: Path, run: str) -> MotionDataset:
     """The test clips of a run's data."""
     from memmlp.config.build import build_experiment, config_of
     from memmlp.runs.lookup import find_run
@@ -144,28 +144,28 @@ def _test_clips(outputs: Path, run: str) -> Frames:
     return build_experiment(config_of(find_run(outputs, run))).data.prepare().open("test")
 
 
-def _synthetic() -> Frames:
+def _synthetic() -> MotionDataset:
     """Test clips of synthetic motion."""
     import tempfile
 
-    from memmlp.motion.dataset import Frames
-    from memmlp.motion.prepare import Source, prepare
+    from memmlp.motion.dataset import MotionDataset
+    from memmlp.motion.prepare import ClipFolder, prepare
     from memmlp.motion.splits import SeededSplit
     from memmlp.motion.synthetic import synthesize
 
     with tempfile.TemporaryDirectory() as folder:
         synthesize(Path(folder) / "clips", minutes=10)
-        prepare(Source(Path(folder) / "clips", SeededSplit()), Path(folder) / "cache")
-        frames = Frames.open(Path(folder) / "cache", "test")
-        return Frames(frames.frames.clone(), frames.starts, frames.lengths, frames.names)
+        prepare(ClipFolder(Path(folder) / "clips", SeededSplit()), Path(folder) / "cache")
+        frames = MotionDataset.open(Path(folder) / "cache", "test")
+        return MotionDataset(frames.frames.clone(), frames.starts, frames.lengths, frames.names)
 
 
-def _motion(frames: Frames) -> Motion:
+def _motion(frames: MotionDataset) -> TrackedMotion:
     """All clips one after the other, as trackers and truth."""
     from memmlp.live.full import trackers_of
-    from memmlp.live.soak import Motion
+    from memmlp.live.soak import TrackedMotion
     from memmlp.motion.body import N_JOINTS, POSITION, SPARSE_DIM
 
     positions, rotations = trackers_of(frames.frames)
     joints = frames.frames[:, SPARSE_DIM:][:, POSITION].unflatten(-1, (N_JOINTS, 3))
-    return Motion(*(part.double().numpy() for part in (positions[1:], rotations[1:], joints)))
+    return TrackedMotion(*(part.double().numpy() for part in (positions[1:], rotations[1:], joints)))

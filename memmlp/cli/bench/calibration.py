@@ -63,14 +63,14 @@ SHARES = {
 }
 
 
-def choices(cell: Cell) -> dict[str, Shares]:
+def choices(cell: GridRow) -> dict[str, Shares]:
     """The shares that are simulated; "values" has them equal for a single value, not for the mean."""
     seeds, clips, size = cell
     values = Shares(seeds=1 / seeds, groups=size / clips, clips=1 / clips, noise=1 / seeds / clips)
     return SHARES | {"values": values}
 
 
-class Cell(NamedTuple):
+class GridRow(NamedTuple):
     """A row of the grid."""
 
     seeds: int
@@ -88,7 +88,7 @@ class Cell(NamedTuple):
         return self.seeds >= 3 and self.groups[-1] >= 4
 
 
-class Look(NamedTuple):
+class SimulatedLook(NamedTuple):
     """Of K comparisons' first seeds; every kind of effect gives the mean of all seeds a variance of 1."""
 
     noise: np.ndarray  # the seeds' means (K, S) of it
@@ -96,10 +96,10 @@ class Look(NamedTuple):
     covariances: np.ndarray  # of the means of groups: groups, clips, skewed, noise (K, 4, 4)
 
 
-class Sample:
+class Simulated:
     """Simulated differences of K comparisons, kept as what a mixture of their effects in any shares needs."""
 
-    def __init__(self, rng: np.random.Generator, cell: Cell, comparisons: int):
+    def __init__(self, rng: np.random.Generator, cell: GridRow, comparisons: int):
         """Draw the effects of all seeds, groups, clips and cells."""
         self.seeds = np.sqrt(cell.seeds) * rng.normal(size=(comparisons, cell.seeds))
         fixed, noise, self.weights = draw(rng, cell, comparisons)
@@ -107,13 +107,13 @@ class Sample:
         variances = noise.var(2, ddof=1)
         self.looks = {n: self._look(fixed, noise[:, :n], variances[:, :n]) for n in looks(cell.seeds)}
 
-    def _look(self, fixed: np.ndarray, noise: np.ndarray, variances: np.ndarray) -> Look:
+    def _look(self, fixed: np.ndarray, noise: np.ndarray, variances: np.ndarray) -> SimulatedLook:
         effects = np.concatenate([fixed, noise.mean(1, keepdims=True)], 1)
         effects -= effects.mean(2, keepdims=True)
         covariances = effects @ effects.transpose(0, 2, 1) / (len(self.weights) - 1)
         rest = variances.mean(1) - covariances[:, 3, 3]  # that of all cells less that of their groups
         e = rest * (self.weights @ self.weights) / (noise.shape[1] - 1)
-        return Look(noise @ self.weights, e, covariances)
+        return SimulatedLook(noise @ self.weights, e, covariances)
 
     def mixed(self, shares: Shares, seeds: int) -> tuple[Error, np.ndarray]:
         """Error and mean (K,) by the first so many seeds; the mean's variance is 1 with all of them."""
@@ -126,7 +126,7 @@ class Sample:
         return known, by_seed.mean(1) + self.means @ weights[1:4]
 
 
-def draw(rng: np.random.Generator, cell: Cell, comparisons: int) -> tuple[np.ndarray, ...]:
+def draw(rng: np.random.Generator, cell: GridRow, comparisons: int) -> tuple[np.ndarray, ...]:
     """Effects of groups, clips and skewed clips as means by group (K, 3, G), noise too (K, S, G); weights."""
     seeds, clips, _ = cell
     by_clip = np.sqrt(clips) * np.stack(
@@ -150,7 +150,7 @@ class Counts(NamedTuple):
     found: np.ndarray
 
 
-def count(sample: Sample, shares: Shares) -> Counts:
+def count(sample: Simulated, shares: Shares) -> Counts:
     """Count over one sample. Of true nulls alone, Holm calls one significant where its first step does."""
     in_looks = np.zeros(len(sample.seeds), bool)
     for seeds, level in spent(sample):
@@ -161,7 +161,7 @@ def count(sample: Sample, shares: Shares) -> Counts:
     return Counts(covered, _any(np.abs(mean) > half), _any(in_looks), half - mean)
 
 
-def spent(sample: Sample) -> Iterator[tuple[int, float]]:
+def spent(sample: Simulated) -> Iterator[tuple[int, float]]:
     """The seeds of each look, and its level."""
     return zip(sample.looks, spending(len(sample.looks)), strict=True)
 
@@ -196,7 +196,7 @@ class Campaign(NamedTuple):
     false: np.ndarray
 
 
-def campaign(sample: Sample, shares: Shares) -> Campaign:
+def campaign(sample: Simulated, shares: Shares) -> Campaign:
     """Whole sequential tables. Half of the arms differ; an arm stops when all its comparisons are decided."""
     tables = len(sample.seeds) // TABLE
     truth = np.repeat(np.arange(ARMS) % 2 * EFFECT, METRICS)
@@ -221,7 +221,7 @@ def _claimed(p: np.ndarray, before: np.ndarray, closed: np.ndarray, level: float
     return np.array([sequential(*row) <= level for row in rows])
 
 
-def simulate(cell: Cell, tables: int, seed: int) -> dict[str, Any]:
+def simulate(cell: GridRow, tables: int, seed: int) -> dict[str, Any]:
     """All that is reported of a cell."""
     rng = np.random.default_rng([seed, *cell])
     size = max(1, CHUNK // (TABLE * cell.seeds * cell.clips))
@@ -229,7 +229,7 @@ def simulate(cell: Cell, tables: int, seed: int) -> dict[str, Any]:
     counts: dict[str, list[Counts]] = {name: [] for name in every}
     campaigns: list[Campaign] = []
     for start in range(0, tables, size):
-        sample = Sample(rng, cell, TABLE * min(size, tables - start))
+        sample = Simulated(rng, cell, TABLE * min(size, tables - start))
         for name, shares in every.items():
             counts[name].append(count(sample, shares))
         if start < CAMPAIGNS:
@@ -369,7 +369,7 @@ def calibration(tables: int, quick: bool, seed: int, file: Path | None, as_markd
         raise SystemExit(1)
 
 
-def grid() -> list[Cell]:
+def grid() -> list[GridRow]:
     """All cells that have two groups at least."""
-    cells = itertools.starmap(Cell, itertools.product(SEEDS, CLIPS, SIZES))
+    cells = itertools.starmap(GridRow, itertools.product(SEEDS, CLIPS, SIZES))
     return [cell for cell in cells if cell.groups[-1] > 0]

@@ -14,7 +14,7 @@ def prepare(minutes: float) -> None:
     import time
     from pathlib import Path
 
-    from memmlp.motion.prepare import Source
+    from memmlp.motion.prepare import ClipFolder
     from memmlp.motion.prepare import prepare as run
     from memmlp.motion.splits import SeededSplit
     from memmlp.motion.synthetic import synthesize
@@ -23,7 +23,7 @@ def prepare(minutes: float) -> None:
         root = Path(folder) / "clips"
         synthesize(root, minutes=minutes)
         start = time.perf_counter()
-        manifest = run(Source(root, SeededSplit()), Path(folder) / "cache")
+        manifest = run(ClipFolder(root, SeededSplit()), Path(folder) / "cache")
         seconds = time.perf_counter() - start
     frames = sum(int(part["frames"]) for part in manifest.totals.values())
     peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))

@@ -13,8 +13,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from memmlp.common.errors import InputError
 from memmlp.config.schema.config import SCHEMAS, Config
-from memmlp.config.schema.network import Reference
-from memmlp.config.schema.training import AGRoLLoss, NoHand, ReferenceLoss, TeacherForcing
+from memmlp.config.schema.network import Baseline
+from memmlp.config.schema.training import AGRoLLoss, BaselineLoss, NoHand, TeacherForcing
 
 
 def check(cfg: DictConfig) -> None:
@@ -86,7 +86,7 @@ def _check_combinations(cfg: DictConfig) -> None:
     _check_names(cfg)
     if cfg.optim.final_lr > cfg.optim.lr:
         raise InputError(f"optim.final_lr={cfg.optim.final_lr}: allowed is at most optim.lr={cfg.optim.lr}")
-    if _is(cfg.model, Reference):
+    if _is(cfg.model, Baseline):
         _check_reference(cfg)
     else:
         _check_slots(cfg)
@@ -111,7 +111,7 @@ def _check_reference(cfg: DictConfig) -> None:
     for group in ("memory", "predictor", "hand"):
         if cfg[group] is not None:
             raise InputError(f"{group}: {name} has none; allowed is a command line without {group}=...")
-    if not _is(cfg.loss, ReferenceLoss):
+    if not _is(cfg.loss, BaselineLoss):
         raise InputError(f"loss: weights of Mem-MLP's terms, which {name} has not; allowed is its own loss")
     if not _is(cfg.rollout, TeacherForcing):
         raise InputError(f"rollout: {name} has no history of its own; allowed is rollout=teacher_forcing")
@@ -134,7 +134,7 @@ def _check_reference(cfg: DictConfig) -> None:
 def _check_foreign_loss(cfg: DictConfig, predictor: str) -> None:
     """AGRoL's loss is of rotations alone, and so may be that of a network that makes nothing else."""
     if not _is(cfg.loss, AGRoLLoss):
-        raise InputError("loss: that of a reference network; allowed is loss=uncertainty or loss=manual")
+        raise InputError("loss: that of a baseline; allowed is loss=uncertainty or loss=manual")
     if not predictor.startswith("RotationOnly") or not _is(cfg.hand, NoHand):
         raise InputError(
             "loss=agrol is of rotations alone: allowed is predictor=rotation_only with hand=off, "
@@ -148,7 +148,7 @@ def _check_slots(cfg: DictConfig) -> None:
     if layers and max(layers) > cfg.model.depth:
         raise InputError(f"memory.layers={layers}: allowed is up to model.depth={cfg.model.depth}")
     predictor = cfg.predictor._target_.rsplit(".", 1)[-1]
-    if _is(cfg.loss, ReferenceLoss):
+    if _is(cfg.loss, BaselineLoss):
         _check_foreign_loss(cfg, predictor)
     if cfg.hand._target_.endswith("HandPosition") and predictor.startswith("RotationOnly"):
         raise InputError(

@@ -40,7 +40,7 @@ class Model:
 
 
 @dataclass
-class Reference(Model):
+class Baseline(Model):
     """A network without slots: it leaves memory, predictor and hand empty."""
 
     name: str = key(Text())
@@ -49,13 +49,13 @@ class Reference(Model):
 
 
 @dataclass
-class AGRoLMLP(Reference):
+class AGRoLMLP(Baseline):
     name: str = called("agrol_mlp")
     _target_: str = target("memmlp.networks.baselines.agrol.AGRoLMLP")
 
 
 @dataclass
-class AGRoLDiffusion(Reference):
+class AGRoLDiffusion(Baseline):
     name: str = called("agrol_diffusion")
     _target_: str = target("memmlp.networks.baselines.agrol.AGRoLDiffusion")
     width: int = at_least(2)
@@ -65,7 +65,7 @@ class AGRoLDiffusion(Reference):
 
 
 @dataclass
-class AvatarPoser(Reference):
+class AvatarPoser(Baseline):
     name: str = called("avatar_poser")
     _target_: str = target("memmlp.networks.baselines.avatar_poser.AvatarPoser")
     heads: int = at_least(1)

@@ -63,19 +63,19 @@ class Manual(Loss):
 
 
 @dataclass
-class ReferenceLoss(Loss):
+class BaselineLoss(Loss):
     """A whole loss, where the others are weights of Mem-MLP's terms."""
 
 
 @dataclass
-class AGRoLLoss(ReferenceLoss):
+class AGRoLLoss(BaselineLoss):
     name: str = called("agrol")
     _target_: str = target("memmlp.training.losses.AGRoLLoss")
     error: str = one_of("norm", "square")
 
 
 @dataclass
-class AvatarPoserLoss(ReferenceLoss):
+class AvatarPoserLoss(BaselineLoss):
     name: str = called("avatar_poser")
     _target_: str = target("memmlp.training.losses.AvatarPoserLoss")
     orientation: float = at_least(0)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.live.player.sources import Source
+from memmlp.live.player.sources import PoseSource
 from memmlp.live.spaces import SPACES, Space
 from memmlp.live.stream import Stream
 from memmlp.motion.body import FPS, JOINTS
@@ -22,14 +22,14 @@ TOP = 20  # cm at the top of the page's colour scale
 Publish = Callable[[dict[str, Any]], None]
 
 
-def greeting(source: Source, network: str) -> dict[str, Any]:
+def greeting(source: PoseSource, network: str) -> dict[str, Any]:
     """What the page must know before the first frame."""
     limbs = [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS]
     words = {"network": network, "source": source.name, "fps": FPS, "joints": JOINTS}
     return words | {"limbs": limbs, "heat": HEAT, "top": TOP}
 
 
-def play(stream: Stream, source: Source, publish: Publish, stopped: threading.Event) -> None:
+def play(stream: Stream, source: PoseSource, publish: Publish, stopped: threading.Event) -> None:
     """Bring each sample through the stream and publish the frames, until it is stopped.
 
     A message has the frame's number and time (s), the step's time (ms), what was dropped and malformed so

@@ -33,7 +33,7 @@ LARGEST = 65_536  # bytes of a datagram
 FORGOTTEN = 10_000  # numbers left out that are no lost packets but another sender
 
 
-class Sample(NamedTuple):
+class PoseSample(NamedTuple):
     """What a source gives: the trackers at a time (seconds), and how many samples were lost before it."""
 
     time: float
@@ -41,7 +41,7 @@ class Sample(NamedTuple):
     dropped: int = 0
 
 
-class Source(Protocol):
+class PoseSource(Protocol):
     """Tracker poses, one sample after the other.
 
     Attributes:
@@ -53,7 +53,7 @@ class Source(Protocol):
     space: str
     malformed: int
 
-    def read(self) -> Sample | None:
+    def read(self) -> PoseSample | None:
         """The next sample; None where none came within `WAIT` seconds."""
 
     def truth(self, time: float) -> np.ndarray | None:
@@ -63,7 +63,7 @@ class Source(Protocol):
         """Let go of what it holds."""
 
 
-class Clip:
+class TrackedClip:
     """A clip of tracker poses and true joints, at any time.
 
     Args:
@@ -120,7 +120,7 @@ class ClipSource:
 
     def __init__(
         self,
-        clip: Clip,
+        clip: TrackedClip,
         hz: float,
         rounds: float = math.inf,
         clock: Callable[[], float] = time.monotonic,
@@ -137,7 +137,7 @@ class ClipSource:
         """Whether all rounds are played."""
         return self.next >= self.rounds * self.count
 
-    def read(self) -> Sample | None:
+    def read(self) -> PoseSample | None:
         """The sample that is due; waits for it."""
         now = self.clock()
         self.began = now if self.began is None else self.began
@@ -147,7 +147,7 @@ class ClipSource:
         self.sleep(max(self.began + index / self.hz - now, 0))
         self.next = index + 1
         turn, step = divmod(index, self.count)
-        return Sample(turn * self.round + step / self.hz, self.clip.trackers(step / self.hz), dropped)
+        return PoseSample(turn * self.round + step / self.hz, self.clip.trackers(step / self.hz), dropped)
 
     @property
     def round(self) -> float:
@@ -181,7 +181,7 @@ class PacketSource:
         self.name = f"{name} packets on port {self.port}"
         self.last: int | None = None
 
-    def read(self) -> Sample | None:
+    def read(self) -> PoseSample | None:
         """The next packet; what is none is counted and passed over."""
         try:
             datagram = self.socket.recv(LARGEST)
@@ -193,7 +193,7 @@ class PacketSource:
             self.malformed += 1
             return None
         arrival = time.monotonic() if packet.time is None else packet.time
-        return Sample(arrival, packet.trackers, self._dropped(packet))
+        return PoseSample(arrival, packet.trackers, self._dropped(packet))
 
     def _dropped(self, packet: Packet) -> int:
         """How many samples are missing between the last packet's number and this one's."""

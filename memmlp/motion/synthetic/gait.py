@@ -9,7 +9,7 @@ import numpy as np
 from memmlp.motion.synthetic.curves import Array, ease, pulse, smooth, wander
 from memmlp.motion.synthetic.puppet import Puppet
 from memmlp.motion.synthetic.stance import Stance, Style, direction, move_hand, occasions, stand
-from memmlp.motion.synthetic.steps import Feet, Step, tread
+from memmlp.motion.synthetic.steps import Feet, FootStep, tread
 
 GRAVITY = 9.81
 
@@ -136,7 +136,7 @@ def _feet(t: Array, gait: Gait, style: Style, course: Course) -> Feet:
     return tread(t, start.places, start.yaws, steps)
 
 
-def _step(t: Array, gait: Gait, style: Style, course: Course, side: int, strike: float) -> Step:
+def _step(t: Array, gait: Gait, style: Style, course: Course, side: int, strike: float) -> FootStep:
     """The step that ends at phase `strike`; small and flat where the pace is low."""
     off, on, over = np.interp(
         [strike - 1 + gait.duty, strike, strike + gait.ahead * gait.duty], course.phase, t
@@ -147,7 +147,7 @@ def _step(t: Array, gait: Gait, style: Style, course: Course, side: int, strike:
     width = style.width * (1 + (gait.width - 1) * course.go[frame])
     stance = Stance(course.path[frame], float(course.heading[frame]), width, 0.7 * style.splay)
     cycle = (on - off) / (1 - gait.duty)
-    return Step(
+    return FootStep(
         side, off, on, stance.places[side], stance.yaws[side],
         lift=gait.lift * effort, heel=gait.heel * effort, toe=gait.toe * effort,
         push=gait.push * cycle, roll=0.2 * gait.duty * cycle,

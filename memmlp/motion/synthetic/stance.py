@@ -10,7 +10,7 @@ import numpy as np
 
 from memmlp.motion.synthetic.curves import Array, smooth, wander
 from memmlp.motion.synthetic.puppet import Puppet
-from memmlp.motion.synthetic.steps import Feet, Step, tread
+from memmlp.motion.synthetic.steps import Feet, FootStep, tread
 
 STANDING = 0.992  # metres, the root's height with nearly straight legs
 FOLLOW = 0.3  # seconds in which the pelvis follows the feet
@@ -92,7 +92,7 @@ class Footwork:
     """Changes of stance one after the other, collected as steps."""
 
     start: Stance
-    steps: list[Step] = field(default_factory=list)
+    steps: list[FootStep] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.stance = self.start
@@ -115,7 +115,7 @@ class Footwork:
             self.stance, center=self.stance.center + shift, heading=self.stance.heading + turn
         )
         for foot, start in ((first, off), (1 - first, off + delay)):
-            self.steps.append(Step(foot, start, start + duration, s.places[foot], s.yaws[foot], **how))
+            self.steps.append(FootStep(foot, start, start + duration, s.places[foot], s.yaws[foot], **how))
 
     def feet(self, t: Array) -> Feet:
         """The feet at the times (N,)."""

@@ -11,7 +11,7 @@ from memmlp.motion.synthetic.curves import Array, arc, glide, pulse
 
 
 @dataclass(frozen=True)
-class Step:
+class FootStep:
     """One step of one foot: seconds, metres, radians.
 
     Attributes:
@@ -55,7 +55,7 @@ class Feet:
     planted: Array
 
 
-def tread(t: Array, places: Array, yaws: Array, steps: Iterable[Step]) -> Feet:
+def tread(t: Array, places: Array, yaws: Array, steps: Iterable[FootStep]) -> Feet:
     """Feet that start at `places` (2, 2) with directions `yaws` (2,) and make the steps, in order of time."""
     n = len(t)
     ground = np.zeros((n, 2, 3))

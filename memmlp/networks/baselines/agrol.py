@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.motion.body import ROTATION, SPARSE_DIM
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.diffusion import Diffusion
 from memmlp.networks.layers import MLPBlock
 from memmlp.networks.memory import State
@@ -31,21 +31,21 @@ class AGRoL(WindowModel):
         """See WindowModel; all T frames by default. The work is that of the whole window, as published."""
         inputs, kept = self.taken_in(sparse, state)
         window = inputs[:, -self.frames :]
-        rotation = self.rotations(self.frame.encode_sparse(window, self.frame.place(window)))
+        rotation = self.rotations(self.normalizer.encode_sparse(window, self.normalizer.origin(window)))
         wanted = self.frames if newest is None else newest
-        return self.frame.posed(rotation[:, -wanted:], window[:, -wanted:]), kept
+        return self.normalizer.posed(rotation[:, -wanted:], window[:, -wanted:]), kept
 
 
 class AGRoLMLP(AGRoL):
     """Stem, MLP blocks, head: 3,735,668 parameters at the paper's sizes, 3.74 M in Table 16.
 
     Args:
-        frame: world <-> network space.
+        normalizer: world <-> network space.
         frames: T. width: d. depth: blocks.
     """
 
-    def __init__(self, frame: Frame, *, frames: int, width: int, depth: int):
-        super().__init__(frame, frames)
+    def __init__(self, normalizer: Normalizer, *, frames: int, width: int, depth: int):
+        super().__init__(normalizer, frames)
         self.stem = nn.Linear(SPARSE_DIM, width)
         self.blocks = nn.ModuleList(MLPBlock(width, frames) for _ in range(depth))
         self.head = nn.Linear(width, ROTATION.stop)
@@ -102,7 +102,7 @@ class AGRoLDiffusion(AGRoL):
     torch as in ONNX, and consecutive windows of a stream do not differ by their noise.
 
     Args:
-        frame: world <-> network space.
+        normalizer: world <-> network space.
         frames: T. width: d. depth: blocks.
         diffusion_steps: of the training's noise schedule. sampling_steps: denoiser calls at inference.
         noise_seed: of the noise that sampling starts from.
@@ -112,7 +112,7 @@ class AGRoLDiffusion(AGRoL):
 
     def __init__(
         self,
-        frame: Frame,
+        normalizer: Normalizer,
         *,
         frames: int,
         width: int,
@@ -121,7 +121,7 @@ class AGRoLDiffusion(AGRoL):
         sampling_steps: int,
         noise_seed: int,
     ):
-        super().__init__(frame, frames)
+        super().__init__(normalizer, frames)
         self.diffusion = Diffusion(diffusion_steps, sampling_steps)
         self.time = TimeEmbedding(width)
         self.stem = nn.Linear(ROTATION.stop + SPARSE_DIM, width)
@@ -146,8 +146,8 @@ class AGRoLDiffusion(AGRoL):
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
         """One denoiser call on the truth (B, T, 252) with noise of a time drawn for each window."""
         _, kept = self.taken_in(sparse, state)
-        window, frames = truth[..., :SPARSE_DIM], self.frame.encode(truth)
+        window, frames = truth[..., :SPARSE_DIM], self.normalizer.encode(truth)
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
         time = torch.randint(self.diffusion.steps, (len(truth),), device=truth.device)
         noisy = self.diffusion.noised(clean, time, torch.randn_like(clean))
-        return self.frame.posed(self.denoise(noisy, time, encoded), window), kept
+        return self.normalizer.posed(self.denoise(noisy, time, encoded), window), kept

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.motion.body import ROTATION, SPARSE_DIM
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import State
 from memmlp.networks.window_model import WindowModel
 
@@ -79,14 +79,14 @@ class AvatarPoser(WindowModel):
     shifted tail window, before which the buffer does not hold the frames of its overlap.
 
     Args:
-        frame: world <-> network space.
+        normalizer: world <-> network space.
         frames: T. width: d. depth: layers. heads: of attention; they divide d.
         feedforward: hidden width of the feed-forward layers. dropout: in the encoder, while training.
     """
 
     def __init__(
         self,
-        frame: Frame,
+        normalizer: Normalizer,
         *,
         frames: int,
         width: int,
@@ -95,7 +95,7 @@ class AvatarPoser(WindowModel):
         feedforward: int,
         dropout: float,
     ):
-        super().__init__(frame, frames)
+        super().__init__(normalizer, frames)
         self.embedding = nn.Linear(SPARSE_DIM, width)
         self.layers = nn.ModuleList(EncoderLayer(width, heads, feedforward, dropout) for _ in range(depth))
         self.orientation = head(width, ROOT)
@@ -118,6 +118,6 @@ class AvatarPoser(WindowModel):
         wanted = sparse.shape[1] if newest is None else newest
         ends = torch.arange(inputs.shape[1] - wanted, inputs.shape[1], device=inputs.device)
         window = ends[:, None] + torch.arange(1 - self.frames, 1, device=inputs.device)
-        encoded = self.frame.encode_sparse(inputs, self.frame.place(inputs))[:, window]
+        encoded = self.normalizer.encode_sparse(inputs, self.normalizer.origin(inputs))[:, window]
         rotation = self.rotations(encoded.flatten(0, 1)).unflatten(0, (len(inputs), wanted))
-        return self.frame.posed(rotation, inputs[:, -wanted:]), kept
+        return self.normalizer.posed(rotation, inputs[:, -wanted:]), kept

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.motion.body import MOTION_DIM
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory.features import Blend, CodeFeature, NoCodesFeature, Past, Recurred, State
 from memmlp.networks.memory.slot import FeatureMemory
 from memmlp.networks.vqvae import VQVAE, straight_through
@@ -141,7 +141,7 @@ class JointCodeMemory(VQMemory):
         latent = self.codes.encoder(torch.cat([sparse, motion], -1))
         return straight_through(latent, self.codes.codebook(latent)[0])
 
-    def terms(self, frames: Tensor, frame: Frame) -> dict[str, Tensor]:
+    def auxiliary_losses(self, frames: Tensor, normalizer: Normalizer) -> dict[str, Tensor]:
         """Eq. 1 of the VQ-VAE's reconstruction and its codebook's loss; an EMA codebook learns here."""
-        terms, _ = self.codes.loss_terms(frame.encode(frames).flatten(0, 1), frame)
-        return {f"vqvae_{name}": term for name, term in terms.items()}
+        auxiliary_losses, _ = self.codes.loss_terms(normalizer.encode(frames).flatten(0, 1), normalizer)
+        return {f"vqvae_{name}": term for name, term in auxiliary_losses.items()}

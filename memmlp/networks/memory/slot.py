@@ -8,7 +8,7 @@ from typing import ClassVar
 from torch import Tensor, nn
 
 from memmlp.common.errors import InputError
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import MLPBlock, PlainFusion, ResidualFusion
 from memmlp.networks.memory.features import MemoryBlock, Past, Recurred, State
 from memmlp.networks.vqvae import VQVAE
@@ -62,7 +62,7 @@ class Memory(nn.Module):
         """The state after an output (B, at least `needed`, 198) whose last `new` frames are new."""
         return {}
 
-    def terms(self, frames: Tensor, frame: Frame) -> dict[str, Tensor]:
+    def auxiliary_losses(self, frames: Tensor, normalizer: Normalizer) -> dict[str, Tensor]:
         """Losses of its own at true world frames (B, T, 252), added to the network's."""
         return {}
 

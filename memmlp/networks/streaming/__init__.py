@@ -12,12 +12,12 @@ from memmlp.networks.baselines.avatar_poser import AvatarPoser
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.streaming.baselines import AGRoLDiffusionStream, AGRoLMLPStream, AvatarPoserStream
 from memmlp.networks.streaming.mem_mlp import MemMLPStream
-from memmlp.networks.streaming.ring import Stream
+from memmlp.networks.streaming.ring import StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
-__all__ = ["Stream", "streaming"]
+__all__ = ["StreamingGraph", "streaming"]
 
-STREAMS: dict[type[WindowModel], type[Stream]] = {
+STREAMS: dict[type[WindowModel], type[StreamingGraph]] = {
     MemMLP: MemMLPStream,
     AvatarPoser: AvatarPoserStream,
     AGRoLMLP: AGRoLMLPStream,
@@ -25,7 +25,7 @@ STREAMS: dict[type[WindowModel], type[Stream]] = {
 }
 
 
-def streaming(model: WindowModel) -> Stream:
+def streaming(model: WindowModel) -> StreamingGraph:
     """The live stream of a trained network, which itself stays as it is.
 
     Raises InputError where there is none: where estimates of past frames change at each step

@@ -1,4 +1,4 @@
-"""The reference networks as live streams.
+"""The baselines as live streams.
 
 AvatarPoser reads one frame of its last layer, AGRoL's networks are kept for one frame of theirs: of that
 layer no other is made. The first layer's products of each frame alone are carried.
@@ -17,11 +17,11 @@ from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP, TimedBlock
 from memmlp.networks.baselines.avatar_poser import AvatarPoser, EncoderLayer
 from memmlp.networks.layers import MLPBlock
 from memmlp.networks.memory import State
-from memmlp.networks.streaming.ring import Ring, Stream
+from memmlp.networks.streaming.ring import Ring, StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
 
-class AvatarPoserStream(Stream):
+class AvatarPoserStream(StreamingGraph):
     """AvatarPoser; its encoder has no order of frames, so that a ring's will do."""
 
     ends = ("model.embedding", "model.orientation", "model.rotation")
@@ -39,7 +39,7 @@ class AvatarPoserStream(Stream):
 
     def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
         """World inputs (1, 54) and the state -> motion (1, 198) in the world, and what is carried on."""
-        embedded = self.model.embedding(self.frame.encode_sparse(sparse, self.frame.place(sparse)))
+        embedded = self.model.embedding(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
         *earlier, last = self.layers
         attention = self.layers[0].attention
         entering = torch.cat(
@@ -53,10 +53,10 @@ class AvatarPoserStream(Stream):
             query, key, value = attention.query(h), attention.key(h), attention.value(h)
         attended = last.attention.attend(ring.newest(query)[None], key[None], value[None])[0]
         newest = last.finish(ring.newest(h), attended)
-        return self.frame.posed(self.model.read(newest), sparse), {"first": first}
+        return self.normalizer.posed(self.model.read(newest), sparse), {"first": first}
 
 
-class AGRoLStream(Stream):
+class AGRoLStream(StreamingGraph):
     """The windows of AGRoL's networks: the stem's outputs in the order of time.
 
     A ring would spare one copy of them, but turning the T x T matrices of 12 blocks to it costs more.
@@ -72,9 +72,9 @@ class AGRoLStream(Stream):
 
     def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
         """World inputs (1, 54) and the state -> motion (1, 198) in the world, and what is carried on."""
-        entering = self.entering(self.frame.encode_sparse(sparse, self.frame.place(sparse)))
+        entering = self.entering(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
         window = torch.cat([torch.where(state["count"] > 0, state["stem"], entering), entering])
-        return self.frame.posed(self.rotation(window), sparse), {"stem": window[1:]}
+        return self.normalizer.posed(self.rotation(window), sparse), {"stem": window[1:]}
 
     def entering(self, encoded: Tensor) -> Tensor:
         """The stem's share (1, d) of a frame's inputs (1, 54)."""

@@ -16,7 +16,7 @@ from memmlp.networks.predictor import Branch
 Take = Callable[[Tensor], Tensor]
 
 
-class Step(NamedTuple):
+class StreamStep(NamedTuple):
     """What blocks need of a step beside the hidden state.
 
     newest: a window's newest frame. mixes: each block's mixing over time, weights (T, T) and offsets (T, 1),
@@ -62,13 +62,13 @@ class Block(nn.Module):
         self.index = index
         self.time_norm, self.norm, self.linear = block.time_norm, block.norm, block.linear
 
-    def forward(self, h: Tensor, step: Step, take: Take = lambda window: window) -> Tensor:
+    def forward(self, h: Tensor, step: StreamStep, take: Take = lambda window: window) -> Tensor:
         """(T, d) -> the same, or what `take` leaves of it without the work for the rest."""
         weight, bias = step.mixes[self.index]
         h = take(h) + F.silu(torch.addmm(take(bias), take(weight), self.time_norm(h)))
         return self.channels(h, step, take)
 
-    def channels(self, h: Tensor, step: Step, take: Take) -> Tensor:
+    def channels(self, h: Tensor, step: StreamStep, take: Take) -> Tensor:
         """The block's second half, frame by frame."""
         return h + F.silu(self.linear(self.norm(h)))
 
@@ -103,7 +103,7 @@ class ResidualBlock(SharedBlock):
         super().__init__(block, index, share)
         self.linear = self.own(block.linear)
 
-    def channels(self, h: Tensor, step: Step, take: Take) -> Tensor:
+    def channels(self, h: Tensor, step: StreamStep, take: Take) -> Tensor:
         """The block's second half, frame by frame."""
         return h + F.silu(self.linear(self.norm(h)) + take(step.shares[self.share]))
 
@@ -115,7 +115,7 @@ class PlainBlock(SharedBlock):
         super().__init__(block, index, share)
         self.merge = self.own(block.merge)
 
-    def channels(self, h: Tensor, step: Step, take: Take) -> Tensor:
+    def channels(self, h: Tensor, step: StreamStep, take: Take) -> Tensor:
         """The block's second half and the merging, frame by frame."""
         return self.merge(super().channels(h, step, take)) + take(step.shares[self.share])
 
@@ -137,7 +137,7 @@ class StreamedBranch(nn.Module):
         super().__init__()
         self.blocks, self.linear = nn.ModuleList(blocks), linear
 
-    def forward(self, h: Tensor, step: Step, newest: int) -> Tensor:
+    def forward(self, h: Tensor, step: StreamStep, newest: int) -> Tensor:
         """(T, d) -> (1, size)."""
         *earlier, last = self.blocks
         for block in earlier:

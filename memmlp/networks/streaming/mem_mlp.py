@@ -15,13 +15,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.motion.body import MOTION_DIM, SPARSE_DIM
-from memmlp.motion.normalizer import Frame
+from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import State
 from memmlp.networks.predictor import Branch
-from memmlp.networks.streaming.blocks import Converter, Mixing, Step
+from memmlp.networks.streaming.blocks import Converter, Mixing, StreamStep
 from memmlp.networks.streaming.recall import recall
-from memmlp.networks.streaming.ring import Ring, Stream
+from memmlp.networks.streaming.ring import Ring, StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
 Way = Callable[[Tensor, Tensor], Tensor]
@@ -31,18 +31,18 @@ class Coordinates(nn.Module):
     """World <-> network space as matrices: both ways are linear for a given turn, and in cosine and sine.
 
     Args:
-        frame: whose `encode_sparse` and `decode_motion` these are; the matrices are found by trying.
+        normalizer: whose `encode_sparse` and `decode_motion` these are; the matrices are found by trying.
     """
 
-    def __init__(self, frame: Frame):
+    def __init__(self, normalizer: Normalizer):
         super().__init__()
-        self.frame = frame
-        exact = copy.deepcopy(frame).double()
-        turns = exact.place(torch.zeros(1, SPARSE_DIM)).shape[-1] - 3
+        self.normalizer = normalizer
+        exact = copy.deepcopy(normalizer).double()
+        turns = exact.origin(torch.zeros(1, SPARSE_DIM)).shape[-1] - 3
         inputs, motions = torch.eye(SPARSE_DIM).double(), torch.eye(MOTION_DIM + 3).double()
 
         def encode(x: Tensor, turn: Tensor) -> Tensor:
-            return exact.encode_sparse(x, torch.cat([exact.place(x)[..., :3], turn.expand(len(x), -1)], -1))
+            return exact.encode_sparse(x, torch.cat([exact.origin(x)[..., :3], turn.expand(len(x), -1)], -1))
 
         def decode(x: Tensor, turn: Tensor) -> Tensor:
             return exact.decode_motion(
@@ -50,19 +50,19 @@ class Coordinates(nn.Module):
             )
 
         self.encoder, self.encoder_bias = (
-            nn.Parameter(p.to(frame.mean)) for p in _matrices(encode, inputs, turns)
+            nn.Parameter(p.to(normalizer.mean)) for p in _matrices(encode, inputs, turns)
         )
         self.decoder, self.decoder_bias = (
-            nn.Parameter(p.to(frame.mean)) for p in _matrices(decode, motions, turns)
+            nn.Parameter(p.to(normalizer.mean)) for p in _matrices(decode, motions, turns)
         )
 
-    def encode(self, sparse: Tensor, place: Tensor) -> Tensor:
+    def encode(self, sparse: Tensor, origin: Tensor) -> Tensor:
         """World inputs (1, 54) of a frame whose place is (1, 3 or 5) -> network space (1, 54)."""
-        return _apply(self.encoder, self.encoder_bias, sparse, place)
+        return _apply(self.encoder, self.encoder_bias, sparse, origin)
 
-    def decode(self, motion: Tensor, place: Tensor) -> Tensor:
+    def decode(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Network space (1, 198) -> world motion (1, 198)."""
-        return _apply(self.decoder, self.decoder_bias, torch.cat([motion, place[:, :3]], -1), place)
+        return _apply(self.decoder, self.decoder_bias, torch.cat([motion, origin[:, :3]], -1), origin)
 
 
 def _matrices(way: Way, basis: Tensor, turns: int) -> tuple[Tensor, Tensor]:
@@ -76,15 +76,15 @@ def _matrices(way: Way, basis: Tensor, turns: int) -> tuple[Tensor, Tensor]:
     return matrices.transpose(1, 2), offsets
 
 
-def _apply(matrices: Tensor, offsets: Tensor, x: Tensor, place: Tensor) -> Tensor:
+def _apply(matrices: Tensor, offsets: Tensor, x: Tensor, origin: Tensor) -> Tensor:
     """The sum of the matrices' products with x (1, in), each times its turn's number."""
     parts, out = len(matrices), matrices.shape[1]
     products = F.linear(x, matrices.reshape(parts * out, -1), offsets.reshape(-1)).view(parts, out)
-    turn = torch.cat([torch.ones_like(place[:, :1]), place[:, 3:]], -1)
+    turn = torch.cat([torch.ones_like(origin[:, :1]), origin[:, 3:]], -1)
     return turn @ products
 
 
-class MemMLPStream(Stream):
+class MemMLPStream(StreamingGraph):
     """A Mem-MLP as a live stream."""
 
     ends = ("coordinates", "stem", "predictor.rotation.linear", "predictor.position.linear")
@@ -92,7 +92,7 @@ class MemMLPStream(Stream):
     def build(self, model: WindowModel) -> None:
         """Make the stream's parts of a copy of the network."""
         assert isinstance(model, MemMLP)
-        self.coordinates = Coordinates(model.frame)
+        self.coordinates = Coordinates(model.normalizer)
         self.stem = model.stem
         converter = Converter()
         self.blocks = nn.ModuleList(converter.block(block) for block in model.blocks)
@@ -116,8 +116,8 @@ class MemMLPStream(Stream):
     def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
         """World inputs (1, 54) and the state -> motion (1, 198) in the world, and what is carried on."""
         memory = self.recall.memory
-        place = self.frame.place(sparse)
-        encoded = self.coordinates.encode(sparse, place)
+        origin = self.normalizer.origin(sparse)
+        encoded = self.coordinates.encode(sparse, origin)
         queue = torch.cat([torch.where(state["count"] > 0, state["sparse"], encoded), encoded[None]], 1)
         past = memory.recall(queue, state, 1)
         stem = self.stem(encoded)
@@ -125,9 +125,9 @@ class MemMLPStream(Stream):
         for name, share, before in zip(self.shares, *self.recall(past), strict=True):
             kept[name] = ring.put(state[name], share, before)
         h, *shares = kept.values()
-        now = Step(ring.newest, self.mixing(ring.slot), shares)
+        now = StreamStep(ring.newest, self.mixing(ring.slot), shares)
         for block in self.blocks:
             h = block(h, now)
-        motion = self.predictor(h, now, sparse, self.frame, 1)
+        motion = self.predictor(h, now, sparse, self.normalizer, 1)
         kept |= memory.remember(motion[None], past, state, 1) | {"sparse": queue[:, 1:]}
-        return self.coordinates.decode(motion, place), kept
+        return self.coordinates.decode(motion, origin), kept

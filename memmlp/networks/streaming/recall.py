@@ -43,7 +43,7 @@ class Projections(nn.Module):
         return F.silu(F.layer_norm(y, self.shape[1:]) * self.scale + self.offset)
 
 
-class Table(nn.Module):
+class CodeTable(nn.Module):
     """Those projections of code-vectors, which are few: computed before, looked up by index."""
 
     def __init__(self, parts: Sequence[Projection], vectors: Tensor):
@@ -137,7 +137,7 @@ class Coded(OwnPast):
 
     def projections(self, name: str, parts: Sequence[Projection]) -> nn.Module:
         """All blocks' projections of the input of that name."""
-        return Table(parts, self.vectors) if name == "codes" else super().projections(name, parts)
+        return CodeTable(parts, self.vectors) if name == "codes" else super().projections(name, parts)
 
 
 class FromRecurrence(Recall):

@@ -44,11 +44,11 @@ def counted(count: Tensor, frames: int) -> Tensor:
     return count.remainder(frames) + 1
 
 
-def _written(window: Tensor, index: Tensor, frame: Tensor) -> Tensor:
-    return window.index_put((index,), frame.expand(index.shape[0], -1))
+def _written(window: Tensor, index: Tensor, normalizer: Tensor) -> Tensor:
+    return window.index_put((index,), normalizer.expand(index.shape[0], -1))
 
 
-class Stream(nn.Module):
+class StreamingGraph(nn.Module):
     """A network as a live stream, for one stream and without gradients.
 
     Args:
@@ -63,7 +63,7 @@ class Stream(nn.Module):
     def __init__(self, model: WindowModel):
         super().__init__()
         model = copy.deepcopy(model).eval().requires_grad_(False)
-        self.frames, self.frame, self.branches = model.frames, model.frame, model.branches
+        self.frames, self.normalizer, self.branches = model.frames, model.normalizer, model.branches
         self.build(model)
         self.requires_grad_(False)
 
@@ -82,7 +82,7 @@ class Stream(nn.Module):
         """
         assert batch == 1
         state = {"count": torch.zeros(1), **self.windows()}
-        return {name: tensor.to(self.frame.mean) for name, tensor in state.items() if tensor.numel()}
+        return {name: tensor.to(self.normalizer.mean) for name, tensor in state.items() if tensor.numel()}
 
     def advance(self, sparse: Tensor, state: State, newest: int = 1) -> tuple[Tensor, State]:
         """Take one frame in.

@@ -10,7 +10,7 @@ import tiny
 import wearer
 
 from memmlp.deploy.export import export
-from memmlp.live.player.sources import Clip
+from memmlp.live.player.sources import TrackedClip
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.streaming import streaming
 
@@ -26,6 +26,6 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def clip() -> Clip:
+def clip() -> TrackedClip:
     """Two seconds."""
-    return Clip("person", PERSON.frames.numpy())
+    return TrackedClip("person", PERSON.frames.numpy())

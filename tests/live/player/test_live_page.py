@@ -12,7 +12,7 @@ from chromium import Browser
 
 from memmlp.live.player.play import greeting, play
 from memmlp.live.player.server import Hub, Server
-from memmlp.live.player.sources import Clip, ClipSource
+from memmlp.live.player.sources import ClipSource, TrackedClip
 from memmlp.live.stream import Stream
 
 SHOWN = "Number(document.documentElement.dataset.shown)"
@@ -20,7 +20,7 @@ NEWEST = "Number(document.querySelector('#scrub').max)"
 
 
 @pytest.fixture
-def url(network: Path, clip: Clip) -> Iterator[str]:
+def url(network: Path, clip: TrackedClip) -> Iterator[str]:
     """A clip that plays."""
     stopped, source = threading.Event(), ClipSource(clip, 60)
     with Server(Hub(greeting(source, "tiny")), 0) as server:
@@ -74,7 +74,7 @@ def test_it_plays_pauses_and_goes_back(browser: Browser, url: str):
     assert browser.errors == []
 
 
-def test_it_says_what_it_waits_for_and_when_the_command_has_ended(browser: Browser, clip: Clip):
+def test_it_says_what_it_waits_for_and_when_the_command_has_ended(browser: Browser, clip: TrackedClip):
     with Server(Hub(greeting(ClipSource(clip, 60), "tiny")), 0) as server:
         browser.open(server.url)
         browser.wait("document.querySelector('#status').textContent == 'waiting for trackers'")

@@ -15,21 +15,21 @@ from memmlp.common.errors import InputError
 from memmlp.live.player import server as module
 from memmlp.live.player.play import greeting, play
 from memmlp.live.player.server import FILES, Hub, Server
-from memmlp.live.player.sources import Clip, ClipSource, Sample
+from memmlp.live.player.sources import ClipSource, PoseSample, TrackedClip
 from memmlp.live.stream import Stream
 
 
 class Instant(ClipSource):
     """A clip whose time passes at once; at its end it stops the loop."""
 
-    def __init__(self, clip: Clip, hz: float, stopped: threading.Event):
+    def __init__(self, clip: TrackedClip, hz: float, stopped: threading.Event):
         self.now, self.stopped = 0.0, stopped
         super().__init__(clip, hz, 1, lambda: self.now, self.pass_time)
 
     def pass_time(self, seconds: float) -> None:
         self.now += seconds
 
-    def read(self) -> Sample | None:
+    def read(self) -> PoseSample | None:
         sample = super().read()
         if self.over:
             self.stopped.set()
@@ -39,7 +39,7 @@ class Instant(ClipSource):
 class Losing(Instant):
     """Loses the left hand in the middle, and sends what is no rotation once."""
 
-    def read(self) -> Sample | None:
+    def read(self) -> PoseSample | None:
         sample = super().read()
         head, left, right = sample.trackers
         if 40 <= self.next < 50:
@@ -49,14 +49,14 @@ class Losing(Instant):
         return sample._replace(trackers=(head, left, right))
 
 
-def played(network: Path, clip: Clip, hz: float, kind: type[Instant] = Instant) -> list[dict]:
+def played(network: Path, clip: TrackedClip, hz: float, kind: type[Instant] = Instant) -> list[dict]:
     """The messages of a clip."""
     stopped, messages = threading.Event(), []
     play(Stream(network), kind(clip, hz, stopped), messages.append, stopped)
     return messages
 
 
-def test_frames_come_at_60_hz_whatever_the_trackers(network: Path, clip: Clip):
+def test_frames_come_at_60_hz_whatever_the_trackers(network: Path, clip: TrackedClip):
     for hz in (60, 72, 90):
         messages = played(network, clip, hz)
         assert [m["number"] for m in messages] == list(range(len(messages)))
@@ -64,7 +64,7 @@ def test_frames_come_at_60_hz_whatever_the_trackers(network: Path, clip: Clip):
         assert len(messages) >= 119
 
 
-def test_truth_and_prediction_in_the_pages_axes(network: Path, clip: Clip):
+def test_truth_and_prediction_in_the_pages_axes(network: Path, clip: TrackedClip):
     message = played(network, clip, 90)[30]
     truth = clip.truth(0.5)
     assert message["truth"] == pytest.approx(
@@ -76,7 +76,7 @@ def test_truth_and_prediction_in_the_pages_axes(network: Path, clip: Clip):
     json.dumps(message)
 
 
-def test_held_trackers_and_refused_samples_are_told(network: Path, clip: Clip):
+def test_held_trackers_and_refused_samples_are_told(network: Path, clip: TrackedClip):
     told = played(network, clip, 60, Losing)
     messages = [message for message in told if "joints" in message]
     assert [message for message in told if "joints" not in message] == [{"dropped": 0, "malformed": 1}]
@@ -88,7 +88,7 @@ def test_held_trackers_and_refused_samples_are_told(network: Path, clip: Clip):
 
 
 @pytest.fixture
-def server(clip: Clip) -> Iterator[Server]:
+def server(clip: TrackedClip) -> Iterator[Server]:
     with Server(Hub(greeting(ClipSource(clip, 60), "tiny")), 0) as server:
         yield server
 
@@ -175,7 +175,7 @@ def test_a_taken_port_is_one_line(server: Server):
         Server(Hub({}), server.server_port)
 
 
-def test_the_end_leaves_the_port_and_no_thread(clip: Clip):
+def test_the_end_leaves_the_port_and_no_thread(clip: TrackedClip):
     before = threading.active_count()
     with Server(Hub({}), 0) as server:
         response = get(server, "/events")

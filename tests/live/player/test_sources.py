@@ -10,7 +10,7 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.live.player.packets import from_json, from_osc, to_json, to_osc
-from memmlp.live.player.sources import HOST, PAUSE, Clip, ClipSource, PacketSource, send
+from memmlp.live.player.sources import HOST, PAUSE, ClipSource, PacketSource, TrackedClip, send
 from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.spaces import SPACES
 
@@ -31,12 +31,12 @@ class Clock:
         self.now += seconds
 
 
-def source(clip: Clip, hz: float, clock: Clock, rounds: float = 1) -> ClipSource:
+def source(clip: TrackedClip, hz: float, clock: Clock, rounds: float = 1) -> ClipSource:
     return ClipSource(clip, hz, rounds, clock, clock.sleep)
 
 
 @pytest.mark.parametrize(("hz", "count"), [(60, 120), (72, 143), (90, 179)])
-def test_a_clip_comes_at_its_rate(clip: Clip, hz: float, count: int):
+def test_a_clip_comes_at_its_rate(clip: TrackedClip, hz: float, count: int):
     clock = Clock()
     played = source(clip, hz, clock)
     samples = []
@@ -48,7 +48,7 @@ def test_a_clip_comes_at_its_rate(clip: Clip, hz: float, count: int):
     assert all(s.dropped == 0 for _, s in samples)
 
 
-def test_at_60_hz_the_samples_are_the_clips_frames(clip: Clip):
+def test_at_60_hz_the_samples_are_the_clips_frames(clip: TrackedClip):
     for index in (0, 7, 119):
         position, quaternion = clip.trackers(index / 60)[1]
         assert position == pytest.approx(clip.positions[index, 1], abs=1e-9)
@@ -56,7 +56,7 @@ def test_at_60_hz_the_samples_are_the_clips_frames(clip: Clip):
         assert clip.truth(index / 60) == pytest.approx(clip.joints[index], abs=1e-9)
 
 
-def test_between_frames_it_is_between_them(clip: Clip):
+def test_between_frames_it_is_between_them(clip: TrackedClip):
     position, quaternion = clip.trackers(10.5 / 60)[2]
     assert position == pytest.approx(clip.positions[10:12, 2].mean(0), abs=1e-9)
     middle = quaternion_to_matrix(quaternion)
@@ -65,7 +65,7 @@ def test_between_frames_it_is_between_them(clip: Clip):
     assert clip.truth(10.5 / 60) == pytest.approx(clip.joints[10:12].mean(0), abs=1e-9)
 
 
-def test_what_is_due_while_somebody_works_is_dropped(clip: Clip):
+def test_what_is_due_while_somebody_works_is_dropped(clip: TrackedClip):
     clock = Clock()
     played = source(clip, 60, clock)
     played.read()
@@ -76,7 +76,7 @@ def test_what_is_due_while_somebody_works_is_dropped(clip: Clip):
     assert played.read().dropped == 0
 
 
-def test_a_round_follows_after_a_pause(clip: Clip):
+def test_a_round_follows_after_a_pause(clip: TrackedClip):
     clock = Clock()
     played = source(clip, 60, clock, rounds=2)
     samples = [played.read() for _ in range(121)]
@@ -86,7 +86,7 @@ def test_a_round_follows_after_a_pause(clip: Clip):
 
 
 @pytest.mark.parametrize(("kind", "space"), [("udp", "amass"), ("osc", "unity")])
-def test_a_clip_arrives_as_packets(clip: Clip, kind: str, space: str):
+def test_a_clip_arrives_as_packets(clip: TrackedClip, kind: str, space: str):
     pack, parse = PACKETS[kind]
     arrives = PacketSource(kind, 0, parse, space)
     there, clock = SPACES[space], Clock()
