@@ -51,7 +51,7 @@ def fake_run(
     for row in rows if groups else ():
         row["group"] = (groups or {})[row["name"]]
     latency = {
-        "median_ms": 0.8 * factor, "p95_ms": 1.1 * factor, "ratio_to_reference": 0.6, "parameters": 356_798,
+        "median_ms": 0.8 * factor, "p95_ms": 1.1 * factor, "ratio_to_yardstick": 0.6, "parameters": 356_798,
         "macs": 13_000_000, "flops": 26_000_000, "onnx_bytes": 1_900_000,
     }  # fmt: skip
     manifest = {"id": run.id, "kind": "memmlp", "seconds": {"train": 300.0, "evaluate": 20.0}, **ORIGIN}

@@ -306,8 +306,8 @@ CASES: dict[str, Callable[[], Numbers]] = {
     },
     "model.mem_mlp": lambda: network(tiny.model(NoMemory, RotationOnly)),
     **{
-        f"model.{name}": partial(lambda name: network(tiny.reference(name)), name)
-        for name in tiny.REFERENCES
+        f"model.{name}": partial(lambda name: network(tiny.baseline(name)), name)
+        for name in tiny.BASELINES
     },
     **{
         f"memory.{name}": partial(lambda kind: network(tiny.model(kind)), kind)

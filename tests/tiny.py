@@ -93,21 +93,21 @@ def model(
     return MemMLP(normalizer(coordinates), slot, head, depth=DEPTH, **SIZES).eval()
 
 
-REFERENCES: dict[str, Callable[..., WindowModel]] = {
+BASELINES: dict[str, Callable[..., WindowModel]] = {
     "agrol_mlp": partial(AGRoLMLP, frames=7, width=16, depth=2),
     "agrol_diffusion": partial(
         AGRoLDiffusion, frames=7, width=16, depth=2, diffusion_steps=50, sampling_steps=3, noise_seed=0
     ),
     "avatar_poser": partial(AvatarPoser, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
 }
-REFERENCE_LOSSES: dict[str, type[Loss]] = {
+BASELINE_LOSSES: dict[str, type[Loss]] = {
     "agrol_mlp": AGRoLLoss,
     "agrol_diffusion": AGRoLLoss,
     "avatar_poser": AvatarPoserLoss,
 }
 
 
-def reference(name: str, coordinates: World | None = None, seed: int = 0, **changes) -> WindowModel:
-    """A tiny reference network with random weights, in evaluation mode."""
+def baseline(name: str, coordinates: World | None = None, seed: int = 0, **changes) -> WindowModel:
+    """A tiny baseline with random weights, in evaluation mode."""
     torch.manual_seed(seed)
-    return REFERENCES[name](normalizer(coordinates), **changes).eval()
+    return BASELINES[name](normalizer(coordinates), **changes).eval()

@@ -28,7 +28,7 @@ def show(outcome: Outcome) -> None:
     measured = results["latency"]
     console.print(
         f"a frame on one CPU core: {measured['median_ms']:.2f} ms median, {measured['p95_ms']:.2f} ms p95 "
-        f"({measured['ratio_to_reference']:.2f} x the reference network)",
+        f"({measured['ratio_to_yardstick']:.2f} x the yardstick)",
         soft_wrap=True,
     )
     console.print(

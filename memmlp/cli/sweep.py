@@ -178,14 +178,14 @@ def track(plan: Plan) -> None:
     """Show the runs as the sweep's, where they are tracked."""
     from omegaconf import OmegaConf
 
-    from memmlp.config.build import build_tracker
+    from memmlp.config.build import build_tracking
     from memmlp.runs.tracking import harmless
 
     labels = {entry.id: entry.label for entry in plan.entries if plan.complete(entry)}
     if labels:
         config = next(task.config for task in plan.tasks if task.id in labels)
         with harmless(f"sweep {plan.name}"):
-            build_tracker(OmegaConf.create(dict(config))).group(plan.name, labels)
+            build_tracking(OmegaConf.create(dict(config))).group(plan.name, labels)
 
 
 def show(chosen: Sweep, plan: Plan) -> None:

@@ -24,18 +24,18 @@ def sync(uri: str | None, outputs: Path) -> None:
     """Bring MLflow's store up to date with all finished runs and sweeps; again as often as you like."""
     from memmlp.common.progress import track as bar
     from memmlp.runs.lookup import list_runs
-    from memmlp.runs.tracking import MLflowTracker
+    from memmlp.runs.tracking import MLflowTracking
     from memmlp.sweep.plan import Plan
 
-    tracker = MLflowTracker(uri, outputs)
+    tracking = MLflowTracking(uri, outputs)
     finished = [run for run in list_runs(outputs) if run.done]
     for run in bar(finished, "runs"):
-        tracker.project(run)
+        tracking.project(run)
     known = {run.id for run in finished}
     plans = [Plan.load(path) for path in sorted(outputs.glob("sweeps/*/plan.json"))]
     for plan in plans:
-        tracker.group(plan.name, {e.id: e.label for e in plan.entries if e.id in known})
-    click.echo(f"{len(finished)} runs and {len(plans)} sweeps are in {tracker.store()}")
+        tracking.group(plan.name, {e.id: e.label for e in plan.entries if e.id in known})
+    click.echo(f"{len(finished)} runs and {len(plans)} sweeps are in {tracking.store()}")
 
 
 @click.command("ui")
@@ -43,9 +43,9 @@ def sync(uri: str | None, outputs: Path) -> None:
 @outputs_option
 def ui(port: int, outputs: Path) -> None:
     """MLflow's page on the tracked runs (needs pip install 'memmlp[ui]')."""
-    from memmlp.runs.tracking import MLflowTracker
+    from memmlp.runs.tracking import MLflowTracking
 
-    store = MLflowTracker(None, outputs).store()
+    store = MLflowTracking(None, outputs).store()
     program = shutil.which("mlflow")
     try:
         import mlflow.server  # noqa: F401  (mlflow-skinny has none)

@@ -38,7 +38,7 @@ from memmlp.networks.window_model import WindowModel
 from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.identity import flatten
 from memmlp.runs.run import Run
-from memmlp.runs.tracking import Tracker
+from memmlp.runs.tracking import Tracking
 from memmlp.training.codes import CodesTraining
 from memmlp.training.losses import Loss, MotionLoss
 from memmlp.training.network import NetworkTraining
@@ -75,7 +75,7 @@ def build_experiment(cfg: DictConfig) -> Experiment:
         ),
         deployment=Deployment(**config["export"]),
         predictions=Path(cfg.save_predictions) if cfg.save_predictions else None,
-        tracker=build_tracker(cfg),
+        tracking=build_tracking(cfg),
     )
 
 
@@ -88,10 +88,10 @@ def untrained(overrides: Sequence[str]) -> WindowModel:
     return architecture.build(frame, codes).eval()
 
 
-def build_tracker(cfg: DictConfig) -> Tracker:
+def build_tracking(cfg: DictConfig) -> Tracking:
     """What shows the config's runs elsewhere."""
-    places = {"outputs": Path(cfg.paths.outputs)} if "uri" in cfg.tracker else {}
-    return built(cfg.tracker, **places)
+    places = {"outputs": Path(cfg.paths.outputs)} if "uri" in cfg.tracking else {}
+    return built(cfg.tracking, **places)
 
 
 def device(name: str) -> torch.device:

@@ -25,31 +25,31 @@ from memmlp.networks.window_model import WindowModel
 WARM_UP = 30
 SETTLING = 3
 Key = TypeVar("Key", bound=Hashable)
-REFERENCE_SHAPE = (41, 512, 8)  # rows, width, layers: 86 M multiply-adds of plain matrix products
+YARDSTICK_SHAPE = (41, 512, 8)  # rows, width, layers: 86 M multiply-adds of plain matrix products
 
 
 def measure(path: Path, steps: int = 200) -> dict[str, Any]:
-    """Median and p95 milliseconds a step of an exported file, one thread, beside the reference network.
+    """Median and p95 milliseconds a step of an exported file, one thread, beside the yardstick.
 
     The two are timed in turn, step by step, in the same minute, so that machines can be compared by the
     ratio. `steps` is at least 200.
     """
-    stream, reference = OnnxStream(path), reference_session()
+    stream, yardstick = OnnxStream(path), yardstick_session()
     sparse = np.zeros((1, SPARSE_DIM), np.float32)
-    rows = {"input": np.ones(REFERENCE_SHAPE[:2], np.float32)}
+    rows = {"input": np.ones(YARDSTICK_SHAPE[:2], np.float32)}
     ours, theirs = [], []
     for step in range(WARM_UP + max(steps, 200)):
         start = time.perf_counter()
         stream.step(sparse)
         middle = time.perf_counter()
-        reference.run(None, rows)
+        yardstick.run(None, rows)
         if step >= WARM_UP:
             ours.append(middle - start)
             theirs.append(time.perf_counter() - middle)
     return {
         **_milliseconds("", ours),
-        **_milliseconds("reference_", theirs),
-        "ratio_to_reference": float(np.median(ours) / np.median(theirs)),
+        **_milliseconds("yardstick_", theirs),
+        "ratio_to_yardstick": float(np.median(ours) / np.median(theirs)),
         "steps": len(ours),
         "threads": 1,
     }
@@ -120,9 +120,9 @@ def macs(model: WindowModel | StreamingGraph) -> int:
     return counter.get_total_flops() // 2
 
 
-def reference_session() -> onnxruntime.InferenceSession:
+def yardstick_session() -> onnxruntime.InferenceSession:
     """A fixed stack of matrix products and ReLUs, the same for ever, as a yardstick for machines."""
-    rows, width, layers = REFERENCE_SHAPE
+    rows, width, layers = YARDSTICK_SHAPE
     weight = np.random.default_rng(0).standard_normal((width, width), np.float32) / np.sqrt(width)
     nodes, name = [], "input"
     for layer in range(layers):
@@ -132,7 +132,7 @@ def reference_session() -> onnxruntime.InferenceSession:
     value = helper.make_tensor_value_info
     graph = helper.make_graph(
         nodes,
-        "reference",
+        "yardstick",
         [value("input", TensorProto.FLOAT, [rows, width])],
         [value(name, TensorProto.FLOAT, [rows, width])],
         [onnx.numpy_helper.from_array(weight.astype(np.float32), "weight")],

@@ -37,7 +37,7 @@ from memmlp.motion.body import (
 from memmlp.motion.features import sparse_features
 from memmlp.motion.geometry import sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.streaming import Stream
+from memmlp.networks.streaming import StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
 TRACKERS = ("tracker_positions", "tracker_rotations")
@@ -58,7 +58,7 @@ class FullStep(nn.Module):
     body: Tensor
     offsets: Tensor
 
-    def __init__(self, model: WindowModel | Stream, space: Space):
+    def __init__(self, model: WindowModel | StreamingGraph, space: Space):
         super().__init__()
         self.model = model
         self.names = list(model.initial_state(1))
@@ -109,7 +109,7 @@ class FullStep(nn.Module):
         return transforms[:, :N_JOINTS, :3, 3]
 
 
-def export_full(model: WindowModel | Stream, path: Path, run_id: str, space: str = "amass") -> None:
+def export_full(model: WindowModel | StreamingGraph, path: Path, run_id: str, space: str = "amass") -> None:
     """Write the whole step, on the CPU in float32, as one ONNX file with its metadata.
 
     Raises InputError for an unknown space.
@@ -155,7 +155,7 @@ def full_parity(model: WindowModel, path: Path, clip: Tensor, space: str = "amas
     return float(np.max([np.abs(a - b).max() for a, b in zip(expected, found, strict=True)]))
 
 
-def _expected(frame: Normalizer, motion: Tensor, sparse: Tensor, space: Space) -> list[np.ndarray]:
+def _expected(normalizer: Normalizer, motion: Tensor, sparse: Tensor, space: Space) -> list[np.ndarray]:
     """Rotations, positions and joints in a space, of world motion (N, 198) at inputs (N, 54)."""
     local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6))).numpy()
     positions = [normalizer.pose(motion, sparse), motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))]

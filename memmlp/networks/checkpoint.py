@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,12 @@ def module_tensors(prefix: str, module: nn.Module) -> dict[str, Tensor]:
 def load_module(prefix: str, module: nn.Module, tensors: dict[str, Tensor]) -> None:
     """Put tensors that `module_tensors` named back."""
     own = {name.removeprefix(f"{prefix}."): t for name, t in tensors.items() if name.startswith(f"{prefix}.")}
-    module.load_state_dict(own)
+    module.load_state_dict({_current(name): tensor for name, tensor in own.items()})
+
+
+def _current(name: str) -> str:
+    """The name that a tensor has in this version; version 0.1 called a normalizer a frame."""
+    return re.sub(r"(^|\.)frame\.(rest|mean|std)$", r"\1normalizer.\2", name)
 
 
 def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:

@@ -13,7 +13,7 @@ from memmlp.evaluation.stage import Evaluation
 from memmlp.motion.source import MotionSource
 from memmlp.networks.architecture import VQVAE_SETTINGS, Architecture
 from memmlp.runs.identity import Identity, deployment_id, evaluation_id
-from memmlp.runs.tracking import Tracker
+from memmlp.runs.tracking import Tracking
 from memmlp.training.codes import CodesTraining
 from memmlp.training.network import NetworkTraining
 
@@ -28,7 +28,7 @@ class Experiment:
         data: the motion. architecture: builds the networks.
         codes, training, evaluation, deployment: how the stages are done.
         predictions: folder for the test clips' predictions, where they are wanted.
-        tracker: shows finished runs elsewhere.
+        tracking: shows finished runs elsewhere.
     """
 
     config: dict[str, Any]
@@ -42,7 +42,7 @@ class Experiment:
     evaluation: Evaluation
     deployment: Deployment
     predictions: Path | None
-    tracker: Tracker
+    tracking: Tracking
 
     @property
     def evaluations(self) -> dict[str, str]:

@@ -61,7 +61,7 @@ def run(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
             test = data.open("test").to(experiment.device)
             save_predictions(experiment.evaluation, model, test, experiment.predictions)
     if made:
-        project_safely(experiment.tracker, run)
+        project_safely(experiment.tracking, run)
     return Outcome(run, tuple(made), results_of(experiment, run))
 
 
@@ -77,7 +77,7 @@ def finished(
             evaluate_run(experiment, run, data, experiment.evaluation.modes)
         made = [*(["evaluation"] if again else []), *finish(experiment, run, data)]
     if made:
-        project_safely(experiment.tracker, run)
+        project_safely(experiment.tracking, run)
     return results_of(experiment, run), made
 
 
@@ -97,7 +97,7 @@ def finish(experiment: Experiment, run: Run, data: Prepared) -> list[str]:
 def results_of(experiment: Experiment, run: Run) -> dict[str, Any]:
     """What was measured of a run as the experiment asks for it: mode -> branch -> metric, and "latency"."""
     files = {mode: run.evaluation(name) for mode, name in experiment.evaluations.items() if run.has(name)}
-    latency = read_json(run.deployment(experiment.deployed).latency)
+    latency = run.deployment(experiment.deployed).record
     means = {mode: read_json(path)["mean"] for mode, path in files.items()}
     return means | ({"latency": latency} if latency else {})
 
@@ -126,7 +126,7 @@ def codes_run(experiment: Experiment, data: Prepared) -> Run:
             errors = experiment.codes.train(experiment.architecture, data, run, experiment.device)
         write_json(run.results_path, {"val": errors})
         run.finish(("model.safetensors", "results.json"))
-    project_safely(experiment.tracker, run)
+    project_safely(experiment.tracking, run)
     return run
 
 

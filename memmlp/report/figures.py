@@ -55,7 +55,7 @@ class Curve(NamedTuple):
 
 @mpl.rc_context(STYLE)
 def forest(table: Table) -> str | None:
-    """Differences from the reference with their intervals, by arm and metric; None where there are none."""
+    """Differences from the control with their intervals, by arm and metric; None where there are none."""
     metrics = [metric for metric in table.metrics if metric not in COSTS]
     rows = [
         row for row in table.rows if any(c.effect for cells in row.cells.values() for c in cells.values())
@@ -84,7 +84,7 @@ def forest(table: Table) -> str | None:
         axis.xaxis.set_major_locator(MaxNLocator(4))
         axis.spines["left"].set_visible(False)
     _legend(figure, [*table.modes, "paper"], ["o"] * len(table.modes) + ["D"])
-    return _svg(figure, f"forest-{table.name}", f"differences from {table.reference}")
+    return _svg(figure, f"forest-{table.name}", f"differences from {table.control}")
 
 
 @mpl.rc_context(STYLE)

@@ -127,7 +127,7 @@ def _effects(chapters: Iterable[Chapter]) -> list[str]:
         svg = figures.forest(chapter.table)
         if svg:
             note = (
-                f"Difference from '{chapter.table.reference}', or from the arm's own control, with its 95 % "
+                f"Difference from '{chapter.table.control}', or from the arm's own control, with its 95 % "
                 "interval; filled where it is significant after Holm's correction; the shaded band is the "
                 "smallest effect of interest, the diamond the paper's difference. Left is better."
             )
@@ -246,7 +246,7 @@ def _latency(entries: Sequence[ReportedRun]) -> str:
         "run",
         "median ms",
         "p95 ms",
-        "x reference",
+        "x yardstick",
         "parameters",
         "MMAC",
         "ONNX MB",
@@ -259,13 +259,13 @@ def _latency(entries: Sequence[ReportedRun]) -> str:
         numbers = [
             _number(values, key, scale, form)
             for key, scale, form in (
-                ("median_ms", 1, ".2f"), ("p95_ms", 1, ".2f"), ("ratio_to_reference", 1, ".2f"),
+                ("median_ms", 1, ".2f"), ("p95_ms", 1, ".2f"), ("ratio_to_yardstick", 1, ".2f"),
                 ("parameters", 1, ",.0f"), ("macs", 1e6, ".1f"), ("onnx_bytes", 1e6, ".2f"),
             )
         ]  # fmt: skip
         rows.append([entry.measured.id, *numbers, entry.measured.origin.hardware, "; ".join(entry.places)])
     return _rows(
-        head, rows, "One streaming step on one CPU core; the reference is a fixed stack of matrix products."
+        head, rows, "One streaming step on one CPU core; the yardstick is a fixed stack of matrix products."
     )
 
 

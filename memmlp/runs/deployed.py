@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -35,16 +36,24 @@ class Deployed:
         write_json(self.latency, {**record, **made})
 
     @property
+    def record(self) -> dict[str, Any]:
+        """What was measured: sizes, times, int8's accuracy; empty where it was not shipped."""
+        # Version 0.1 called the yardstick of times a reference.
+        return {
+            re.sub(r"(^|_)reference(_|$)", r"\1yardstick\2", k): v for k, v in read_json(self.latency).items()
+        }
+
+    @property
     def made(self) -> str:
         """When."""
-        return str(read_json(self.latency).get("made", ""))
+        return str(self.record.get("made", ""))
 
     @property
     def settings(self) -> dict[str, Any]:
         """What was asked for."""
-        return dict(read_json(self.latency).get("settings", {}))
+        return dict(self.record.get("settings", {}))
 
     @property
     def prefers_int8(self) -> bool:
         """Whether its int8 file is as accurate as the other one."""
-        return self.int8.exists() and bool(read_json(self.latency).get("int8", {}).get("default"))
+        return self.int8.exists() and bool(self.record.get("int8", {}).get("default"))

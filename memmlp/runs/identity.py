@@ -22,7 +22,8 @@ NEUTRAL = (
     "data",  # its digest stands for it: frames, clips, split and rest pose; but see `_draws`
     "profile",  # sizes, read by the groups that use them
     "paths",
-    "tracker",
+    "tracking",
+    "tracker",  # tracking, in runs of version 0.1
     "device",  # recorded, and flagged where runs that are compared differ in it
     "threads",
     "force",

@@ -208,7 +208,7 @@ class Run:
         own = [report for report in reports if used_as_configured(report.get("settings", {}), config)]
         for report in sorted(own, key=lambda report: report["made"]):
             found[report["mode"]] = {**found.get(report["mode"], {}), **report["mean"]}
-        latency = read_json(self.shipped.latency)
+        latency = self.shipped.record
         return found | ({"latency": latency} if latency else {})
 
     @property

@@ -31,7 +31,7 @@ QUIET = {
 CHATTY = ("mlflow", "alembic", "urllib3")
 
 
-class Tracker(Protocol):
+class Tracking(Protocol):
     """What shows runs elsewhere."""
 
     def project(self, run: Run) -> None:
@@ -41,7 +41,7 @@ class Tracker(Protocol):
         """Show the runs of these ids as a sweep's, each with its arm's label."""
 
 
-class NoTracker:
+class NoTracking:
     """Shows nothing."""
 
     def project(self, run: Run) -> None:
@@ -51,7 +51,7 @@ class NoTracker:
         """Nothing."""
 
 
-class MLflowTracker:
+class MLflowTracking:
     """One MLflow run a run folder, found again by its tag `memmlp.run_id`.
 
     Args:
@@ -151,20 +151,20 @@ class MLflowTracker:
             client.log_batch(name, metrics=part)
 
 
-def project_safely(tracker: Tracker, run: Run) -> None:
+def project_safely(tracking: Tracking, run: Run) -> None:
     """Project a run; a failure is one line on stderr and nothing more, for the folder has it all."""
     with harmless(f"run {run.id}"):
-        tracker.project(run)
+        tracking.project(run)
 
 
 @contextlib.contextmanager
 def harmless(what: str) -> Iterator[None]:
-    """Turn a tracker's failure into a warning of one line."""
+    """Turn tracking's failure into a warning of one line."""
     try:
         yield
     except Exception as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        print(f"memmlp: warning: {what} is not shown by the tracker: {reason}", file=sys.stderr)
+        print(f"memmlp: warning: {what} is not shown by the tracking: {reason}", file=sys.stderr)
 
 
 def _tags(run: Run) -> dict[str, str]:

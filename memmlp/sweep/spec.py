@@ -4,7 +4,7 @@ title: Placement of memory blocks in the backbone
 table: 14                          # of the paper; left out in sweeps of your own
 base: [experiment=paper]           # overrides that all arms share
 seeds: [0, 1, 2]
-reference: 2, 4, 6, 8              # the arm that the others are compared with; the first one by default
+control: 2  , 4, 6, 8              # the arm that the others are compared with; the first one by default
 metrics: [MPJRE, MPJPE, MPJVE, Jitter]
 branch: combined                   # whose errors the rows show: rotation (the default), position or combined
 branch_source: its last row is Table 6's after inverse kinematics                   # how we know
@@ -35,12 +35,12 @@ from memmlp.evaluation.units import SMALLEST, UNITS
 MODES = ("stream", "window")
 BRANCHES = ("rotation", "position", "combined")
 KEYS = (
-    "title", "table", "notes", "base", "seeds", "reference", "metrics", "branch", "branch_source", "smallest",
+    "title", "table", "notes", "base", "seeds", "control", "metrics", "branch", "branch_source", "smallest",
     "arms", "axes",
 )  # fmt: skip
 ARM_KEYS = ("overrides", "branch", "against", "paper", "note")
 COSTS = ("FLOPs", "MACs", "parameters", "size", "ms", "ratio", "FPS")
-"""Columns that are no errors: GFLOP, GMAC, millions, MB, ms, those over the reference network's, 1 / s."""
+"""Columns that are no errors: GFLOP, GMAC, millions, MB, ms, those over the yardstick's, 1 / s."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Arm:
         branch: whose errors the row shows: rotation, position, or combined (after inverse kinematics).
         paper: the paper's values by metric, as printed.
         note: a word of warning shown under the table.
-        against: label of the arm that this one is compared with; None for the sweep's reference.
+        against: label of the arm that this one is compared with; None for the sweep's control.
         fixed: whether the branch is the arm's own, and not the sweep's.
         seeds: in place of the sweep's, where seeds are spent on open verdicts alone; None for the sweep's.
     """
@@ -84,7 +84,7 @@ class Sweep:
     Attributes:
         name: the file's stem. title, notes: for the table. table: its number in the paper.
         base: overrides of all arms. seeds: of each arm.
-        arms: the rows in order. reference: the label that the others are compared with.
+        arms: the rows in order. control: the label that the others are compared with.
         metrics: the columns. extra: overrides of the command line.
         branch_source: how we know which branch the paper's values belong to, where the file says.
         smallest: smallest effect of interest by metric, in the metric's unit; every metric but costs has one.
@@ -97,7 +97,7 @@ class Sweep:
     base: tuple[str, ...]
     seeds: tuple[int, ...]
     arms: tuple[Arm, ...]
-    reference: str
+    control: str
     metrics: tuple[str, ...]
     extra: tuple[str, ...] = ()
     branch_source: str | None = None
@@ -116,9 +116,9 @@ class Sweep:
         )
         return self if arms == self.arms else replace(self, arms=arms, branch_source=None)
 
-    def control(self, arm: Arm) -> str | None:
-        """The label of the arm that one is compared with; None for the reference without a control."""
-        return arm.against or (self.reference if arm.label != self.reference else None)
+    def control_of(self, arm: Arm) -> str | None:
+        """The label of the arm that one is compared with; None for the sweep's control, if it has none."""
+        return arm.against or (self.control if arm.label != self.control else None)
 
     def seeds_of(self, arm: Arm) -> tuple[int, ...]:
         """The seeds of an arm, the sweep's where it has none of its own."""
@@ -192,9 +192,9 @@ def parse_sweep(name: str, content: Any) -> Sweep:
     runnable = [arm.label for arm in arms if arm.overrides is not None]
     if not runnable:
         raise InputError("arms: none to run; allowed is at least one arm with overrides, or axes")
-    reference = str(content.get("reference", runnable[0]))
-    if reference not in runnable:
-        raise InputError(f"reference: '{reference}' is no arm; allowed are {', '.join(runnable)}")
+    control = str(content.get("control", runnable[0]))
+    if control not in runnable:
+        raise InputError(f"control: '{control}' is no arm; allowed are {', '.join(runnable)}")
     _check_controls(arms, runnable)
     source = content.get("branch_source")
     return Sweep(
@@ -205,7 +205,7 @@ def parse_sweep(name: str, content: Any) -> Sweep:
         base=tuple(_overrides(content.get("base", []), "base")),
         seeds=seeds,
         arms=tuple(arms),
-        reference=reference,
+        control=control,
         metrics=_metrics(content.get("metrics", ["MPJRE", "MPJPE", "MPJVE", "Jitter"])),
         branch_source=None if source is None else _text(source, "branch_source"),
         smallest=SMALLEST | _smallest(content.get("smallest", {})),

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from memmlp.sweep.spec import COSTS, MODES, Arm, Sweep
-from memmlp.tables.effects import Runs, control, effects, paper_effect, with_existing_branches
+from memmlp.tables.effects import Runs, control_arm, effects, paper_effect, with_existing_branches
 from memmlp.tables.flags import Say, flags, silent
 from memmlp.tables.measured import Measured
 from memmlp.tables.table import Cell, Effect, Key, Row, Table
@@ -57,7 +57,7 @@ def collect(
         number=sweep.table,
         modes=shown,
         metrics=sweep.metrics,
-        reference=sweep.reference,
+        control=sweep.control,
         branch_source=sweep.branch_source,
         smallest=dict(sweep.smallest),
         comparisons=compared,
@@ -82,6 +82,6 @@ def _row(sweep: Sweep, arm: Arm, runs: Runs | None, modes: Sequence[str], found:
 
     cells = {mode: {metric: cell(mode, metric) for metric in sweep.metrics} for mode in modes}
     wanted = sweep.seeds_of(arm) if runs is not None else ()
-    against = control(sweep, arm)
+    against = control_arm(sweep, arm)
     other = against.label if against else None
     return Row(arm.label, arm.branch, other, arm.note, tuple(runs or ()), wanted, cells)

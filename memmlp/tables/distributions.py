@@ -9,7 +9,7 @@ import numpy as np
 
 from memmlp.statistics import interquartile_mean, probability_of_improvement
 from memmlp.sweep.spec import COSTS, Arm, Sweep
-from memmlp.tables.effects import Runs, control, with_existing_branches
+from memmlp.tables.effects import Runs, control_arm, with_existing_branches
 
 
 class Distribution(NamedTuple):
@@ -42,7 +42,7 @@ def _of_metric(
 ) -> list[Distribution]:
     arms = [arm for arm in sweep.runnable() if runs[arm.label]]
     errors = {arm.label: _errors(runs[arm.label], clips, mode, arm, metric) for arm in arms}
-    return [_distribution(arm.label, errors, control(sweep, arm)) for arm in arms]
+    return [_distribution(arm.label, errors, control_arm(sweep, arm)) for arm in arms]
 
 
 def _errors(runs: Runs, clips: list[str], mode: str, arm: Arm, metric: str) -> np.ndarray:

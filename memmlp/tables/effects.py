@@ -26,15 +26,15 @@ class Paired(NamedTuple):
     groups: np.ndarray
 
 
-def control(sweep: Sweep, arm: Arm) -> Arm | None:
-    """The arm that another is compared with; None for the reference, and for rows of the paper alone."""
-    label = sweep.control(arm) if arm.overrides is not None else None
+def control_arm(sweep: Sweep, arm: Arm) -> Arm | None:
+    """The arm that another is compared with; None for the sweep's control and rows of the paper alone."""
+    label = sweep.control_of(arm) if arm.overrides is not None else None
     return next((other for other in sweep.arms if other.label == label), None)
 
 
 def paper_effect(sweep: Sweep, arm: Arm, metric: str) -> float | None:
     """The paper's difference from the control, as printed; None where there is none."""
-    other = control(sweep, arm)
+    other = control_arm(sweep, arm)
     ours = (arm.paper or {}).get(metric)
     theirs = (other.paper or {}).get(metric) if other else None
     return None if ours is None or theirs is None else round(ours - theirs, 6)
@@ -75,7 +75,7 @@ def one_and_the_same(arm: Arm, other: Arm, ours: Runs, theirs: Runs) -> bool:
 def _compared(sweep: Sweep) -> Iterator[tuple[Arm, Arm]]:
     """Each arm that has a control, with it."""
     for arm in sweep.runnable():
-        other = control(sweep, arm)
+        other = control_arm(sweep, arm)
         if other is not None:
             yield arm, other
 

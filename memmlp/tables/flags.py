@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from memmlp.sweep.spec import COSTS, Arm, Sweep
-from memmlp.tables.effects import Runs, control, one_and_the_same
+from memmlp.tables.effects import Runs, control_arm, one_and_the_same
 from memmlp.tables.measured import Measured
 
 Say = Callable[[Arm, int], str | None]
@@ -92,7 +92,7 @@ def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, Runs], command: str
 
 def _unequal_clips(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
     for arm in sweep.runnable():
-        other = control(sweep, arm)
+        other = control_arm(sweep, arm)
         if other is None:
             continue
         sides = [run.clips.keys() for one in (arm, other) for run in runs[one.label].values()]
@@ -146,14 +146,14 @@ def _replicates(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
 def _same(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
     """Arms that are one run: what tells them apart has no effect under these overrides."""
     for arm in sweep.runnable():
-        other = control(sweep, arm)
+        other = control_arm(sweep, arm)
         if other and one_and_the_same(arm, other, runs[arm.label], runs[other.label]):
             yield f"'{arm.label}' and '{other.label}' are one run: what tells them apart has no effect here"
 
 
 def _single(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
     """Comparisons of one seed, where others have more."""
-    pairs = [(arm.label, other.label) for arm in sweep.runnable() if (other := control(sweep, arm))]
+    pairs = [(arm.label, other.label) for arm in sweep.runnable() if (other := control_arm(sweep, arm))]
     shared = {one: len(runs[one].keys() & runs[two].keys()) for one, two in pairs}
     few = [label for label, number in shared.items() if number == 1]
     if few and max(shared.values()) > 1:

@@ -21,7 +21,7 @@ class Line:
     """A line of an arm.
 
     Attributes:
-        kind: "measured", "difference" (from the reference) or "paper". head: its first two cells.
+        kind: "measured", "difference" (from the control) or "paper". head: its first two cells.
         cells: one a metric, each of one or two parts.
     """
 
@@ -102,12 +102,12 @@ def _branches(table: Table) -> list[str]:
 
 def _differences(table: Table) -> str:
     """What a line of differences has, and of which arms it is."""
-    own = [row for row in table.rows if row.against not in (None, table.reference)]
+    own = [row for row in table.rows if row.against not in (None, table.control)]
     others = "".join(f", of '{row.label}' from '{row.against}'" for row in own)
     least = "its look's level" if table.looks else "0.05"
     star = f"; * p < {least} by Holm's correction over the table's {table.comparisons} comparisons"
     return (
-        f"diff.: from '{table.reference}'{others} [95 % interval, paired by seed and test clip]"
+        f"diff.: from '{table.control}'{others} [95 % interval, paired by seed and test clip]"
         f"{star if table.comparisons else ''}"
     )
 
@@ -207,7 +207,7 @@ def number_words(value: float) -> str:
 
 
 def _ratio(value: float | None, difference: float) -> tuple[str, ...]:
-    """How many times the reference's a cost is that differs from it by so much."""
+    """How many times the control's a cost is that differs from it by so much."""
     if value is None or value == difference:
         return ()
     return (f"(x {value / (value - difference):.3g})",)
@@ -224,7 +224,7 @@ def _places(width: float) -> int:
 
 
 def paper_words(cell: Cell, metric: str) -> str:
-    """The paper's value, its difference from the reference, and whether ours has its sign."""
+    """The paper's value, its difference from the control, and whether ours has its sign."""
     if cell.paper is None:
         return MISSING
     places = 1 if metric in ("ms", "FPS") else 2

@@ -57,7 +57,7 @@ class Measured:
         id: of the run.
         means: the metrics' means over the test clips. clips: those of each clip by its name.
         groups: the group (take, subject) of each clip; a clip that is not named is a group of its own.
-        costs: GFLOP, GMAC and ms of a streaming step, its time over the reference network's in the same
+        costs: GFLOP, GMAC and ms of a streaming step, its time over the yardstick's in the same
             minute, millions of parameters, MB of ONNX, frames a second.
         origin: what the run was made from.
         latency: all that was measured of its streaming step.
@@ -120,7 +120,7 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
             clips.setdefault(clip["name"], {}).setdefault(report["mode"], {}).update(clip)
             groups |= {clip["name"]: clip["group"]} if clip.get("group") else {}
     deployed = [run.deployment(name) for name in stages or () if run.deployment(name).done] or [run.shipped]
-    latency = read_json(deployed[-1].latency)
+    latency = deployed[-1].record
     origin = _evaluated(_origin(manifest), reports)
     return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run)
 
@@ -152,7 +152,7 @@ def _costs(latency: Mapping[str, float]) -> dict[str, float]:
         "parameters": of("parameters") / 1e6,
         "size": of("onnx_bytes") / 1e6,
         "ms": of("median_ms"),
-        "ratio": of("ratio_to_reference"),
+        "ratio": of("ratio_to_yardstick"),
         "FPS": 1000 / of("median_ms"),
     }
     return {name: float(cost) for name, cost in costs.items() if not np.isnan(cost)}

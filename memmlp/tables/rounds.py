@@ -21,7 +21,7 @@ from memmlp.statistics import Verdict, looks, seeds_needed, sequential, spending
 from memmlp.sweep.spec import COSTS, MODES, Arm, Sweep
 from memmlp.tables.effects import (
     Runs,
-    control,
+    control_arm,
     or_nan,
     or_none,
     paired,
@@ -152,7 +152,7 @@ def subject(sweep: Sweep) -> dict[str, Any]:
         "arms": {
             arm.label: {
                 "branch": arm.branch,
-                "against": sweep.control(arm),
+                "against": sweep.control_of(arm),
                 "paper": {metric: paper_effect(sweep, arm, metric) for metric in sweep.metrics},
             }
             for arm in sweep.runnable()
@@ -234,7 +234,7 @@ def of_json(content: Mapping[str, Any]) -> Rounds:
 def _compared(sweep: Sweep) -> Iterator[tuple[Arm, Arm]]:
     """The arms that have a control and something to compare, with it."""
     for arm in sweep.runnable():
-        other = control(sweep, arm)
+        other = control_arm(sweep, arm)
         if other is not None and set(sweep.metrics) - set(COSTS):
             yield arm, other
 

@@ -97,7 +97,7 @@ class Row:
 
     Attributes:
         label, note: of the sweep's arm. branch: whose errors are shown. against: the label of its control,
-            None for the reference.
+            None for the sweep's control.
         found, wanted: seeds; none is wanted of a row that is the paper's alone.
         cells: by mode and metric.
     """
@@ -123,7 +123,7 @@ class Table:
     Attributes:
         name, title, number: of the sweep; the number is that in the paper.
         modes: of evaluation; one where only costs are shown. metrics: the columns.
-        reference: label of the arm that the others are compared with, where they name no other.
+        control: label of the arm that the others are compared with, where they name no other.
         branch_source: how it is known which branch the paper's values are of; None where it prints none.
         smallest: the smallest effect of interest by metric.
         comparisons: how many p-values the correction is over.
@@ -136,7 +136,7 @@ class Table:
     number: int | None
     modes: tuple[str, ...]
     metrics: tuple[str, ...]
-    reference: str
+    control: str
     branch_source: str | None
     smallest: Mapping[str, float]
     comparisons: int

@@ -22,7 +22,7 @@ from memmlp.deploy.quantization import accuracy, compared, quantise
 from memmlp.deploy.session import OnnxStream
 from memmlp.motion.coordinates import Heading
 from memmlp.networks.memory import CodeMemory
-from memmlp.networks.streaming import Stream, streaming
+from memmlp.networks.streaming import streaming
 from memmlp.networks.window_model import WindowModel
 from memmlp.runs.deployed import Deployed
 from memmlp.runs.lookup import list_runs
@@ -45,7 +45,7 @@ def pair(tmp_path_factory) -> tuple[Path, Path]:
 
 
 def test_auto_is_the_stream_where_there_is_one():
-    assert isinstance(GRAPHS["auto"](tiny.model()), Stream)
+    assert isinstance(GRAPHS["auto"](tiny.model()), StreamingGraph)
     revised = tiny.model(CodeMemory, history="latest")
     assert GRAPHS["auto"](revised) is revised
     assert GRAPHS["naive"](revised) is revised
@@ -65,9 +65,9 @@ def weights(graph: onnx.ModelProto) -> dict[str, int]:
     return found
 
 
-@pytest.mark.parametrize("network", ["mem_mlp", *tiny.REFERENCES])
+@pytest.mark.parametrize("network", ["mem_mlp", *tiny.BASELINES])
 def test_inner_layers_are_int8_and_the_ends_are_not(pair, tmp_path, network):
-    _, quantised = pair if network == "mem_mlp" else files(tmp_path, tiny.reference(network))
+    _, quantised = pair if network == "mem_mlp" else files(tmp_path, tiny.baseline(network))
     kinds = weights(onnx.load(quantised))
     inner = [kind for name, kind in kinds.items() if ".blocks." in name or ".layers." in name]
     assert inner
@@ -120,27 +120,27 @@ def test_accuracy_is_that_of_the_evaluation(pair):
 def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
     monkeypatch.chdir(home)
     (made,) = (found for found in list_runs(home / "outputs") if found.manifest["kind"] == "memmlp")
-    place = made.shipped
-    written = place.latency.read_text()
+    shipped = made.shipped
+    written = shipped.latency.read_text()
     record = json.loads(written)
     assert record["graph"] == "streaming"
     assert 0 < record["step_macs"] < record["macs"]
     cost = record["int8"]
     assert cost["growth"] == pytest.approx(cost["int8"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
     assert cost["median_ms"] > 0
-    assert cost["onnx_bytes"] == place.int8.stat().st_size
+    assert cost["onnx_bytes"] == shipped.int8.stat().st_size
     assert made.verify() == []
     assert math.isclose(cost["fp32"]["MPJPE"], made.results["stream"]["rotation"]["MPJPE"], rel_tol=1e-3)
-    for default, used in ((True, place.int8), (False, place.onnx)):
+    for default, used in ((True, shipped.int8), (False, shipped.onnx)):
         cost["default"] = default
-        place.latency.write_text(json.dumps(record))
+        shipped.latency.write_text(json.dumps(record))
         assert made.deployed == used
         assert package.Stream(made).network.path == used
         assert package.Stream(str(made.folder)).network.path == used
-    place.latency.write_text(written)
+    shipped.latency.write_text(written)
     assert made.verify() == []
-    place.int8.write_bytes(b"")
-    assert made.verify() == [f"deployments/{deployed.folder.name}/step.int8.onnx"]
+    shipped.int8.write_bytes(b"")
+    assert made.verify() == [f"deployments/{shipped.folder.name}/step.int8.onnx"]
 
     line = ["export", made.id, "--out", "int8.onnx", "--precision", "int8"]
     assert "MPJPE" in memmlp(*line, "--max-growth", "50").out
@@ -156,8 +156,8 @@ def test_the_naive_graph_by_switch(tmp_path):
     """No run: what a config's deployment writes."""
     shipped = {}
     for graph in ("naive", "auto"):
-        place = Deployed(tmp_path / graph)
-        shipped[graph] = Deployment(1, graph).ship(tiny.model(), place, "0" * 16, CLIPS, CLIPS)
+        shipped = Deployed(tmp_path / graph)
+        shipped[graph] = Deployment(1, graph).ship(tiny.model(), shipped, "0" * 16, CLIPS, CLIPS)
     assert [record["graph"] for record in shipped.values()] == ["naive", "streaming"]
     assert shipped["naive"]["step_macs"] == shipped["naive"]["macs"] == shipped["auto"]["macs"]
     assert build_experiment(composed(["export.graph=naive"])).deployment.graph == "naive"

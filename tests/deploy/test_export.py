@@ -49,7 +49,7 @@ def test_parity_sees_a_difference(exported):
 
 def test_almost_parallel_columns_are_no_failure(tmp_path):
     """As an untrained network makes them: the joints of rotations that agree may be far apart."""
-    model, path = tiny.reference("agrol_mlp"), tmp_path / "step.onnx"
+    model, path = tiny.baseline("agrol_mlp"), tmp_path / "step.onnx"
     mean, std = (t[SPARSE_DIM:][ROTATION].view(22, 6) for t in (model.normalizer.mean, model.normalizer.std))
     mean[9, 3:], std[9] = mean[9, :3], 4e-3
     export(model, path, "0123456789abcdef")
@@ -93,7 +93,7 @@ def test_latency_and_size(exported):
     measured = latency.measure(path, steps=1)
     assert measured["steps"] == 200
     assert 0 < measured["median_ms"] <= measured["p95_ms"]
-    assert measured["ratio_to_reference"] > 0
+    assert measured["ratio_to_yardstick"] > 0
     size = latency.size(model, model, path)
     assert size["flops"] == 2 * size["macs"] > 0
     assert size["onnx_bytes"] == path.stat().st_size

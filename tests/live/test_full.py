@@ -61,9 +61,9 @@ def test_it_is_the_stream(name, network, folder: Path):
         full.reset()
 
 
-@pytest.mark.parametrize("name", tiny.REFERENCES)
-def test_reference_networks_have_it_too(name, tmp_path: Path):
-    network = tiny.reference(name)
+@pytest.mark.parametrize("name", tiny.BASELINES)
+def test_baselines_have_it_too(name, tmp_path: Path):
+    network = tiny.baseline(name)
     export_full(network, tmp_path / "full.onnx", RUN, "unity")
     assert full_parity(network, tmp_path / "full.onnx", PERSON.frames, "unity") <= TOLERANCE
 

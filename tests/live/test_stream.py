@@ -41,7 +41,7 @@ PERSON = wearer.person(TIMES)
 MODELS = {
     "vq": lambda: tiny.model(coordinates=Heading()),
     "rotation-only": lambda: tiny.model(NoMemory, RotationOnly),
-    "avatar_poser": lambda: tiny.reference("avatar_poser"),
+    "avatar_poser": lambda: tiny.baseline("avatar_poser"),
 }
 
 

@@ -24,13 +24,13 @@ from memmlp.networks.window_model import WindowModel
 from memmlp.runs.lookup import list_runs
 from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss
 
-NAMES = list(tiny.REFERENCES)
+NAMES = list(tiny.BASELINES)
 CLIP = tiny.clip(40)
 SPARSE = CLIP[None, :, :SPARSE_DIM]
 SHORT = [
     "profile=tiny",
     "data.synth.minutes=0.2",
-    "tracker=none",
+    "tracking=none",
     "threads=1",
     "optim.steps=2",
     "model.depth=2",
@@ -80,7 +80,7 @@ def test_published_work():
 @pytest.mark.parametrize("name", NAMES)
 @torch.no_grad()
 def test_a_stream_is_the_last_frame_of_windows_with_full_history(name):
-    model = tiny.reference(name, Heading())
+    model = tiny.baseline(name, Heading())
     size = model.frames
     stream = evaluation.stream(model, [CLIP])[0]
     for end in (size, 20, 40):
@@ -91,7 +91,7 @@ def test_a_stream_is_the_last_frame_of_windows_with_full_history(name):
 @pytest.mark.parametrize("name", NAMES)
 @torch.no_grad()
 def test_a_fresh_start_is_the_first_frame_for_a_window(name):
-    model = tiny.reference(name)
+    model = tiny.baseline(name)
     first = model.advance(SPARSE[:, :1], model.initial_state(1), 1)[0]
     still = model.advance(SPARSE[:, :1].expand(-1, model.frames, -1), model.initial_state(1), 1)[0]
     torch.testing.assert_close(first, still)
@@ -101,7 +101,7 @@ def test_a_fresh_start_is_the_first_frame_for_a_window(name):
 @pytest.mark.parametrize("mode", ["stream", "window"])
 @torch.no_grad()
 def test_side_by_side_is_one_by_one_and_short_clips_count(name, mode):
-    model = tiny.reference(name)
+    model = tiny.baseline(name)
     clips = [tiny.clip(n, seed=n) for n in (4, 25, 14)]
     for together, clip in zip(evaluation.predict(model, clips, mode, 8), clips, strict=True):
         assert together.shape == (len(clip), MOTION_DIM)
@@ -112,14 +112,14 @@ def test_side_by_side_is_one_by_one_and_short_clips_count(name, mode):
 @torch.no_grad()
 def test_avatar_poser_is_the_same_in_both_modes():
     """Of a clip of whole windows; every frame has its own window."""
-    model = tiny.reference("avatar_poser")
+    model = tiny.baseline("avatar_poser")
     clip = CLIP[: 5 * model.frames]
     torch.testing.assert_close(evaluation.window(model, [clip])[0], evaluation.stream(model, [clip])[0])
 
 
 @torch.no_grad()
 def test_agrol_windows_see_nothing_of_other_windows():
-    model, changed = tiny.reference("agrol_mlp"), CLIP.clone()
+    model, changed = tiny.baseline("agrol_mlp"), CLIP.clone()
     changed[:7] += 0.5
     before, after = evaluation.window(model, [CLIP])[0], evaluation.window(model, [changed])[0]
     assert torch.equal(before[7:], after[7:])
@@ -129,7 +129,7 @@ def test_agrol_windows_see_nothing_of_other_windows():
 @pytest.mark.parametrize("name", NAMES)
 @torch.no_grad()
 def test_positions_are_forward_kinematics_of_the_rotations(name):
-    model = tiny.reference(name, Heading())
+    model = tiny.baseline(name, Heading())
     motion = evaluation.stream(model, [CLIP])[0]
     expected = model.normalizer.pose(motion, CLIP[:, :SPARSE_DIM]).flatten(1)
     torch.testing.assert_close(motion[:, ROTATION.stop :], expected, atol=1e-5, rtol=0)
@@ -138,7 +138,7 @@ def test_positions_are_forward_kinematics_of_the_rotations(name):
 @pytest.mark.parametrize("coordinates", [World(), Heading()], ids=["world", "heading"])
 @pytest.mark.parametrize("name", NAMES)
 def test_torch_and_onnx_agree_on_a_whole_clip(name, coordinates, tmp_path):
-    model = tiny.reference(name, coordinates)
+    model = tiny.baseline(name, coordinates)
     export(model, tmp_path / "step.onnx", "0" * 16)
     assert parity(model, tmp_path / "step.onnx", CLIP) <= TOLERANCE
 
@@ -189,7 +189,7 @@ def test_a_perfect_denoiser_is_found_again():
 
 def test_the_denoiser_learns_from_the_noised_truth_of_the_window():
     """The training call gives the denoiser noised true rotations, drawn times and the window's inputs."""
-    model, seen = tiny.reference("agrol_diffusion"), []
+    model, seen = tiny.baseline("agrol_diffusion"), []
     denoise = model.denoise
     model.denoise = lambda *args: (seen.append(args), denoise(*args))[1]
     truth = tiny.clip(7)[None].expand(64, -1, -1)
@@ -238,7 +238,7 @@ def test_attention_is_an_independent_computation():
 
 @torch.no_grad()
 def test_avatar_poser_reads_the_newest_frame_and_knows_no_order_of_the_others():
-    model, window = tiny.reference("avatar_poser").double(), torch.randn(1, 7, SPARSE_DIM).double()
+    model, window = tiny.baseline("avatar_poser").double(), torch.randn(1, 7, SPARSE_DIM).double()
     found = model.rotations(window)
     torch.testing.assert_close(model.rotations(window[:, [3, 1, 5, 0, 2, 4, 6]]), found)
     assert not torch.allclose(model.rotations(window[:, [6, 1, 2, 3, 4, 5, 0]]), found, atol=1e-3)
@@ -321,14 +321,14 @@ def posed(rotation: np.ndarray) -> np.ndarray:
     return np.array(places)
 
 
-def test_reference_networks_see_what_their_authors_give_them():
+def test_baselines_see_what_their_authors_give_them():
     """World coordinates, and z-scores of the diffusion model alone; what is asked for wins."""
-    features = {name: tuple(composed([f"model={name}"]).normalizer.values()) for name in NAMES}
+    features = {name: tuple(composed([f"model={name}"]).frame.values()) for name in NAMES}
     raw = ("world", False)
     assert features == {"agrol_mlp": raw, "avatar_poser": raw, "agrol_diffusion": ("world", True)}
-    asked = composed(["model=agrol_mlp", "frame.coordinates=heading", "frame.normalize=true"]).normalizer
+    asked = composed(["model=agrol_mlp", "frame.coordinates=heading", "frame.normalize=true"]).frame
     assert tuple(asked.values()) == ("heading", True)
-    assert tuple(composed([]).normalizer.values()) == ("heading", True)
+    assert tuple(composed([]).frame.values()) == ("heading", True)
 
 
 def test_avatar_posers_loss_on_positions_reaches_the_rotations():
@@ -350,12 +350,12 @@ KNOBS = [
 @pytest.mark.parametrize(("name", "change"), KNOBS, ids=str)
 @torch.no_grad()
 def test_every_knob_changes_the_motion(name, change):
-    base, other = (evaluation.stream(tiny.reference(name, **c), [CLIP])[0] for c in ({}, change))
+    base, other = (evaluation.stream(tiny.baseline(name, **c), [CLIP])[0] for c in ({}, change))
     assert not torch.allclose(base, other, atol=1e-4)
 
 
 def test_dropout_drops_in_training_alone():
-    model = tiny.reference("avatar_poser", dropout=0.5)
+    model = tiny.baseline("avatar_poser", dropout=0.5)
     call = SPARSE[:, :7], model.initial_state(1), CLIP[None, :7]
     assert torch.equal(model.learn(*call)[0], model.learn(*call)[0])
     model.train()
@@ -363,7 +363,7 @@ def test_dropout_drops_in_training_alone():
 
 
 def test_sampling_draws_nothing():
-    model = tiny.reference("agrol_diffusion")
+    model = tiny.baseline("agrol_diffusion")
     runs = []
     for seed in (1, 2):
         torch.manual_seed(seed)
@@ -383,7 +383,7 @@ def test_one_command_does_it_all_and_finds_it_again(name, memmlp):
     assert run.results["latency"]["macs"] > 0
     assert run.manifest["upstream"] is None
     assert "finished already" in memmlp("train", f"model={name}", *SHORT).out
-    loaded = build_experiment(config_of(run)).architecture.load(run)
+    loaded = build_experiment(config_of(run)).architecture.load(run.model)
     assert parity(loaded, run.onnx, CLIP) <= TOLERANCE
 
 

@@ -18,7 +18,7 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.coordinates import Heading, HeadRelative, World
 from memmlp.networks.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory
 from memmlp.networks.predictor import RotationOnly, TwoBranch, TwoBranchMemory
-from memmlp.networks.streaming import Stream, streaming
+from memmlp.networks.streaming import StreamingGraph, streaming
 
 MEMORIES = [
     (NoMemory, {}),
@@ -53,11 +53,11 @@ def test_the_stream_is_the_network(kind, changes, predictor):
     assert largest_difference(tiny.model(kind, predictor, **changes).double(), CLIP.double()) < 1e-11
 
 
-@pytest.mark.parametrize("name", tiny.REFERENCES)
+@pytest.mark.parametrize("name", tiny.BASELINES)
 @pytest.mark.parametrize("depth", [1, 3])
 @torch.no_grad()
-def test_the_stream_of_a_reference_is_the_network(name, depth):
-    assert largest_difference(tiny.reference(name, depth=depth).double(), CLIP.double()) < 1e-11
+def test_the_stream_of_a_baseline_is_the_network(name, depth):
+    assert largest_difference(tiny.baseline(name, depth=depth).double(), CLIP.double()) < 1e-11
 
 
 @pytest.mark.parametrize("coordinates", [World(), HeadRelative(), Heading()])
@@ -73,7 +73,7 @@ def test_the_network_itself_stays_as_it_is():
     model = tiny.model()
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     live = streaming(model)
-    assert isinstance(live, Stream)
+    assert isinstance(live, StreamingGraph)
     assert not any(parameter.requires_grad for parameter in live.parameters())
     assert model.memory.frames == model.frames
     for name, tensor in model.state_dict().items():
@@ -81,7 +81,7 @@ def test_the_network_itself_stays_as_it_is():
     assert any(parameter.requires_grad for parameter in model.parameters())
 
 
-@pytest.mark.parametrize("model", [tiny.model(), *map(tiny.reference, tiny.REFERENCES)])
+@pytest.mark.parametrize("model", [tiny.model(), *map(tiny.baseline, tiny.BASELINES)])
 @torch.no_grad()
 def test_less_work(model):
     counts = []
@@ -100,7 +100,7 @@ def test_what_has_no_stream_is_refused():
 NETWORKS = {
     "codes": partial(tiny.model, CodeMemory, coordinates=Heading()),
     "lstm": partial(tiny.model, LSTMMemory, coordinates=Heading()),
-    **{name: partial(tiny.reference, name) for name in tiny.REFERENCES},
+    **{name: partial(tiny.baseline, name) for name in tiny.BASELINES},
 }
 
 

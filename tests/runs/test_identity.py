@@ -27,7 +27,7 @@ from memmlp.runs.run import Run
 
 BASE = [
     "profile=tiny", "data=mocap", "data.root=clips", "data.split.groups=[]", "memory.shift=frame",
-    "tracker=mlflow", "threads=1", "optim.steps=4", "vqvae.steps=3",
+    "tracking=mlflow", "threads=1", "optim.steps=4", "vqvae.steps=3",
     "optim.batch=4", "model.width=8", "model.frames=5", "model.depth=4", "memory.layers=[2]", "vqvae.width=8",
     "memory.width=4", "predictor.depth=1", "optim.checkpoint_every=9", "optim.validate_every=9",
     "evaluation.ik=lbfgs", "evaluation.ik_iterations=2", "optim.schedule=step", "optim.drop_at=0.5",
@@ -55,7 +55,7 @@ CHANGES: dict[str, str] = {
     "evaluation.modes": "[stream]", "evaluation.batch": "1", "evaluation.ik": "off",
     "evaluation.ik_iterations": "3",
     "export.graph": "naive", "export.precision": "int8", "export.latency_steps": "250",
-    "tracker.uri": "sqlite:///other.db",
+    "tracking.uri": "sqlite:///other.db",
 }  # fmt: skip
 
 UNTRIED = {
@@ -116,7 +116,7 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
     experiment = replace(build_experiment(composed([*BASE, *overrides])), outputs=folder)
     data = experiment.data.prepare()
     identity = experiment.identity(data.digest)
-    codes = codes_run(replace(experiment, tracker=Silent()), data).model
+    codes = codes_run(replace(experiment, tracking=Silent()), data).model
     run = Run(folder / "run")
     run.folder.mkdir(parents=True)
     model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)
@@ -140,7 +140,7 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
 
 
 class Silent:
-    """A tracker that shows nothing."""
+    """Tracking that shows nothing."""
 
     def project(self, run: Run) -> None:
         """Nothing."""
@@ -191,7 +191,7 @@ def test_identity_moves_exactly_where_a_result_moves(base: Outcome, home: Path, 
 
 NOWHERE = {
     "force", "save_predictions", "data.name", "data.strict", "optim.checkpoint_every", "optim.log_every",
-    "optim.validate_every", "evaluation.modes", "evaluation.batch", "tracker.uri",
+    "optim.validate_every", "evaluation.modes", "evaluation.batch", "tracking.uri",
 }  # fmt: skip
 """Keys that change no result; what they do has tests of its own."""
 

@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from memmlp.cli.track import track
 from memmlp.common.files import write_json
 from memmlp.runs.run import Run
-from memmlp.runs.tracking import MLflowTracker, NoTracker, project_safely
+from memmlp.runs.tracking import MLflowTracking, NoTracking, project_safely
 from memmlp.sweep.plan import Entry, Plan
 
 CONFIG = {"seed": 0, "memory": {"layers": [2, 4], "shift": None}, "long": "x" * 7000}
@@ -57,16 +57,16 @@ def steps(outputs: Path, key: str) -> list[tuple[int, float]]:
 def projected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An outputs folder with one run, projected when unfinished, when longer, and when done, twice."""
     outputs = tmp_path_factory.mktemp("outputs")
-    tracker, run = MLflowTracker(None, outputs), a_run(outputs)
-    tracker.project(run)
+    tracking, run = MLflowTracking(None, outputs), a_run(outputs)
+    tracking.project(run)
     run.begin("memmlp", CONFIG | {"seed": 0.5}, data="d", upstream="u")  # resumed with other settings
     time.sleep(0.01)
     run.log(5, {"loss": 1 / 5})  # repeated
     run.log(6, {"loss": 0.1, "new": 1.0})
-    tracker.project(run)
+    tracking.project(run)
     run.finish(["results.json"])
-    tracker.project(run)
-    tracker.project(run)
+    tracking.project(run)
+    tracking.project(run)
     return outputs
 
 
@@ -105,13 +105,13 @@ def test_small_artifacts_lie_in_the_outputs(projected: Path):
 
 def test_a_run_done_again_replaces_the_old_one(projected: Path):
     run = Run.of(projected, "1" * 16)
-    tracker = MLflowTracker(None, projected)
+    tracking = MLflowTracking(None, projected)
     for started in ("2024-01-01T00:00:00+00:00", "2025-01-01T00:00:00+00:00"):
         run.reset()
         run.begin("memmlp", CONFIG, data="d", upstream=None)
         run.write_manifest({"started": started})
         run.log(1, {"loss": float(started[:4])})
-        tracker.project(run)
+        tracking.project(run)
     (found,) = [r for r in shown(projected) if r.data.tags["memmlp.run_id"] == run.id]
     client = client_of(projected)
     assert [m.value for m in client.get_metric_history(found.info.run_id, "train/loss")] == [2025.0]
@@ -133,7 +133,7 @@ def test_many_metrics_go_in_batches(projected: Path, monkeypatch: pytest.MonkeyP
     run.begin("memmlp", {f"key{i}": i for i in range(250)}, data="d", upstream=None)
     for step in range(600):
         run.log(step, {"a": 1.0, "b": 2.0})
-    MLflowTracker(None, projected).project(run)
+    MLflowTracking(None, projected).project(run)
     assert sizes == [(0, 100), (0, 100), (0, 50), (1000, 0), (200, 0)]
     (found,) = [r for r in shown(projected) if r.data.tags["memmlp.run_id"] == run.id]
     client = client_of(projected)
@@ -143,30 +143,30 @@ def test_many_metrics_go_in_batches(projected: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_the_environment_names_the_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    tracker = MLflowTracker(None, tmp_path)
-    assert tracker.store() == f"sqlite:///{tmp_path / 'mlflow.db'}"
+    tracking = MLflowTracking(None, tmp_path)
+    assert tracking.store() == f"sqlite:///{tmp_path / 'mlflow.db'}"
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://somewhere")
-    assert tracker.store() == "http://somewhere"
-    assert MLflowTracker("http://else", tmp_path).store() == "http://else"
+    assert tracking.store() == "http://somewhere"
+    assert MLflowTracking("http://else", tmp_path).store() == "http://else"
 
 
 def test_a_failure_is_one_line_and_no_more(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
     run = a_run(tmp_path)
-    project_safely(MLflowTracker("http://127.0.0.1:9", tmp_path), run)
+    project_safely(MLflowTracking("http://127.0.0.1:9", tmp_path), run)
     out, err = capfd.readouterr()
     assert out == ""
-    assert err.startswith(f"memmlp: warning: run {run.id} is not shown by the tracker: ")
+    assert err.startswith(f"memmlp: warning: run {run.id} is not shown by the tracking: ")
     assert err.count("\n") == 1
 
 
 def test_mlflow_says_nothing(projected: Path, capfd: pytest.CaptureFixture[str]):
-    MLflowTracker(None, projected).project(Run.of(projected, "0" * 16))
+    MLflowTracking(None, projected).project(Run.of(projected, "0" * 16))
     assert capfd.readouterr() == ("", "")
 
 
 COLD = "import sys; from pathlib import Path; from memmlp.runs.run import Run; " \
     "from memmlp.runs.tracking import *; " \
-    "MLflowTracker(None, Path(sys.argv[1])).project(Run.of(sys.argv[1], sys.argv[2]))"  # fmt: skip
+    "MLflowTracking(None, Path(sys.argv[1])).project(Run.of(sys.argv[1], sys.argv[2]))"  # fmt: skip
 
 
 def test_cold_starts_at_once_do_not_ruin_the_store(tmp_path: Path):
@@ -189,15 +189,15 @@ import sys
 sys.modules["mlflow"] = None
 from pathlib import Path
 from memmlp.runs.run import Run
-from memmlp.runs.tracking import MLflowTracker, NoTracker, project_safely
+from memmlp.runs.tracking import MLflowTracking, NoTracking, project_safely
 run = Run.of(sys.argv[1], "0" * 16)
-project_safely(NoTracker(), run)
+project_safely(NoTracking(), run)
 print("none works")
-project_safely(MLflowTracker(None, Path(sys.argv[1])), run)
+project_safely(MLflowTracking(None, Path(sys.argv[1])), run)
 """
 
 
-def test_no_tracker_needs_no_mlflow(tmp_path: Path):
+def test_no_tracking_needs_no_mlflow(tmp_path: Path):
     a_run(tmp_path)
     job = subprocess.run(
         [sys.executable, "-c", BLOCKED, str(tmp_path)], capture_output=True, text=True, env=dict(os.environ)
@@ -207,18 +207,18 @@ def test_no_tracker_needs_no_mlflow(tmp_path: Path):
     assert "mlflow" in job.stderr
 
 
-def test_no_tracker_leaves_nothing(tmp_path: Path):
-    NoTracker().project(a_run(tmp_path))
+def test_no_tracking_leaves_nothing(tmp_path: Path):
+    NoTracking().project(a_run(tmp_path))
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
 
 
 def test_a_sweep_is_the_parent_of_its_runs_and_a_shared_run_has_one_parent(tmp_path: Path):
-    tracker = MLflowTracker(None, tmp_path)
+    tracking = MLflowTracking(None, tmp_path)
     for name in ("a" * 16, "b" * 16):
-        tracker.project(a_run(tmp_path, name))
+        tracking.project(a_run(tmp_path, name))
     for _ in range(2):
-        tracker.group("table04", {"a" * 16: "full", "b" * 16: "none"})
-        tracker.group("table11", {"a" * 16: "with VQ-VAE"})
+        tracking.group("table04", {"a" * 16: "full", "b" * 16: "none"})
+        tracking.group("table11", {"a" * 16: "with VQ-VAE"})
     runs = {run.info.run_name: run for run in shown(tmp_path)}
     assert set(runs) == {"a" * 16, "b" * 16, "table04", "table11"}
     shared, other = runs["a" * 16].data.tags, runs["b" * 16].data.tags

@@ -444,7 +444,7 @@ def test_what_a_search_leaves(tmp_path: Path):
     assert {f"loss.{key}": value for key, value in content["loss"].items()} == best.params
     assert path.read_text().startswith("# @package _global_\n")
     shipped = tmp_path / "shipped.yaml"
-    shipped.write_text("reference: b\narms: {a: {overrides: [loss=manual]}, b: []}\n")
+    shipped.write_text("control: b\narms: {a: {overrides: [loss=manual]}, b: []}\n")
     assert results.write_table(study, shipped, tmp_path / "table05.yaml")
     arms = yaml.safe_load((tmp_path / "table05.yaml").read_text())["arms"]
     assert list(arms) == ["manual, searched", "a", "b"]

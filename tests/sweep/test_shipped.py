@@ -150,7 +150,7 @@ def test_the_decomposition_changes_one_ingredient_a_step():
     }
     changed = {}
     for label, arm in arms.items():
-        control = DECOMPOSITION.control(arm)
+        control = DECOMPOSITION.control_of(arm)
         if control and label != "AGRoL-MLP-41":
             one, other = configs[label], configs[control]
             keys = {key for key in one.keys() | other.keys() if one.get(key) != other.get(key)}

@@ -62,7 +62,7 @@ def test_axes_are_a_grid_over_every_arm():
 def test_rows_of_the_paper_alone_are_not_run():
     sweep = parse_sweep("s", {"arms": {"AvatarPoser": {"overrides": None}, "ours": []}})
     assert [job.label for job in sweep.jobs()] == ["ours"]
-    assert sweep.reference == "ours"
+    assert sweep.control == "ours"
 
 
 def test_arms_show_the_sweeps_branch_or_their_own_and_another_where_asked():
@@ -81,13 +81,13 @@ def test_arms_show_the_sweeps_branch_or_their_own_and_another_where_asked():
     assert [arm.branch for arm in grid.arms] == ["position"]
 
 
-def test_an_arm_is_compared_with_the_reference_or_with_its_own_control():
+def test_an_arm_is_compared_with_the_sweeps_control_or_with_its_own_control():
     arms = {"a": [], "b": {"against": "a"}, "c": {"overrides": ["loss=manual"], "against": "b"}, "d": []}
-    sweep = parse_sweep("s", {"arms": arms, "reference": "d"})
-    assert [sweep.control(arm) for arm in sweep.arms] == ["d", "a", "b", None]
+    sweep = parse_sweep("s", {"arms": arms, "control": "d"})
+    assert [sweep.control_of(arm) for arm in sweep.arms] == ["d", "a", "b", None]
     grid = parse_sweep("s", {"arms": arms, "axes": {"model.frames": [11, 21]}})
     assert grid.arms[3].label == "b, model.frames=21"
-    assert grid.control(grid.arms[3]) == "a, model.frames=21"
+    assert grid.control_of(grid.arms[3]) == "a, model.frames=21"
 
 
 def test_every_metric_has_a_smallest_effect_that_a_file_may_set():
@@ -129,7 +129,7 @@ def test_every_metric_has_a_smallest_effect_that_a_file_may_set():
         ({"arms": {"a": {"paper": {"MPJPE": "3"}}}}, "arms.a.paper.MPJPE: '3'; allowed is a number"),
         ({"arms": ARMS, "seeds": [0, 0]}, "seeds: [0, 0]; allowed is a list of whole numbers, each once"),
         ({"arms": ARMS, "seeds": [-1]}, "seeds: [-1]"),
-        ({"arms": ARMS, "reference": "half"}, "reference: 'half' is no arm; allowed are full, none"),
+        ({"arms": ARMS, "control": "half"}, "control: 'half' is no arm; allowed are full, none"),
         ({"arms": ARMS, "metrics": ["FID"]}, "metrics: 'FID'; allowed are MPJRE"),
         ({"arms": ARMS, "table": "four"}, "table: 'four'"),
         ({"arms": ARMS, "axes": {"model.frames": 11}}, "axes.model.frames: allowed is a list of values"),

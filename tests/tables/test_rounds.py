@@ -23,7 +23,7 @@ SWEEP = parse_sweep(
     "mine",
     {
         "seeds": [4, 2],
-        "reference": "full",
+        "control": "full",
         "metrics": ["MPJPE", "FLOPs"],
         "arms": {
             "full": [],

@@ -34,7 +34,7 @@ FILE = {
     "table": 11,
     "notes": ["a note of the file"],
     "seeds": [0, 1, 2],
-    "reference": "full_model",
+    "control": "full_model",
     "metrics": ["MPJRE", "MPJPE", "Jitter", "FLOPs", "ms"],
     "arms": {
         "a system": {"overrides": None, "paper": {"MPJPE": 4.0}},
@@ -286,7 +286,7 @@ def test_missing_runs_are_shown_with_the_command(sweep: Sweep, tmp_path: Path):
     assert "0/3" in FORMATS["md"](table)
 
 
-def test_no_reference_no_differences(sweep: Sweep, tmp_path: Path):
+def test_no_control_no_differences(sweep: Sweep, tmp_path: Path):
     find = fake_sweep(tmp_path, sweep)
     table = table_of(sweep, lambda arm, seed: None if arm.label == "full_model" else find(arm, seed))
     assert table.comparisons == 0
@@ -475,7 +475,7 @@ def test_only_costs_need_one_block(tmp_path: Path):
     assert table.flags == ()
 
 
-def test_costs_show_how_many_times_the_references_they_are(tmp_path: Path):
+def test_costs_show_how_many_times_the_controls_they_are(tmp_path: Path):
     """Of the fake arms' 0.8, 0.88, 0.96 ms, and of the paper's 6.0 and 30.1."""
     sweep = load_sweep(SHIPPED / "table17.yaml")
     text = printed(table_of(sweep, fake_sweep(tmp_path, sweep)), 100)

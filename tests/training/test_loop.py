@@ -38,8 +38,8 @@ def motion_task(rollout: str = "own", optim: Optim = OPTIM, seed: int = 0) -> Mo
     return MotionTask(model, loss, made, tiny.frames(), optim, seed, validate=lambda model: {"answer": 42.0})
 
 
-def reference_task(name: str, optim: Optim = OPTIM, seed: int = 0) -> MotionTask:
-    model, loss = tiny.reference(name, seed=seed), tiny.REFERENCE_LOSSES[name]()
+def baseline_task(name: str, optim: Optim = OPTIM, seed: int = 0) -> MotionTask:
+    model, loss = tiny.baseline(name, seed=seed), tiny.BASELINE_LOSSES[name]()
     return MotionTask(model, loss, TeacherForcing(), tiny.frames(), optim, seed, validate=lambda model: {})
 
 
@@ -55,7 +55,7 @@ def weights(run: Run) -> dict[str, torch.Tensor]:
 
 TASKS = {
     **{name: partial(motion_task, name) for name in ROLLOUTS},
-    **{name: partial(reference_task, name) for name in tiny.REFERENCES},
+    **{name: partial(baseline_task, name) for name in tiny.BASELINES},
     "vqvae": vqvae_task,
 }
 
@@ -68,7 +68,7 @@ def test_the_weighting_of_the_data_decides_which_clips_a_step_sees():
         task = motion_task()
         task = MotionTask(
             task.model, task.loss, TeacherForcing(), task.frames, replace(OPTIM, batch=3000), 0,
-            task.validate, experiment.weighting,
+            task.validate, experiment.training.weighting,
         )  # fmt: skip
         drawn[weighting] = torch.bincount(task.sampler.draw(0)[0], minlength=3) / 3000
     expected = {"frames": torch.tensor([54, 39, 74]) / 167, "clips": torch.ones(3) / 3}
@@ -81,7 +81,7 @@ class Kill(Exception):
     """Stands for a process that ends."""
 
 
-@pytest.mark.parametrize("make", [*ROLLOUTS, *tiny.REFERENCES, "vqvae"])
+@pytest.mark.parametrize("make", [*ROLLOUTS, *tiny.BASELINES, "vqvae"])
 def test_a_resumed_run_is_the_same_run(make, tmp_path):
     """Stopped at step 7 of 12, two steps after the last checkpoint, and gone on by a new process' objects."""
 
@@ -130,7 +130,7 @@ def test_another_seed_is_another_run(tmp_path):
     assert not torch.equal(a["module.model.stem.weight"], b["module.model.stem.weight"])
 
 
-@pytest.mark.parametrize("make", [vqvae_task, motion_task, *(TASKS[name] for name in tiny.REFERENCES)])
+@pytest.mark.parametrize("make", [vqvae_task, motion_task, *(TASKS[name] for name in tiny.BASELINES)])
 def test_it_learns_and_logs(make, tmp_path):
     optim = replace(OPTIM, steps=60, lr=5e-3, final_lr=1e-3, batch=16, validate_every=30)
     run = Run(tmp_path)

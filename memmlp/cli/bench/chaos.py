@@ -24,7 +24,7 @@ from memmlp.common.files import file_digest
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
 
-OVERRIDES = ["profile=tiny", "data.synth.minutes=1", "tracker=none", "threads=1"]
+OVERRIDES = ["profile=tiny", "data.synth.minutes=1", "tracking=none", "threads=1"]
 PAUSES = (0.5, 3.0)  # seconds between kills of a sweep's processes
 LONG_PAUSES = (3.0, 9.0)  # of a search's: one controller, which has to come to its feet in between
 

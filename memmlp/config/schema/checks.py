@@ -69,7 +69,7 @@ def _show(value: Any) -> str:
     return str(list(value)) if OmegaConf.is_list(value) else str(value)
 
 
-SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "tracker")
+SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "tracking")
 
 
 def _check_names(cfg: DictConfig) -> None:

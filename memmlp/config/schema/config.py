@@ -121,22 +121,22 @@ class Export:
 
 
 @dataclass
-class Tracker:
+class Tracking:
     name: str = key(Text())
     _target_: str = MISSING
 
 
 @dataclass
-class MLflowTracker(Tracker):
+class MLflowTracking(Tracking):
     name: str = called("mlflow")
-    _target_: str = target("memmlp.runs.tracking.MLflowTracker")
+    _target_: str = target("memmlp.runs.tracking.MLflowTracking")
     uri: Optional[str] = key()
 
 
 @dataclass
-class NoTracker(Tracker):
+class NoTracking(Tracking):
     name: str = called("none")
-    _target_: str = target("memmlp.runs.tracking.NoTracker")
+    _target_: str = target("memmlp.runs.tracking.NoTracking")
 
 
 @dataclass
@@ -162,7 +162,7 @@ class Config:
     optim: Optim = field(default_factory=Optim)
     evaluation: Evaluation = field(default_factory=Evaluation)
     export: Export = field(default_factory=Export)
-    tracker: Tracker = field(default_factory=Tracker)
+    tracking: Tracking = field(default_factory=Tracking)
 
 
 SCHEMAS: dict[str, type] = {
@@ -201,17 +201,21 @@ SCHEMAS: dict[str, type] = {
     "optim": Optim,
     "evaluation": Evaluation,
     "export": Export,
-    "tracker_mlflow": MLflowTracker,
-    "tracker_none": NoTracker,
+    "tracking_mlflow": MLflowTracking,
+    "tracking_none": NoTracking,
 }
 
 
 GROUPS = {
     "paths": Paths, "profile": Profile, "frame": Frame, "model": Model, "memory": Memory, "vqvae": VQVAE,
     "predictor": Predictor, "rollout": Rollout, "loss": Loss, "hand": Hand, "optim": Optim,
-    "evaluation": Evaluation, "export": Export, "tracker": Tracker,
+    "evaluation": Evaluation, "export": Export, "tracking": Tracking,
 }  # fmt: skip
 DATA = {"seeded": SeededData, "lists": ListData, "subsets": SubsetData}
+
+
+RENAMED = {"tracker": "tracking"}
+"""Groups that runs of version 0.1 know by other names."""
 
 
 def restored(config: Mapping[str, Any]) -> DictConfig:
@@ -220,7 +224,7 @@ def restored(config: Mapping[str, Any]) -> DictConfig:
     Raises OmegaConf's errors, or KeyError, where it is none of this version's.
     """
     cfg = OmegaConf.structured(Config)
-    for group, content in config.items():
+    for group, content in ((RENAMED.get(name, name), content) for name, content in config.items()):
         cfg[group] = _restored(group, content) if isinstance(content, Mapping) else content
     return cfg
 
