@@ -22,7 +22,7 @@ from memmlp.deploy.quantization import accuracy, compared, quantise
 from memmlp.deploy.session import OnnxStream
 from memmlp.motion.coordinates import Heading
 from memmlp.networks.memory import CodeMemory
-from memmlp.networks.streaming import streaming
+from memmlp.networks.streaming import StreamingGraph, streaming
 from memmlp.networks.window_model import WindowModel
 from memmlp.runs.deployed import Deployed
 from memmlp.runs.lookup import list_runs
@@ -156,8 +156,8 @@ def test_the_naive_graph_by_switch(tmp_path):
     """No run: what a config's deployment writes."""
     shipped = {}
     for graph in ("naive", "auto"):
-        shipped = Deployed(tmp_path / graph)
-        shipped[graph] = Deployment(1, graph).ship(tiny.model(), shipped, "0" * 16, CLIPS, CLIPS)
+        place = Deployed(tmp_path / graph)
+        shipped[graph] = Deployment(1, graph).ship(tiny.model(), place, "0" * 16, CLIPS, CLIPS)
     assert [record["graph"] for record in shipped.values()] == ["naive", "streaming"]
     assert shipped["naive"]["step_macs"] == shipped["naive"]["macs"] == shipped["auto"]["macs"]
     assert build_experiment(composed(["export.graph=naive"])).deployment.graph == "naive"

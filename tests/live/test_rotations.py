@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
-from memmlp.live.rotations import Skeleton, sixd_to_matrix, slerp, turned_by
+from memmlp.live.rotations import BodyTree, sixd_to_matrix, slerp, turned_by
 from memmlp.motion import geometry
 from memmlp.motion.body import HEAD, JOINTS, PARENTS, builtin_rest_joints
 
@@ -25,7 +25,7 @@ def test_forward_kinematics_are_those_of_torch():
     _, expected = geometry.forward_kinematics(
         torch.tensor(LOCAL), torch.zeros(3).double(), torch.tensor(rest)
     )
-    found = Skeleton(JOINTS, PARENTS, rest).positions(LOCAL)
+    found = BodyTree(JOINTS, PARENTS, rest).positions(LOCAL)
     np.testing.assert_allclose(found, (expected - expected[HEAD]).numpy(), atol=2e-6)
 
 

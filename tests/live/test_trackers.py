@@ -7,7 +7,7 @@ import pytest
 import tiny
 import wearer
 
-from memmlp.live.rotations import Skeleton
+from memmlp.live.rotations import BodyTree
 from memmlp.live.trackers import (
     NOBODY,
     Features,
@@ -20,7 +20,7 @@ from memmlp.live.trackers import (
 )
 from memmlp.motion.body import JOINTS, PARENTS, SPARSE_DIM
 
-SKELETON = Skeleton(JOINTS, PARENTS, tiny.REST.numpy())
+SKELETON = BodyTree(JOINTS, PARENTS, tiny.REST.numpy())
 TIMES = np.arange(240) / 60
 PERSON = wearer.person(TIMES)
 SAMPLES = [Tracked(*sample) for sample in zip(TIMES, PERSON.positions, PERSON.rotations, strict=True)]
