@@ -35,7 +35,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 # Begun first, so that no process is left alone with one of them at the end.
 LONGEST = (
     "test_axes", "networks/test_baselines", "cli/test_tune", "kills/test_search", "kills/test_sweep",
-    "cli/test_sweep", "live/test_full", "pipeline/test_pipeline", "deploy/test_deployment",
+    "cli/test_sweep", "live/test_full_graph", "pipeline/test_pipeline", "deploy/test_deployment",
     "live/test_stream", "kills/test_command", "kills/test_training",
 )  # fmt: skip
 

@@ -44,7 +44,6 @@ from memmlp.networks.streaming import streaming
 from memmlp.networks.vqvae import VQVAE
 from memmlp.networks.window_model import WindowModel
 from memmlp.runs.recipes import RECIPES
-from memmlp.training.codes import VQVAETask
 from memmlp.training.loop import seed_step, train_step
 from memmlp.training.losses import (
     AGRoLLoss,
@@ -62,6 +61,7 @@ from memmlp.training.losses import (
 from memmlp.training.network import MotionTask
 from memmlp.training.optim import Optim, vqvae_optim
 from memmlp.training.rollout import OwnPredictions, PersistentStreams, Rollout, TeacherForcing
+from memmlp.training.vqvae import VQVAETask
 
 PATH = Path(__file__).with_name("golden.json")
 BOTH = frozenset({"rotation", "position"})

@@ -20,7 +20,7 @@ from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.pipeline.experiment import Experiment
-from memmlp.pipeline.run import codes_run
+from memmlp.pipeline.run import vqvae_run
 from memmlp.runs.run import Run
 
 TINY = [
@@ -106,7 +106,7 @@ def trained(overrides: list[str]) -> Arm:
 def train_and_stream(overrides: list[str]) -> Arm:
     experiment = build_experiment(composed(overrides))
     data = experiment.data.prepare()
-    codes = codes_run(experiment, data).model if experiment.architecture.uses_codes else None
+    codes = vqvae_run(experiment, data).model if experiment.architecture.uses_codes else None
     run = Run(Path("variants") / str(len(ARMS)))
     run.folder.mkdir(parents=True)
     model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)
@@ -294,4 +294,4 @@ def test_a_joint_vqvae_is_part_of_the_runs_identity_and_its_own_stage_is_not():
     base = identity()
     assert all(identity(change) != base for change in ("vqvae.codes=32", "vqvae.encoder_depth=2"))
     assert all(identity(change) == base for change in ("vqvae.steps=7", "vqvae.lr=0.5", "tracking=none"))
-    assert experiment_of().codes_identity("data") is None
+    assert experiment_of().vqvae_identity("data") is None

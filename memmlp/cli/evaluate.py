@@ -35,11 +35,11 @@ def evaluate(
 
     from memmlp.cli.outcome import metrics_table
     from memmlp.common.files import write_json
-    from memmlp.config.opened import opened
+    from memmlp.config.open_run import open_run
     from memmlp.evaluation.predictions import save_predictions as write_predictions
     from memmlp.pipeline.run import clip_rows, finished
 
-    found = opened(outputs, run, device, overrides)
+    found = open_run(outputs, run, device, overrides)
     experiment = found.experiment
     results, made = finished(experiment, found.run, found.data, again=again)
     said = f"{' and '.join(made)} done" if made else "measured before"

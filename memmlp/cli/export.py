@@ -76,7 +76,7 @@ def export(
     from memmlp.deploy.deployment import GRAPHS
     from memmlp.deploy.export import export as export_network
     from memmlp.deploy.parity import TOLERANCE, parity
-    from memmlp.live.full import export_full, full_parity
+    from memmlp.live.full_graph import export_full, full_parity
     from memmlp.networks.streaming import StreamingGraph
     from memmlp.runs.lookup import find_run
 

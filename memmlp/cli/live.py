@@ -108,9 +108,9 @@ def clip_of(network: str, clip: str | None, outputs: Path) -> TrackedClip:
         raise InputError(
             f"{network}: has no test clips; allowed with it are --clip FILE.npz, --udp and --osc"
         )
-    from memmlp.config.opened import clip_index, opened
+    from memmlp.config.open_run import clip_index, open_run
 
-    test = opened(outputs, network).test
+    test = open_run(outputs, network).test
     index = 0 if clip is None else clip_index(test, clip)
     return TrackedClip(test.names[index], test.clip(index).numpy())
 

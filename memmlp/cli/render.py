@@ -12,7 +12,7 @@ from memmlp.cli.options import Finite, outputs_option
 if TYPE_CHECKING:
     import numpy as np
 
-    from memmlp.config.opened import Opened
+    from memmlp.config.open_run import OpenedRun
     from memmlp.render.take import Take
 
 SUFFIXES = (".png", ".gif", ".mp4")
@@ -58,7 +58,7 @@ def render(
     pictures a second. One colour scale holds for all.
     """
     from memmlp.common.errors import InputError
-    from memmlp.config.opened import opened
+    from memmlp.config.open_run import open_run
     from memmlp.render.figure import heatmap_png
     from memmlp.render.film import film, pyav
 
@@ -66,7 +66,7 @@ def render(
     kind = out.suffix.lower()
     if kind == ".mp4":
         pyav()
-    take = taken([opened(outputs, run) for run in runs], labels, clip, (begin, end), branch, mode)
+    take = taken([open_run(outputs, run) for run in runs], labels, clip, (begin, end), branch, mode)
     try:
         if kind == ".png":
             heatmap_png(out, take, frames)
@@ -91,7 +91,7 @@ def check(out: Path, runs: tuple[str, ...], labels: tuple[str, ...]) -> None:
 
 
 def taken(
-    runs: list[Opened],
+    runs: list[OpenedRun],
     labels: tuple[str, ...],
     clip: str | None,
     times: tuple[float, float | None],
@@ -102,7 +102,7 @@ def taken(
     import numpy as np
 
     from memmlp.common.errors import InputError
-    from memmlp.config.opened import clip_of
+    from memmlp.config.open_run import clip_of
     from memmlp.render.take import Take
 
     names = labels or tuple(run.run.id[:8] for run in runs)
@@ -122,9 +122,9 @@ def taken(
     return Take(title, truths[0], predictions, start=first)
 
 
-def predicted(run: Opened, clip: str, last: int, branch: str, mode: str) -> tuple[np.ndarray, np.ndarray]:
+def predicted(run: OpenedRun, clip: str, last: int, branch: str, mode: str) -> tuple[np.ndarray, np.ndarray]:
     """Truth and prediction (last, 22, 3) of a test clip's frames up to `last`, metres, world."""
-    from memmlp.config.opened import clip_of
+    from memmlp.config.open_run import clip_of
     from memmlp.evaluation import modes as evaluation
     from memmlp.motion.body import SPARSE_DIM
 

@@ -50,7 +50,7 @@ def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | N
     from memmlp.report.store import Kept, load_kept, overrides_of, save, without_paths
     from memmlp.tables.collect import finished
     from memmlp.tables.measured import load
-    from memmlp.tables.planned import finder
+    from memmlp.tables.planned_runs import finder
     from memmlp.tables.rounds import as_json
 
     sweep = find_sweep(name).with_overrides(overrides)

@@ -101,7 +101,7 @@ def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
     from memmlp.common.files import write_json
     from memmlp.tables.collect import finished
     from memmlp.tables.measured import load
-    from memmlp.tables.planned import finder
+    from memmlp.tables.planned_runs import finder
     from memmlp.tables.rounds import advanced, as_json
 
     path = record(sweep, outputs)

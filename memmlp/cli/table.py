@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from memmlp.cli.rounds import Shown
     from memmlp.sweep.spec import Sweep
     from memmlp.tables.effects import Runs
-    from memmlp.tables.planned import Read
-    from memmlp.tables.planning import Need
+    from memmlp.tables.planned_runs import Read
+    from memmlp.tables.seeds_needed import Need
     from memmlp.tables.table import Table
 
 MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", "window")}
@@ -127,7 +127,7 @@ def gathered(
 def of_plan(shown: Shown, modes: Sequence[str], command: str, read: Read) -> Found:
     """A planned sweep's finished runs and table."""
     from memmlp.tables.collect import collect, finished
-    from memmlp.tables.planned import finder, older, states
+    from memmlp.tables.planned_runs import finder, older, states
 
     sweep, plan, rounds, flags = shown
     runs = finished(sweep, finder(plan, read))
@@ -153,7 +153,7 @@ def on_screen(tables: Sequence[Table]) -> None:
     """Show tables as wide as the screen."""
     from rich.console import Console
 
-    from memmlp.tables.render import show
+    from memmlp.tables.formats import show
 
     console = Console(highlight=False, markup=False)
     for one in tables:
@@ -163,7 +163,7 @@ def on_screen(tables: Sequence[Table]) -> None:
 def plans_on_screen(found: Sequence[Found], modes: Sequence[str]) -> None:
     """Show how many seeds the paper's effects need, sweep by sweep."""
     from memmlp.tables.grid import caption
-    from memmlp.tables.planning import needs
+    from memmlp.tables.seeds_needed import needs
 
     for one in found:
         wanted = needs(one.sweep, one.runs, modes)
@@ -199,7 +199,7 @@ def _needed(wanted: Sequence[Need]) -> str:
 
 def _formatted(tables: Sequence[Table], form: str, alone: bool) -> str:
     """The tables' text; of JSON one object, or a list for `all`."""
-    from memmlp.tables.render import FORMATS
+    from memmlp.tables.formats import FORMATS
 
     texts = [FORMATS[form](one) for one in tables]
     if form == "json" and not alone:
@@ -209,7 +209,7 @@ def _formatted(tables: Sequence[Table], form: str, alone: bool) -> str:
 
 def _form_of(out: Path | None) -> str:
     """The format that a file's ending tells."""
-    from memmlp.tables.render import FORMATS
+    from memmlp.tables.formats import FORMATS
 
     ending = out.suffix.removeprefix(".") if out else ""
     if ending not in FORMATS:

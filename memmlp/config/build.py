@@ -21,8 +21,8 @@ from memmlp.config.compose import composed
 from memmlp.config.motion import build_motion
 from memmlp.config.schema import check, restored
 from memmlp.deploy.deployment import Deployment
+from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK, LBFGS, NoIK
-from memmlp.evaluation.stage import Evaluation
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
@@ -39,10 +39,10 @@ from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.identity import flatten
 from memmlp.runs.run import Run
 from memmlp.runs.tracking import Tracking
-from memmlp.training.codes import CodesTraining
 from memmlp.training.losses import Loss, MotionLoss
 from memmlp.training.network import NetworkTraining
 from memmlp.training.optim import Optim, vqvae_optim
+from memmlp.training.vqvae import VQVAETraining
 
 COORDINATES: dict[str, type[World]] = {"head_relative": HeadRelative, "world": World, "heading": Heading}
 
@@ -58,7 +58,7 @@ def build_experiment(cfg: DictConfig) -> Experiment:
         force=cfg.force,
         data=build_motion(cfg),
         architecture=build_architecture(cfg),
-        codes=CodesTraining(
+        vqvae=VQVAETraining(
             config={"frame": config["frame"], "vqvae": config["vqvae"]},
             seed=cfg.vqvae.seed,
             optim=partial(build_vqvae_optim, cfg),

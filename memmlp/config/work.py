@@ -34,14 +34,14 @@ def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
     from omegaconf import OmegaConf
 
     from memmlp.config.build import build_experiment
-    from memmlp.pipeline.run import codes_run, run
+    from memmlp.pipeline.run import run, vqvae_run
 
     experiment = build_experiment(OmegaConf.create(dict(task.config)))
     check_identity(experiment, task)
     if chosen := experiment.config["threads"] or threads:
         torch.set_num_threads(chosen)
     if task.kind == "vqvae":
-        codes_run(experiment, experiment.data.prepare())
+        vqvae_run(experiment, experiment.data.prepare())
     else:
         run(experiment, partial(check_wanted, path, task.id))
 

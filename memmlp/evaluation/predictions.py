@@ -8,8 +8,8 @@ import numpy as np
 from torch import Tensor
 
 from memmlp.evaluation import modes
+from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK
-from memmlp.evaluation.stage import Evaluation
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.normalizer import Normalizer

@@ -51,7 +51,7 @@ def read_clip(path: Path, name: str) -> Clip:
     """
     try:
         # opened here, for np.load leaves a file that is no zip open
-        with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
+        with open(path, "rb") as open_run, np.load(open_run, allow_pickle=False) as file:
             missing = {"poses", "trans"} - set(file.files)
             rate_key = next((key for key in FRAME_RATE_KEYS if key in file.files), None)
             if missing or rate_key is None:

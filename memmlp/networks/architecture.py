@@ -57,7 +57,7 @@ class Architecture:
             return Normalizer.fit(self.coordinates, rest, frames)
         return Normalizer.raw(self.coordinates, rest)
 
-    def load_codes(self, weights: Path) -> VQVAE:
+    def load_vqvae(self, weights: Path) -> VQVAE:
         """The trained VQ-VAE of a file of weights."""
         model = self.vqvae()
         checkpoint.load_module("model", model, checkpoint.read(weights)[0])

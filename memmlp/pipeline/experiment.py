@@ -9,13 +9,13 @@ from typing import Any
 import torch
 
 from memmlp.deploy.deployment import Deployment
-from memmlp.evaluation.stage import Evaluation
+from memmlp.evaluation.evaluation import Evaluation
 from memmlp.motion.source import MotionSource
 from memmlp.networks.architecture import VQVAE_SETTINGS, Architecture
 from memmlp.runs.identity import Identity, deployment_id, evaluation_id
 from memmlp.runs.tracking import Tracking
-from memmlp.training.codes import CodesTraining
 from memmlp.training.network import NetworkTraining
+from memmlp.training.vqvae import VQVAETraining
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Experiment:
         outputs: folder of runs and caches. device: of training and evaluation.
         force: whether a run that was made is made again.
         data: the motion. architecture: builds the networks.
-        codes, training, evaluation, deployment: how the stages are done.
+        vqvae, training, evaluation, deployment: how the stages are done.
         predictions: folder for the test clips' predictions, where they are wanted.
         tracking: shows finished runs elsewhere.
     """
@@ -37,7 +37,7 @@ class Experiment:
     force: bool
     data: MotionSource
     architecture: Architecture
-    codes: CodesTraining
+    vqvae: VQVAETraining
     training: NetworkTraining
     evaluation: Evaluation
     deployment: Deployment
@@ -59,9 +59,9 @@ class Experiment:
         """The identities of all that is made of the trained network."""
         return (*self.evaluations.values(), self.deployed)
 
-    def codes_identity(self, data: str) -> Identity | None:
+    def vqvae_identity(self, data: str) -> Identity | None:
         """The identity of the VQ-VAE's run on data of that digest, where the network uses a frozen one."""
-        return Identity("vqvae", self.codes.config, data) if self.architecture.uses_codes else None
+        return Identity("vqvae", self.vqvae.config, data) if self.architecture.uses_codes else None
 
     def identity(self, data: str) -> Identity:
         """The identity of the network's run on data of that digest."""
@@ -69,4 +69,4 @@ class Experiment:
         own = {key: value for key, value in self.config.items() if key != "vqvae"}
         if self.architecture.trains_codes:
             own["vqvae"] = {key: self.config["vqvae"][key] for key in VQVAE_SETTINGS}
-        return Identity("memmlp", own, data, self.codes_identity(data))
+        return Identity("memmlp", own, data, self.vqvae_identity(data))

@@ -15,12 +15,12 @@ from typing import Any
 import torch
 
 from memmlp.common.files import read_json, write_json
+from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
-from memmlp.evaluation.stage import picture
 from memmlp.motion.source import Prepared
 from memmlp.pipeline.experiment import Experiment
+from memmlp.runs.evaluated import write_report
 from memmlp.runs.identity import Identity, deployment_settings, evaluation_settings
-from memmlp.runs.reports import write_report
 from memmlp.runs.run import Run
 from memmlp.runs.tracking import project_safely
 from memmlp.training.loop import Watch, unwatched
@@ -46,7 +46,7 @@ def run(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     `watch` is called after each validation with the step and its values, and may raise to stop the run.
     """
     data = experiment.data.prepare()
-    codes = codes_run(experiment, data) if experiment.architecture.uses_codes else None
+    codes = vqvae_run(experiment, data) if experiment.architecture.uses_codes else None
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     with run.lock():
         if experiment.force:
@@ -113,17 +113,17 @@ def clip_rows(experiment: Experiment, run: Run) -> list[dict[str, Any]]:
     return list(rows.values())
 
 
-def codes_run(experiment: Experiment, data: Prepared) -> Run:
+def vqvae_run(experiment: Experiment, data: Prepared) -> Run:
     """The finished run of the VQ-VAE that the network uses, trained where it is missing."""
-    identity = experiment.codes_identity(data.digest)
+    identity = experiment.vqvae_identity(data.digest)
     assert identity is not None
     run = Run.of(experiment.outputs, identity.id)
     with run.lock():
         if run.done:
             return run
-        begin(experiment, run, identity, experiment.codes.config)
+        begin(experiment, run, identity, experiment.vqvae.config)
         with timed(run, "train"):
-            errors = experiment.codes.train(experiment.architecture, data, run, experiment.device)
+            errors = experiment.vqvae.train(experiment.architecture, data, run, experiment.device)
         write_json(run.results_path, {"val": errors})
         run.finish(("model.safetensors", "results.json"))
     project_safely(experiment.tracking, run)

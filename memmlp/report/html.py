@@ -17,9 +17,9 @@ from memmlp.runs.log import Metrics
 from memmlp.sweep.spec import COSTS, Sweep
 from memmlp.tables.distributions import Distribution, distributions
 from memmlp.tables.effects import Runs
+from memmlp.tables.formats import as_html
 from memmlp.tables.grid import caption
 from memmlp.tables.measured import Measured
-from memmlp.tables.render import as_html
 from memmlp.tables.table import Table
 
 ERROR = "MPJRE"  # of Fig. 1, as Sec. 4.3 has it

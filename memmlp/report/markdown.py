@@ -10,9 +10,9 @@ from jinja2 import Environment, StrictUndefined, TemplateError
 from memmlp.common.errors import InputError
 from memmlp.report.claims import claims
 from memmlp.report.store import Kept
+from memmlp.tables.formats import escaped, markdown
 from memmlp.tables.grid import MINUS, caption, effect_words, number_words, unit, value_words
 from memmlp.tables.measured import UNKNOWN, Measured
-from memmlp.tables.render import escaped, markdown
 from memmlp.tables.table import Cell, Row, Table
 
 MARK = "<!-- made by: memmlp results docs -->"

@@ -19,11 +19,11 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, file_digest, now, read_json, sync_folder, write_json
 from memmlp.runs.deployed import Deployed
 from memmlp.runs.environment import changes, environment, host, sources
+from memmlp.runs.evaluated import intact
 from memmlp.runs.identity import used_as_configured
 from memmlp.runs.lock import Lock
 from memmlp.runs.log import Metrics, MetricsLog
 from memmlp.runs.origin import joined
-from memmlp.runs.reports import intact
 
 
 class Run:

@@ -12,8 +12,8 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
+from memmlp.runs.evaluated import intact
 from memmlp.runs.identity import used_as_configured
-from memmlp.runs.reports import intact
 from memmlp.runs.run import Run
 
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # mode -> branch -> metric -> value

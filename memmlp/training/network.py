@@ -58,7 +58,7 @@ class NetworkTraining:
         """
         frames = data.open("train").to(device)
         torch.manual_seed(self.seed)
-        frozen = architecture.load_codes(codes) if codes else None
+        frozen = architecture.load_vqvae(codes) if codes else None
         model = architecture.build(architecture.normalizer(data.manifest, frames.frames), frozen).to(device)
         self.rollout.begin(model)
         pieces = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)

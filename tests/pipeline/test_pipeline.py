@@ -19,7 +19,7 @@ from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.config.shipped import shipped
 from memmlp.motion.dataset import MotionDataset
-from memmlp.pipeline.run import codes_run
+from memmlp.pipeline.run import vqvae_run
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
 
@@ -176,7 +176,7 @@ def test_every_experiment_trains_and_streams(home, name):
     cfg = composed([f"experiment={name}", *TINY, "optim.steps=2"])
     experiment = build_experiment(cfg)
     data = experiment.data.prepare()
-    codes = codes_run(experiment, data).model if experiment.architecture.uses_codes else None
+    codes = vqvae_run(experiment, data).model if experiment.architecture.uses_codes else None
     run = Run(home / "variants" / name)
     run.folder.mkdir(parents=True, exist_ok=True)
     model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)

@@ -21,7 +21,7 @@ from memmlp.deploy.deployment import GRAPHS
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline.experiment import Experiment
-from memmlp.pipeline.run import codes_run
+from memmlp.pipeline.run import vqvae_run
 from memmlp.runs.identity import NEUTRAL, Identity, deployment_id, evaluation_id, flatten
 from memmlp.runs.run import Run
 
@@ -116,7 +116,7 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
     experiment = replace(build_experiment(composed([*BASE, *overrides])), outputs=folder)
     data = experiment.data.prepare()
     identity = experiment.identity(data.digest)
-    codes = codes_run(replace(experiment, tracking=Silent()), data).model
+    codes = vqvae_run(replace(experiment, tracking=Silent()), data).model
     run = Run(folder / "run")
     run.folder.mkdir(parents=True)
     model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)

@@ -16,9 +16,9 @@ import memmlp.runs.recipes
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, write_json
 from memmlp.runs.environment import environment
+from memmlp.runs.evaluated import intact, write_report
 from memmlp.runs.identity import NEUTRAL, Identity, deployment_id, evaluation_id, flatten, run_id
 from memmlp.runs.lookup import diff, find_run, list_runs
-from memmlp.runs.reports import intact, write_report
 from memmlp.runs.run import Run
 
 CONFIG = {"seed": 0, "model": {"width": 16, "layers": [2, 4]}, "optim": {"lr": 1e-3, "log_every": 5}}

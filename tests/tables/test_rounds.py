@@ -13,8 +13,8 @@ from memmlp.statistics import Verdict
 from memmlp.sweep.spec import Sweep, parse_sweep
 from memmlp.tables.collect import collect
 from memmlp.tables.effects import Runs
+from memmlp.tables.formats import markdown
 from memmlp.tables.measured import Measured, Origin
-from memmlp.tables.render import markdown
 from memmlp.tables.rounds import Rounds, advanced, as_json, begin, of_json, outlook
 
 ORIGIN = Origin("c", False, "d", "cpu")

@@ -17,15 +17,15 @@ from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, runs_of, table_of
 from rich.console import Console
 
 from memmlp.common.errors import InputError
-from memmlp.runs.reports import write_report
+from memmlp.runs.evaluated import write_report
 from memmlp.runs.run import Run
 from memmlp.statistics import Verdict, holm, paired_effects
 from memmlp.sweep.spec import Sweep, load_sweep, parse_sweep
 from memmlp.tables.collect import collect, without_runs
+from memmlp.tables.formats import FORMATS, show
 from memmlp.tables.grid import heading
 from memmlp.tables.measured import load
-from memmlp.tables.planning import needs
-from memmlp.tables.render import FORMATS, show
+from memmlp.tables.seeds_needed import needs
 from memmlp.tables.table import Effect, Table
 
 SHIPPED = Path(__file__).parent.parent.parent / "sweeps"
@@ -562,19 +562,19 @@ def test_json_has_the_values_of_each_seed(table: Table):
 def test_collect_reads_each_run_once(sweep: Sweep, tmp_path: Path):
     """The work is linear in the runs: one reading a run, though each is in many comparisons."""
     many = parse_sweep("many", {"axes": {"optim.lr": list(range(1, 41))}, "seeds": [0, 1]})
-    find, opened = fake_sweep(tmp_path, many), []
+    find, open_run = fake_sweep(tmp_path, many), []
 
     def counted(folder: Path):
-        opened.append(folder)
+        open_run.append(folder)
         return load(folder)
 
     runs_of(many, find, functools.cache(counted))
-    assert len(opened) == len(set(opened)) == 80
+    assert len(open_run) == len(set(open_run)) == 80
 
 
 def test_tables_need_no_torch():
     """Nor scipy.stats or matplotlib: together seconds to import, more than two thousand runs take."""
-    code = "import sys, memmlp.cli.table, memmlp.tables.render as r; print(*sys.modules)"
+    code = "import sys, memmlp.cli.table, memmlp.tables.formats as r; print(*sys.modules)"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"torch", "scipy.stats", "matplotlib", "hydra"} & set(ran.stdout.split())
 

@@ -15,12 +15,12 @@ from memmlp.motion.dataset import WindowSampler
 from memmlp.networks import checkpoint
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.run import Run
-from memmlp.training.codes import VQVAETask, perplexity
 from memmlp.training.loop import train
 from memmlp.training.losses import HandPosition, MotionLoss, Uncertainty
 from memmlp.training.network import MotionTask
 from memmlp.training.optim import SCHEDULES, Optim
 from memmlp.training.rollout import OwnPredictions, PersistentStreams, TeacherForcing
+from memmlp.training.vqvae import VQVAETask, perplexity
 
 OPTIM = Optim(steps=12, batch=4, lr=1e-3, final_lr=1e-4, schedule="cosine", checkpoint_every=5, log_every=4)
 ROLLOUTS = {

@@ -162,7 +162,7 @@ def _synthetic() -> MotionDataset:
 
 def _motion(frames: MotionDataset) -> TrackedMotion:
     """All clips one after the other, as trackers and truth."""
-    from memmlp.live.full import trackers_of
+    from memmlp.live.full_graph import trackers_of
     from memmlp.live.soak import TrackedMotion
     from memmlp.motion.body import N_JOINTS, POSITION, SPARSE_DIM
 

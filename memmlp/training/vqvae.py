@@ -21,7 +21,7 @@ from memmlp.training.optim import Optim
 
 
 @dataclass(frozen=True)
-class CodesTraining:
+class VQVAETraining:
     """How a VQ-VAE is trained.
 
     Attributes:

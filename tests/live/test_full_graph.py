@@ -16,7 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.deploy.export import export
 from memmlp.deploy.parity import TOLERANCE
 from memmlp.deploy.session import OnnxStream
-from memmlp.live.full import export_full, full_parity, trackers_of
+from memmlp.live.full_graph import export_full, full_parity, trackers_of
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
 from memmlp.motion.body import SPARSE_DIM

@@ -19,7 +19,7 @@ from memmlp.runs.lookup import find_run
 from memmlp.runs.run import Run
 
 
-class Opened(NamedTuple):
+class OpenedRun(NamedTuple):
     """A finished run, what it was built of, and its prepared data."""
 
     run: Run
@@ -32,7 +32,7 @@ class Opened(NamedTuple):
         return self.data.open("test").to(self.experiment.device)
 
 
-def opened(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequence[str] = ()) -> Opened:
+def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequence[str] = ()) -> OpenedRun:
     """The finished run of an id, of the beginning of one, or of a folder.
 
     Args:
@@ -51,7 +51,7 @@ def opened(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequen
     if data.digest != run.manifest["data"]:
         root = experiment.data.source.root
         raise InputError(f"run {run.id}: its data has changed since (data.root={root})")
-    return Opened(run, experiment, data)
+    return OpenedRun(run, experiment, data)
 
 
 def clip_of(test: MotionDataset, name: str) -> Tensor:
