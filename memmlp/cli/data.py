@@ -58,7 +58,7 @@ def import_(
     report = import_folder(source, out, skeleton=skeleton, fps=rates, body=body, strict=strict)
     for note in report.notes:
         click.echo(f"note: {note}")
-    _show_skipped([f"{file.source}: {file.reason}" for file in report.skipped])
+    _show_skipped([f"{file.file}: {file.reason}" for file in report.skipped])
     minutes = sum(clip.frames / clip.fps for clip in report.clips) / 60
     maps = ", ".join(sorted({clip.skeleton for clip in report.clips}))
     click.echo(f"{len(report.clips)} clips, {minutes:.1f} minutes, skeleton {maps}, in {out}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +13,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from memmlp.networks.streaming import StreamingGraph
+    from memmlp.networks.window_model import WindowModel
 
 
 @click.command("export")
@@ -66,17 +66,9 @@ def export(
     outputs: Path,
 ) -> None:
     """Export a finished run (id, its beginning, or folder) as ONNX and check it on whole test clips."""
-    import tempfile
-    from functools import partial
-
-    import numpy as np
-
     from memmlp.common.errors import InputError
     from memmlp.config.build import build_experiment, config_of
     from memmlp.deploy.deployment import GRAPHS
-    from memmlp.deploy.export import export as export_network
-    from memmlp.deploy.parity import TOLERANCE, parity
-    from memmlp.live.full_graph import export_full, full_parity
     from memmlp.networks.streaming import StreamingGraph
     from memmlp.runs.lookup import find_run
 
@@ -87,29 +79,56 @@ def export(
         raise InputError(
             f"--space {space}: the network itself knows AMASS' world alone; allowed with --scope full"
         )
-    write: Callable[..., None] = export_network
-    check: Callable[..., float] = parity
-    if scope == "full":
-        write, check = (
-            partial(export_full, space=space or "amass"),
-            partial(full_parity, space=space or "amass"),
-        )
     experiment = build_experiment(config_of(found))
     data = experiment.data.prepare()
     model = experiment.architecture.load(found.model)
     network = GRAPHS[graph](model)
     test = data.open("test").clips()
-    if precision == "int8":
-        if scope == "full" or not isinstance(network, StreamingGraph):
-            raise InputError("--precision int8: allowed with --scope network and a streaming graph")
+    if precision == "fp32":
+        write_exact(
+            model,
+            network,
+            out,
+            found.id,
+            test[: clips or None],
+            full=space or "amass" if scope == "full" else None,
+        )
+    elif scope == "network" and isinstance(network, StreamingGraph):
         write_int8(network, out, found.id, data.open("train").clips(), test, max_growth / 100)
-        return
-    checked = test[: clips or None]
+    else:
+        raise InputError("--precision int8: allowed with --scope network and a streaming graph")
+
+
+def write_exact(
+    model: WindowModel,
+    network: WindowModel | StreamingGraph,
+    out: Path,
+    run_id: str,
+    clips: list[Tensor],
+    full: str | None,
+) -> None:
+    """Write the network's float32 file if it computes on all clips (N, 252) what the trained model does.
+
+    full: the space of the poses, where the file is to have all of the way from trackers to joints.
+    """
+    import tempfile
+
+    import numpy as np
+
+    from memmlp.deploy.export import export as export_network
+    from memmlp.deploy.parity import TOLERANCE, parity
+    from memmlp.live.full_graph import export_full, full_parity
+
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         path = Path(folder) / "step.onnx"
-        write(network, path, found.id)
-        worst = float(np.max([check(model, path, clip) for clip in checked]))  # NaN, if one is
-        said = f"differs from torch by {worst:.1e} at most on {len(checked)} test clips"
+        if full:
+            export_full(network, path, run_id, full)
+            apart = [full_parity(model, path, clip, full) for clip in clips]
+        else:
+            export_network(network, path, run_id)
+            apart = [parity(model, path, clip) for clip in clips]
+        worst = float(np.max(apart))  # NaN, if one is
+        said = f"differs from torch by {worst:.1e} at most on {len(clips)} test clips"
         if not worst <= TOLERANCE:
             raise click.ClickException(f"{said}, more than {TOLERANCE:.0e}: not written")
         path.replace(out)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
@@ -65,53 +65,60 @@ def live(
         raise InputError("--send: has no port; allowed is --udp PORT or --osc PORT")
     if osc is not None:
         needs_osc()
+    feed = Feed(network, clip, udp, osc, space, hz, outputs)
     with contextlib.suppress(KeyboardInterrupt):
         if send:
-            sent(clip_source(network, clip, hz, outputs, rounds=1), udp, osc, space)
+            sent(feed)
         else:
-            watched(
-                network, source_of(network, clip, udp, osc, space, hz, outputs), port, no_browser, outputs
-            )
+            watched(feed, port, no_browser)
 
 
-def source_of(
-    network: str, clip: str | None, udp: int | None, osc: int | None, space: str, hz: float, outputs: Path
-) -> PoseSource:
-    """The source that the options name."""
+class Feed(NamedTuple):
+    """What the options name: a network, and the poses that it is fed with."""
+
+    network: str
+    clip: str | None
+    udp: int | None
+    osc: int | None
+    space: str
+    hz: float
+    outputs: Path
+
+
+def source_of(feed: Feed) -> PoseSource:
+    """The source of the poses: packets at a port, or a clip over and over."""
     from memmlp.live.player.packets import from_json, from_osc
     from memmlp.live.player.sources import PacketSource
 
-    if udp is not None:
-        return PacketSource("UDP", udp, from_json, space)
-    if osc is not None:
-        return PacketSource("OSC", osc, from_osc, space)
-    return clip_source(network, clip, hz, outputs)
+    if feed.udp is not None:
+        return PacketSource("UDP", feed.udp, from_json, feed.space)
+    if feed.osc is not None:
+        return PacketSource("OSC", feed.osc, from_osc, feed.space)
+    return clip_source(feed)
 
 
-def clip_source(
-    network: str, clip: str | None, hz: float, outputs: Path, rounds: float = float("inf")
-) -> ClipSource:
-    """A clip at a rate."""
+def clip_source(feed: Feed, rounds: float = float("inf")) -> ClipSource:
+    """The clip at its rate, so many times."""
     from memmlp.live.player.sources import ClipSource
 
-    return ClipSource(clip_of(network, clip, outputs), hz, rounds)
+    return ClipSource(clip_of(feed), feed.hz, rounds)
 
 
-def clip_of(network: str, clip: str | None, outputs: Path) -> TrackedClip:
+def clip_of(feed: Feed) -> TrackedClip:
     """A test clip of a run, or an AMASS npz on the built-in body."""
     from memmlp.common.errors import InputError
     from memmlp.live.player.sources import TrackedClip
 
-    if clip is not None and clip.endswith(".npz"):
-        return TrackedClip(Path(clip).stem, npz_frames(Path(clip)))
-    if network.endswith(".onnx"):
+    if feed.clip is not None and feed.clip.endswith(".npz"):
+        return TrackedClip(Path(feed.clip).stem, npz_frames(Path(feed.clip)))
+    if feed.network.endswith(".onnx"):
         raise InputError(
-            f"{network}: has no test clips; allowed with it are --clip FILE.npz, --udp and --osc"
+            f"{feed.network}: has no test clips; allowed with it are --clip FILE.npz, --udp and --osc"
         )
     from memmlp.config.open_run import clip_index, open_run
 
-    test = open_run(outputs, network).test
-    index = 0 if clip is None else clip_index(test, clip)
+    test = open_run(feed.outputs, feed.network).test
+    index = 0 if feed.clip is None else clip_index(test, feed.clip)
     return TrackedClip(test.names[index], test.clip(index).numpy())
 
 
@@ -131,19 +138,20 @@ def npz_frames(path: Path) -> np.ndarray:
     return motion_frames(*tensors).numpy()
 
 
-def sent(source: ClipSource, udp: int | None, osc: int | None, space: str) -> None:
-    """Send a clip's packets, in a space."""
+def sent(feed: Feed) -> None:
+    """Send a clip's packets once, in a space."""
     from memmlp.live.player.packets import to_json, to_osc
     from memmlp.live.player.sources import send
     from memmlp.live.spaces import space_of
 
-    port, pack = (udp, to_json) if udp is not None else (osc, to_osc)
+    source = clip_source(feed, rounds=1)
+    port, pack = (feed.udp, to_json) if feed.udp is not None else (feed.osc, to_osc)
     assert port is not None
     click.echo(f"sending {source.name} to port {port}")
-    click.echo(f"{send(source, port, pack, space_of(space))} packets sent")
+    click.echo(f"{send(source, port, pack, space_of(feed.space))} packets sent")
 
 
-def watched(network: str, source: PoseSource, port: int, no_browser: bool, outputs: Path) -> None:
+def watched(feed: Feed, port: int, no_browser: bool) -> None:
     """Play the source through the network, and serve the page, until Ctrl-C."""
     import threading
     import webbrowser
@@ -153,11 +161,11 @@ def watched(network: str, source: PoseSource, port: int, no_browser: bool, outpu
     from memmlp.live.stream import Stream
     from memmlp.runs.lookup import find_run
 
-    with contextlib.closing(source):
-        if network.endswith(".onnx"):
-            file, name = Path(network), Path(network).name
+    with contextlib.closing(source_of(feed)) as source:
+        if feed.network.endswith(".onnx"):
+            file, name = Path(feed.network), Path(feed.network).name
         else:
-            run = find_run(outputs, network)
+            run = find_run(feed.outputs, feed.network)
             file, name = run.deployed, f"run {run.id[:8]}"
         stream = Stream(file, space=source.space)
         hub = Hub(greeting(source, name))

@@ -25,6 +25,14 @@ RATE_TOLERANCE = 1e-4  # relative: 59.94 is not 60, and 120.0005 (a BVH's frame 
 
 
 @dataclass(frozen=True)
+class Skipped:
+    """A file that was passed over, and why: its path below the folder, and one line."""
+
+    file: str
+    reason: str
+
+
+@dataclass(frozen=True)
 class Clip:
     """Motion of the 22 body joints.
 

@@ -17,7 +17,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.progress import track
 from memmlp.motion.body import load_rest_joints
 from memmlp.motion.bvh import Bvh, find_bvh, read_bvh
-from memmlp.motion.clip import FRAME_RATE_RANGE, write_clip
+from memmlp.motion.clip import FRAME_RATE_RANGE, Skipped, write_clip
 from memmlp.motion.retarget import retarget
 from memmlp.motion.skeleton import SkeletonMap, find_skeleton, is_number, load_skeleton
 
@@ -37,14 +37,6 @@ class Imported:
     header_fps: float
     fps: float
     fps_reason: str
-
-
-@dataclass(frozen=True)
-class Skipped:
-    """A file that could not be imported, and why."""
-
-    source: str
-    reason: str
 
 
 @dataclass(frozen=True)

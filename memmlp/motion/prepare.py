@@ -26,7 +26,7 @@ from filelock import FileLock
 from memmlp.common.errors import InputError
 from memmlp.common.progress import track
 from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
-from memmlp.motion.clip import Clip, read_clip, resample
+from memmlp.motion.clip import Clip, Skipped, read_clip, resample
 from memmlp.motion.splits import PARTS, Split, group_names
 from memmlp.runs.recipes import RECIPES
 
@@ -78,14 +78,6 @@ class ClipRecord:
     sha256: str
     fps: float
     resampling: str
-
-
-@dataclass(frozen=True)
-class Skipped:
-    """A file that is not in the cache, and why: its path below the data root and one line."""
-
-    file: str
-    reason: str
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,6 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import sync_folder
 from memmlp.search.spec import Range, Search, Value
 
-ENDED = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
-
-
 BEGINNING = b'{"op_code":'  # of every line of a journal
 
 

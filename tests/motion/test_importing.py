@@ -134,7 +134,7 @@ def test_bad_files_are_skipped(source: Path, tmp_path: Path) -> None:
     import_folder(source, tmp_path / "out")
     write(source, "HIERARCHY", "salsa/01.bvh")
     report = import_folder(source, tmp_path / "out")
-    assert [skipped.source for skipped in report.skipped] == ["salsa/01.bvh"]
+    assert [skipped.file for skipped in report.skipped] == ["salsa/01.bvh"]
     assert report.skipped[0].reason.startswith("salsa/01.bvh: no MOTION")
     assert list(rates(tmp_path / "out")) == ["indian/01.npz", "salsa/02.npz", "top.npz"]
     assert str(tmp_path) not in (tmp_path / "out" / "import.json").read_text()
