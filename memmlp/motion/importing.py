@@ -180,7 +180,7 @@ def _publish(staging: Path, out: Path, report: ImportReport, body: str) -> None:
             (out / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.move(staging / name, out / name)
         for skipped in report.skipped:
-            (out / _npz(Path(skipped.source))).unlink(missing_ok=True)
+            (out / _npz(Path(skipped.file))).unlink(missing_ok=True)
     except OSError as error:
         raise InputError(
             f"{out}: cannot be written ({error.strerror}); allowed: a folder to write to"

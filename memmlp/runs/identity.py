@@ -23,7 +23,6 @@ NEUTRAL = (
     "profile",  # sizes, read by the groups that use them
     "paths",
     "tracking",
-    "tracker",  # tracking, in runs of version 0.1
     "device",  # recorded, and flagged where runs that are compared differ in it
     "threads",
     "force",
@@ -34,6 +33,9 @@ NEUTRAL = (
     "hydra",
 )
 """Config keys that change no result of any stage."""
+
+FORMER = ("tracker",)
+"""Neutral keys that runs of version 0.1 have: today's `tracking`."""
 
 PATHS = ("_target_", "_partial_")
 """Where a component's class lies; the `name` of one of this package says what it is."""
@@ -148,7 +150,7 @@ def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
 def trained_by(config: Mapping[str, Any]) -> dict[str, Any]:
     """The dotted keys of a config that can change the result of a training; null is no key."""
     later = (*EVALUATION, *DEPLOYMENT, *(() if _rolls_out(config) else INFERENCE))
-    out = (*NEUTRAL, *later, *_unused(config))
+    out = (*NEUTRAL, *FORMER, *later, *_unused(config))
     flat = {key: _canonical(value) for key, value in flatten(config).items() if value is not None}
     counting = {key: flat[key] for key in flat if not _below(key, out) and not _is_path(key, flat[key])}
     return counting | _draws(config)

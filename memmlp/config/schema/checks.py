@@ -13,8 +13,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from memmlp.common.errors import InputError
 from memmlp.config.schema.config import SCHEMAS, Config
-from memmlp.config.schema.network import Baseline
-from memmlp.config.schema.training import AGRoLLoss, BaselineLoss, NoHand, TeacherForcing
+from memmlp.config.schema.network import BaselineConfig
+from memmlp.config.schema.training import (
+    AGRoLLossConfig,
+    BaselineLossConfig,
+    NoHandConfig,
+    TeacherForcingConfig,
+)
 
 
 def check(cfg: DictConfig) -> None:
@@ -86,7 +91,7 @@ def _check_combinations(cfg: DictConfig) -> None:
     _check_names(cfg)
     if cfg.optim.final_lr > cfg.optim.lr:
         raise InputError(f"optim.final_lr={cfg.optim.final_lr}: allowed is at most optim.lr={cfg.optim.lr}")
-    if _is(cfg.model, Baseline):
+    if _is(cfg.model, BaselineConfig):
         _check_reference(cfg)
     else:
         _check_slots(cfg)
@@ -111,9 +116,9 @@ def _check_reference(cfg: DictConfig) -> None:
     for group in ("memory", "predictor", "hand"):
         if cfg[group] is not None:
             raise InputError(f"{group}: {name} has none; allowed is a command line without {group}=...")
-    if not _is(cfg.loss, BaselineLoss):
+    if not _is(cfg.loss, BaselineLossConfig):
         raise InputError(f"loss: weights of Mem-MLP's terms, which {name} has not; allowed is its own loss")
-    if not _is(cfg.rollout, TeacherForcing):
+    if not _is(cfg.rollout, TeacherForcingConfig):
         raise InputError(f"rollout: {name} has no history of its own; allowed is rollout=teacher_forcing")
     if cfg.evaluation.ik != "off":
         raise InputError(
@@ -133,9 +138,9 @@ def _check_reference(cfg: DictConfig) -> None:
 
 def _check_foreign_loss(cfg: DictConfig, predictor: str) -> None:
     """AGRoL's loss is of rotations alone, and so may be that of a network that makes nothing else."""
-    if not _is(cfg.loss, AGRoLLoss):
+    if not _is(cfg.loss, AGRoLLossConfig):
         raise InputError("loss: that of a baseline; allowed is loss=uncertainty or loss=manual")
-    if not predictor.startswith("RotationOnly") or not _is(cfg.hand, NoHand):
+    if not predictor.startswith("RotationOnly") or not _is(cfg.hand, NoHandConfig):
         raise InputError(
             "loss=agrol is of rotations alone: allowed is predictor=rotation_only with hand=off, "
             "or loss=uncertainty or loss=manual"
@@ -148,7 +153,7 @@ def _check_slots(cfg: DictConfig) -> None:
     if layers and max(layers) > cfg.model.depth:
         raise InputError(f"memory.layers={layers}: allowed is up to model.depth={cfg.model.depth}")
     predictor = cfg.predictor._target_.rsplit(".", 1)[-1]
-    if _is(cfg.loss, BaselineLoss):
+    if _is(cfg.loss, BaselineLossConfig):
         _check_foreign_loss(cfg, predictor)
     if cfg.hand._target_.endswith("HandPosition") and predictor.startswith("RotationOnly"):
         raise InputError(

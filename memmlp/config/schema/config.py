@@ -10,26 +10,32 @@ from typing import Any, Optional
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from memmlp.config.schema.data import Data, ListData, SeededData, SubsetData, SynthData
+from memmlp.config.schema.data import (
+    DataConfig,
+    ListDataConfig,
+    SeededDataConfig,
+    SubsetDataConfig,
+    SynthDataConfig,
+)
 from memmlp.config.schema.network import (
-    VQVAE,
-    AGRoLDiffusion,
-    AGRoLMLP,
-    AvatarPoser,
-    CodeMemory,
-    Frame,
-    GRUMemory,
-    JointCodeMemory,
-    LSTMMemory,
-    Memory,
-    Model,
-    NoCodesMemory,
-    NoMemory,
-    Predictor,
-    RotationOnly,
-    RotationOnlyMemory,
-    TwoBranch,
-    TwoBranchMemory,
+    AGRoLDiffusionConfig,
+    AGRoLMLPConfig,
+    AvatarPoserConfig,
+    CodeMemoryConfig,
+    FrameConfig,
+    GRUMemoryConfig,
+    JointCodeMemoryConfig,
+    LSTMMemoryConfig,
+    MemoryConfig,
+    ModelConfig,
+    NoCodesMemoryConfig,
+    NoMemoryConfig,
+    PredictorConfig,
+    RotationOnlyConfig,
+    RotationOnlyMemoryConfig,
+    TwoBranchConfig,
+    TwoBranchMemoryConfig,
+    VQVAEConfig,
 )
 from memmlp.config.schema.rules import (
     EachOf,
@@ -44,20 +50,20 @@ from memmlp.config.schema.rules import (
     target,
 )
 from memmlp.config.schema.training import (
-    AGRoLLoss,
-    AvatarPoserLoss,
-    Hand,
-    HandFK,
-    HandPosition,
-    Loss,
-    Manual,
-    NoHand,
-    Optim,
-    OwnPredictions,
-    Rollout,
-    Streams,
-    TeacherForcing,
-    Uncertainty,
+    AGRoLLossConfig,
+    AvatarPoserLossConfig,
+    HandConfig,
+    HandFKConfig,
+    HandPositionConfig,
+    LossConfig,
+    ManualConfig,
+    NoHandConfig,
+    OptimConfig,
+    OwnPredictionsConfig,
+    RolloutConfig,
+    StreamsConfig,
+    TeacherForcingConfig,
+    UncertaintyConfig,
 )
 
 # OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
@@ -66,12 +72,12 @@ from memmlp.config.schema.training import (
 
 
 @dataclass
-class Paths:
+class PathsConfig:
     outputs: str = key(Text())
 
 
 @dataclass
-class Profile:
+class ProfileConfig:
     """The sizes that a scale of work needs; the groups read them, and any can be set in its group instead."""
 
     frames: int = at_least(2)
@@ -106,7 +112,7 @@ class Profile:
 
 
 @dataclass
-class Evaluation:
+class EvaluationConfig:
     modes: list[str] = key(EachOf(OneOf(("window", "stream"))))
     batch: int = at_least(1)
     ik: str = one_of("off", "lbfgs")
@@ -114,27 +120,27 @@ class Evaluation:
 
 
 @dataclass
-class Export:
+class ExportConfig:
     latency_steps: int = at_least(1)
     graph: str = one_of("auto", "streaming", "naive")
     precision: str = one_of("fp32", "int8")
 
 
 @dataclass
-class Tracking:
+class TrackingConfig:
     name: str = key(Text())
     _target_: str = MISSING
 
 
 @dataclass
-class MLflowTracking(Tracking):
+class MLflowTrackingConfig(TrackingConfig):
     name: str = called("mlflow")
     _target_: str = target("memmlp.runs.tracking.MLflowTracking")
     uri: Optional[str] = key()
 
 
 @dataclass
-class NoTracking(Tracking):
+class NoTrackingConfig(TrackingConfig):
     name: str = called("none")
     _target_: str = target("memmlp.runs.tracking.NoTracking")
 
@@ -148,70 +154,81 @@ class Config:
     threads: int = at_least(0)
     force: bool = key()
     save_predictions: Optional[str] = key()
-    paths: Paths = field(default_factory=Paths)
-    profile: Profile = field(default_factory=Profile)
-    data: Data = field(default_factory=Data)
-    frame: Frame = field(default_factory=Frame)
-    model: Model = field(default_factory=Model)
-    memory: Optional[Memory] = None
-    predictor: Optional[Predictor] = None
-    vqvae: VQVAE = field(default_factory=VQVAE)
-    rollout: Rollout = field(default_factory=Rollout)
-    loss: Loss = field(default_factory=Loss)
-    hand: Optional[Hand] = None
-    optim: Optim = field(default_factory=Optim)
-    evaluation: Evaluation = field(default_factory=Evaluation)
-    export: Export = field(default_factory=Export)
-    tracking: Tracking = field(default_factory=Tracking)
+    paths: PathsConfig = field(default_factory=PathsConfig)
+    profile: ProfileConfig = field(default_factory=ProfileConfig)
+    data: DataConfig = field(default_factory=DataConfig)
+    frame: FrameConfig = field(default_factory=FrameConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    memory: Optional[MemoryConfig] = None
+    predictor: Optional[PredictorConfig] = None
+    vqvae: VQVAEConfig = field(default_factory=VQVAEConfig)
+    rollout: RolloutConfig = field(default_factory=RolloutConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    hand: Optional[HandConfig] = None
+    optim: OptimConfig = field(default_factory=OptimConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    export: ExportConfig = field(default_factory=ExportConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
 
 SCHEMAS: dict[str, type] = {
     "config": Config,
-    "profile": Profile,
-    "data_synth": SynthData,
-    "data_seeded": SeededData,
-    "data_lists": ListData,
-    "data_subsets": SubsetData,
-    "frame": Frame,
-    "model": Model,
-    "model_agrol_mlp": AGRoLMLP,
-    "model_agrol_diffusion": AGRoLDiffusion,
-    "model_avatar_poser": AvatarPoser,
-    "predictor_two_branch": TwoBranch,
-    "predictor_two_branch_memory": TwoBranchMemory,
-    "predictor_rotation_only": RotationOnly,
-    "predictor_rotation_only_memory": RotationOnlyMemory,
-    "memory_none": NoMemory,
-    "memory_no_codes": NoCodesMemory,
-    "memory_vq": CodeMemory,
-    "memory_vq_joint": JointCodeMemory,
-    "memory_lstm": LSTMMemory,
-    "memory_gru": GRUMemory,
-    "vqvae": VQVAE,
-    "rollout_teacher_forcing": TeacherForcing,
-    "rollout_own_predictions": OwnPredictions,
-    "rollout_streams": Streams,
-    "loss_uncertainty": Uncertainty,
-    "loss_manual": Manual,
-    "loss_agrol": AGRoLLoss,
-    "loss_avatar_poser": AvatarPoserLoss,
-    "hand_position": HandPosition,
-    "hand_fk": HandFK,
-    "hand_off": NoHand,
-    "optim": Optim,
-    "evaluation": Evaluation,
-    "export": Export,
-    "tracking_mlflow": MLflowTracking,
-    "tracking_none": NoTracking,
+    "profile": ProfileConfig,
+    "data_synth": SynthDataConfig,
+    "data_seeded": SeededDataConfig,
+    "data_lists": ListDataConfig,
+    "data_subsets": SubsetDataConfig,
+    "frame": FrameConfig,
+    "model": ModelConfig,
+    "model_agrol_mlp": AGRoLMLPConfig,
+    "model_agrol_diffusion": AGRoLDiffusionConfig,
+    "model_avatar_poser": AvatarPoserConfig,
+    "predictor_two_branch": TwoBranchConfig,
+    "predictor_two_branch_memory": TwoBranchMemoryConfig,
+    "predictor_rotation_only": RotationOnlyConfig,
+    "predictor_rotation_only_memory": RotationOnlyMemoryConfig,
+    "memory_none": NoMemoryConfig,
+    "memory_no_codes": NoCodesMemoryConfig,
+    "memory_vq": CodeMemoryConfig,
+    "memory_vq_joint": JointCodeMemoryConfig,
+    "memory_lstm": LSTMMemoryConfig,
+    "memory_gru": GRUMemoryConfig,
+    "vqvae": VQVAEConfig,
+    "rollout_teacher_forcing": TeacherForcingConfig,
+    "rollout_own_predictions": OwnPredictionsConfig,
+    "rollout_streams": StreamsConfig,
+    "loss_uncertainty": UncertaintyConfig,
+    "loss_manual": ManualConfig,
+    "loss_agrol": AGRoLLossConfig,
+    "loss_avatar_poser": AvatarPoserLossConfig,
+    "hand_position": HandPositionConfig,
+    "hand_fk": HandFKConfig,
+    "hand_off": NoHandConfig,
+    "optim": OptimConfig,
+    "evaluation": EvaluationConfig,
+    "export": ExportConfig,
+    "tracking_mlflow": MLflowTrackingConfig,
+    "tracking_none": NoTrackingConfig,
 }
 
 
 GROUPS = {
-    "paths": Paths, "profile": Profile, "frame": Frame, "model": Model, "memory": Memory, "vqvae": VQVAE,
-    "predictor": Predictor, "rollout": Rollout, "loss": Loss, "hand": Hand, "optim": Optim,
-    "evaluation": Evaluation, "export": Export, "tracking": Tracking,
-}  # fmt: skip
-DATA = {"seeded": SeededData, "lists": ListData, "subsets": SubsetData}
+    "paths": PathsConfig,
+    "profile": ProfileConfig,
+    "frame": FrameConfig,
+    "model": ModelConfig,
+    "memory": MemoryConfig,
+    "vqvae": VQVAEConfig,
+    "predictor": PredictorConfig,
+    "rollout": RolloutConfig,
+    "loss": LossConfig,
+    "hand": HandConfig,
+    "optim": OptimConfig,
+    "evaluation": EvaluationConfig,
+    "export": ExportConfig,
+    "tracking": TrackingConfig,
+}
+DATA = {"seeded": SeededDataConfig, "lists": ListDataConfig, "subsets": SubsetDataConfig}
 
 
 RENAMED = {"tracker": "tracking"}
@@ -232,7 +249,7 @@ def restored(config: Mapping[str, Any]) -> DictConfig:
 def _restored(group: str, content: Mapping[str, Any]) -> Any:
     """A typed group. A component that is not of this package keeps the path of its class."""
     if group == "data":
-        schema = SynthData if content["synth"] else DATA[content["split"]["name"]]
+        schema = SynthDataConfig if content["synth"] else DATA[content["split"]["name"]]
         return OmegaConf.merge(OmegaConf.structured(schema), _bare(content))
     shipped = SCHEMAS.get(f"{group}_{content.get('name')}")
     own = _bare(content) if shipped else dict(content)

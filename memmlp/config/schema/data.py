@@ -24,7 +24,7 @@ from memmlp.config.schema.rules import (
 
 
 @dataclass
-class SeededSplit:
+class SeededSplitConfig:
     name: str = called("seeded")
     _target_: str = target("memmlp.motion.splits.SeededSplit")
     test: float = fraction()
@@ -34,7 +34,7 @@ class SeededSplit:
 
 
 @dataclass
-class ListSplit:
+class ListSplitConfig:
     name: str = called("lists")
     _target_: str = target("memmlp.motion.splits.ListSplit")
     folder: str = key(Existing("folder"))
@@ -44,7 +44,7 @@ class ListSplit:
 
 
 @dataclass
-class SubsetSplit:
+class SubsetSplitConfig:
     name: str = called("subsets")
     _target_: str = target("memmlp.motion.splits.SubsetSplit")
     train: list[str] = key(EachOf())
@@ -55,13 +55,13 @@ class SubsetSplit:
 
 
 @dataclass
-class Synth:
+class SynthConfig:
     minutes: float = positive()
     seed: int = at_least(0)
 
 
 @dataclass
-class Data:
+class DataConfig:
     name: str = key(Text())
     body: str = key(Existing("file", ("builtin",)))
     min_frames: int = at_least(2)
@@ -70,28 +70,28 @@ class Data:
 
 
 @dataclass
-class SynthData(Data):
+class SynthDataConfig(DataConfig):
     root: str = key(Text())
-    synth: Synth = field(default_factory=Synth)
-    split: SeededSplit = field(default_factory=SeededSplit)
+    synth: SynthConfig = field(default_factory=SynthConfig)
+    split: SeededSplitConfig = field(default_factory=SeededSplitConfig)
 
 
 @dataclass
-class SeededData(Data):
+class SeededDataConfig(DataConfig):
     root: str = key(Existing("folder"))
-    synth: Optional[Synth] = None
-    split: SeededSplit = field(default_factory=SeededSplit)
+    synth: Optional[SynthConfig] = None
+    split: SeededSplitConfig = field(default_factory=SeededSplitConfig)
 
 
 @dataclass
-class ListData(Data):
+class ListDataConfig(DataConfig):
     root: str = key(Existing("folder"))
-    synth: Optional[Synth] = None
-    split: ListSplit = field(default_factory=ListSplit)
+    synth: Optional[SynthConfig] = None
+    split: ListSplitConfig = field(default_factory=ListSplitConfig)
 
 
 @dataclass
-class SubsetData(Data):
+class SubsetDataConfig(DataConfig):
     root: str = key(Existing("folder"))
-    synth: Optional[Synth] = None
-    split: SubsetSplit = field(default_factory=SubsetSplit)
+    synth: Optional[SynthConfig] = None
+    split: SubsetSplitConfig = field(default_factory=SubsetSplitConfig)

@@ -26,13 +26,13 @@ from memmlp.config.schema.rules import (
 
 
 @dataclass
-class Frame:
+class FrameConfig:
     coordinates: str = one_of("heading", "head_relative", "world")
     normalize: bool = key()
 
 
 @dataclass
-class Model:
+class ModelConfig:
     name: str = called("mem_mlp")
     frames: int = at_least(2)
     width: int = at_least(1)
@@ -40,7 +40,7 @@ class Model:
 
 
 @dataclass
-class Baseline(Model):
+class BaselineConfig(ModelConfig):
     """A network without slots: it leaves memory, predictor and hand empty."""
 
     name: str = key(Text())
@@ -49,13 +49,13 @@ class Baseline(Model):
 
 
 @dataclass
-class AGRoLMLP(Baseline):
+class AGRoLMLPConfig(BaselineConfig):
     name: str = called("agrol_mlp")
     _target_: str = target("memmlp.networks.baselines.agrol.AGRoLMLP")
 
 
 @dataclass
-class AGRoLDiffusion(Baseline):
+class AGRoLDiffusionConfig(BaselineConfig):
     name: str = called("agrol_diffusion")
     _target_: str = target("memmlp.networks.baselines.agrol.AGRoLDiffusion")
     width: int = at_least(2)
@@ -65,7 +65,7 @@ class AGRoLDiffusion(Baseline):
 
 
 @dataclass
-class AvatarPoser(Baseline):
+class AvatarPoserConfig(BaselineConfig):
     name: str = called("avatar_poser")
     _target_: str = target("memmlp.networks.baselines.avatar_poser.AvatarPoser")
     heads: int = at_least(1)
@@ -74,7 +74,7 @@ class AvatarPoser(Baseline):
 
 
 @dataclass
-class Predictor:
+class PredictorConfig:
     name: str = key(Text())
     _target_: str = MISSING
     _partial_: bool = True
@@ -82,46 +82,46 @@ class Predictor:
 
 
 @dataclass
-class TwoBranch(Predictor):
+class TwoBranchConfig(PredictorConfig):
     name: str = called("two_branch")
     _target_: str = target("memmlp.networks.predictor.TwoBranch")
 
 
 @dataclass
-class RotationOnly(Predictor):
+class RotationOnlyConfig(PredictorConfig):
     name: str = called("rotation_only")
     _target_: str = target("memmlp.networks.predictor.RotationOnly")
 
 
 @dataclass
-class TwoBranchMemory(Predictor):
+class TwoBranchMemoryConfig(PredictorConfig):
     name: str = called("two_branch_memory")
     _target_: str = target("memmlp.networks.predictor.TwoBranchMemory")
     depth: int = at_least(1)
 
 
 @dataclass
-class RotationOnlyMemory(Predictor):
+class RotationOnlyMemoryConfig(PredictorConfig):
     name: str = called("rotation_only_memory")
     _target_: str = target("memmlp.networks.predictor.RotationOnlyMemory")
     depth: int = at_least(1)
 
 
 @dataclass
-class Memory:
+class MemoryConfig:
     name: str = key(Text())
     _target_: str = MISSING
     _partial_: bool = True
 
 
 @dataclass
-class NoMemory(Memory):
+class NoMemoryConfig(MemoryConfig):
     name: str = called("none")
     _target_: str = target("memmlp.networks.memory.NoMemory")
 
 
 @dataclass
-class NoCodesMemory(Memory):
+class NoCodesMemoryConfig(MemoryConfig):
     name: str = called("no_codes")
     _target_: str = target("memmlp.networks.memory.NoCodesMemory")
     layers: list[int] = key(EachOf(Within(1)))
@@ -133,38 +133,38 @@ class NoCodesMemory(Memory):
 
 
 @dataclass
-class CodeMemory(NoCodesMemory):
+class CodeMemoryConfig(NoCodesMemoryConfig):
     name: str = called("vq")
     _target_: str = target("memmlp.networks.memory.CodeMemory")
 
 
 @dataclass
-class JointCodeMemory(NoCodesMemory):
+class JointCodeMemoryConfig(NoCodesMemoryConfig):
     name: str = called("vq_joint")
     _target_: str = target("memmlp.networks.memory.JointCodeMemory")
 
 
 @dataclass
-class RecurrentMemory(Memory):
+class RecurrentMemoryConfig(MemoryConfig):
     layers: list[int] = key(EachOf(Within(1)))
     width: int = at_least(1)
     fusion: str = one_of("residual", "plain")
 
 
 @dataclass
-class LSTMMemory(RecurrentMemory):
+class LSTMMemoryConfig(RecurrentMemoryConfig):
     name: str = called("lstm")
     _target_: str = target("memmlp.networks.memory.LSTMMemory")
 
 
 @dataclass
-class GRUMemory(RecurrentMemory):
+class GRUMemoryConfig(RecurrentMemoryConfig):
     name: str = called("gru")
     _target_: str = target("memmlp.networks.memory.GRUMemory")
 
 
 @dataclass
-class VQVAE:
+class VQVAEConfig:
     codes: int = at_least(1)
     width: int = at_least(1)
     encoder_depth: int = at_least(0)

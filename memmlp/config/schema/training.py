@@ -13,46 +13,46 @@ from memmlp.config.schema.rules import Text, Within, at_least, called, key, one_
 
 
 @dataclass
-class Rollout:
+class RolloutConfig:
     name: str = key(Text())
     _target_: str = MISSING
 
 
 @dataclass
-class TeacherForcing(Rollout):
+class TeacherForcingConfig(RolloutConfig):
     name: str = called("teacher_forcing")
     _target_: str = target("memmlp.training.rollout.TeacherForcing")
 
 
 @dataclass
-class OwnPredictions(Rollout):
+class OwnPredictionsConfig(RolloutConfig):
     name: str = called("own_predictions")
     _target_: str = target("memmlp.training.rollout.OwnPredictions")
     max_passes: int = at_least(1)
 
 
 @dataclass
-class Streams(Rollout):
+class StreamsConfig(RolloutConfig):
     name: str = called("streams")
     _target_: str = target("memmlp.training.rollout.PersistentStreams")
     streams: int = at_least(1)
 
 
 @dataclass
-class Loss:
+class LossConfig:
     name: str = key(Text())
     _target_: str = MISSING
 
 
 @dataclass
-class Uncertainty(Loss):
+class UncertaintyConfig(LossConfig):
     name: str = called("uncertainty")
     _target_: str = target("memmlp.training.losses.Uncertainty")
     lr: float = positive()
 
 
 @dataclass
-class Manual(Loss):
+class ManualConfig(LossConfig):
     name: str = called("manual")
     _target_: str = target("memmlp.training.losses.Manual")
     rotation: float = at_least(0)
@@ -63,19 +63,19 @@ class Manual(Loss):
 
 
 @dataclass
-class BaselineLoss(Loss):
+class BaselineLossConfig(LossConfig):
     """A whole loss, where the others are weights of Mem-MLP's terms."""
 
 
 @dataclass
-class AGRoLLoss(BaselineLoss):
+class AGRoLLossConfig(BaselineLossConfig):
     name: str = called("agrol")
     _target_: str = target("memmlp.training.losses.AGRoLLoss")
     error: str = one_of("norm", "square")
 
 
 @dataclass
-class AvatarPoserLoss(BaselineLoss):
+class AvatarPoserLossConfig(BaselineLossConfig):
     name: str = called("avatar_poser")
     _target_: str = target("memmlp.training.losses.AvatarPoserLoss")
     orientation: float = at_least(0)
@@ -85,31 +85,31 @@ class AvatarPoserLoss(BaselineLoss):
 
 
 @dataclass
-class Hand:
+class HandConfig:
     name: str = key(Text())
     _target_: str = MISSING
 
 
 @dataclass
-class HandPosition(Hand):
+class HandPositionConfig(HandConfig):
     name: str = called("position")
     _target_: str = target("memmlp.training.losses.HandPosition")
 
 
 @dataclass
-class HandFK(Hand):
+class HandFKConfig(HandConfig):
     name: str = called("fk")
     _target_: str = target("memmlp.training.losses.HandFK")
 
 
 @dataclass
-class NoHand(Hand):
+class NoHandConfig(HandConfig):
     name: str = called("off")
     _target_: str = target("memmlp.training.losses.NoHand")
 
 
 @dataclass
-class Optim:
+class OptimConfig:
     steps: int = at_least(1)
     batch: int = at_least(1)
     lr: float = positive()
