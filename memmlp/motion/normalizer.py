@@ -85,7 +85,7 @@ class Normalizer(nn.Module):
     def pose(self, motion: Tensor, sparse: Tensor) -> Tensor:
         """Joint positions (..., 22, 3), metres, world, from the rotations of world motion (..., 198).
 
-        Forward kinematics, translated so that the head stands where its tracker says (field.md).
+        Forward kinematics, translated so that the head stands where its tracker says (reading 22).
         """
         local = sixd_to_matrix(motion[..., ROTATION].unflatten(-1, (N_JOINTS, 6)))
         _, positions = forward_kinematics(local, torch.zeros_like(sparse[..., :3]), self.rest)
