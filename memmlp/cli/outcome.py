@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -62,7 +63,9 @@ def older_code(run: Run, changed: Sequence[str]) -> str:
 def metrics_table(results: dict[str, Any]) -> Table:
     """The test metrics by mode and branch."""
     columns = [(mode, branch) for mode, branch in COLUMNS if branch in results.get(mode, {})]
-    table = Table(title="test clips", title_justify="left")
+    table = Table(
+        title="test clips", title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0)
+    )
     table.add_column("metric")
     table.add_column("unit")
     for mode, branch in columns:
