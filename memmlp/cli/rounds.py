@@ -169,15 +169,13 @@ class Shown(NamedTuple):
 def shown(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> Shown:
     """The sweep with its rounds, where there were any and they are of what it is now."""
     from memmlp.cli.plan import planned
-    from memmlp.tables.rounds import begin
 
     path = record(sweep, outputs)
     kept = read(path)
     if kept is None or not kept.taken:
         return Shown(sweep, planned(sweep, outputs), None)
-    chosen = "seeds" if any(word.startswith("seed=") for word in overrides) else None
-    if other := chosen or _difference(kept, begin(sweep, len(kept.seeds))):
-        flag = f"seeds were spent in rounds with other {other}: these verdicts do not keep the 5 %"
+    chosen = any(word.startswith("seed=") for word in overrides)
+    if flag := of_another(kept, sweep, chosen):
         return Shown(sweep, planned(sweep, outputs), None, (flag,))
     spent = kept.spent(sweep)
     plan = planned(spent, outputs)
@@ -186,6 +184,21 @@ def shown(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> Shown:
     except InputError as error:
         return Shown(spent, plan, None, (f"seeds were spent in rounds, but not of these runs: {error}",))
     return Shown(spent, plan, kept)
+
+
+def of_another(kept: Rounds, sweep: Sweep, chosen: bool = False) -> str | None:
+    """The line about looks that were of something else than the sweep is now; None where they are of it.
+
+    chosen: whether the sweep's seeds were chosen by hand.
+    """
+    from memmlp.tables.rounds import begin
+
+    other = "seeds" if chosen else _difference(kept, begin(sweep, len(kept.seeds)))
+    return (
+        f"seeds were spent in rounds with other {other}: these verdicts do not keep the 5 %"
+        if other
+        else None
+    )
 
 
 def spent_before(sweep: Sweep, outputs: Path) -> tuple[str, ...]:

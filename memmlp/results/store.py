@@ -36,6 +36,7 @@ class Kept:
         runs: the finished runs by the arm's label and the seed.
         arms: the overrides of each arm that the runs were made with.
         rounds: of seeds that were spent in rounds, as JSON holds them; None where they were not.
+        flags: what a reader has to know of how the seeds came about.
     """
 
     sweep: str
@@ -43,6 +44,7 @@ class Kept:
     runs: Mapping[str, Runs]
     arms: Mapping[str, tuple[str, ...]]
     rounds: Mapping[str, Any] | None = None
+    flags: tuple[str, ...] = ()
 
     @property
     def command(self) -> str:
@@ -58,14 +60,18 @@ class Kept:
     def merged(self, other: Kept) -> Kept:
         """With another's runs added; where both have a cell, the other's stands.
 
-        Raises InputError where they are not of one sweep and the same overrides.
+        Raises InputError where they are not of one sweep and the same overrides, or would join seeds of a
+        fixed number to such as were spent in rounds: no verdict would keep its level.
         """
         if (self.sweep, self.overrides) != (other.sweep, other.overrides):
             raise InputError(f"holds the results of '{self.command}', not of '{other.command}'")
+        if self.rounds and not other.rounds:
+            raise InputError("holds seeds that were spent in rounds, and these were not")
         self.check(other.arms)
         labels = dict.fromkeys([*self.runs, *other.runs])
         runs = {label: {**self.runs.get(label, {}), **other.runs.get(label, {})} for label in labels}
-        return replace(self, runs=runs, arms={**self.arms, **other.arms}, rounds=other.rounds)
+        arms, flags = {**self.arms, **other.arms}, tuple(dict.fromkeys([*self.flags, *other.flags]))
+        return replace(self, runs=runs, arms=arms, rounds=other.rounds, flags=flags)
 
     def check(self, arms: Mapping[str, tuple[str, ...]]) -> None:
         """Raise InputError where an arm has other overrides: the runs are of another arm of that name."""
@@ -116,6 +122,7 @@ def dumps(kept: Kept) -> str:
         "command": kept.command,
         "arms": {label: list(words) for label, words in sorted(kept.arms.items())},
         "rounds": kept.rounds,
+        **({"flags": list(kept.flags)} if kept.flags else {}),
         "clips": dict(sorted(clips.items())),
         "cells": {
             label: {str(seed): runs[seed].id for seed in sorted(runs)}
@@ -141,7 +148,8 @@ def load_kept(path: Path) -> Kept:
             for label, seeds in content["cells"].items()
         }
         arms = {label: tuple(words) for label, words in content["arms"].items()}
-        return Kept(content["sweep"], tuple(content["overrides"]), cells, arms, content["rounds"])
+        words, flags = tuple(content["overrides"]), tuple(content.get("flags", ()))
+        return Kept(content["sweep"], words, cells, arms, content["rounds"], flags)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: no file of results ({error}); make it with memmlp results save") from None
 
