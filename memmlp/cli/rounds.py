@@ -237,7 +237,12 @@ def closing(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs]) -> list[str]
     """Why it ended, what more seeds could do, and how many runs it took."""
     latest = [finding for finding, _ in rounds.latest().values()]
     still = [finding for finding in latest if finding.verdict == "open"]
-    lines = [] if still or rounds.next_looks(sweep) else ["all verdicts are decided"]
+    unseen = Counter(key.label for key in rounds.unseen(sweep))
+    lines = [] if still or unseen or rounds.next_looks(sweep) else ["all verdicts are decided"]
+    lines += [
+        f"of '{label}' {number} comparisons have no verdict: the runs have nothing to compare"
+        for label, number in unseen.items()
+    ]
     if any(finding.p is None for finding in still):
         lines.append("the test clips are one group: no number of seeds decides")
     return [*lines, *_outlooks(rounds, sweep, runs), _spent(rounds, sweep)]

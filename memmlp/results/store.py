@@ -182,6 +182,8 @@ def _clips_key(run: Measured) -> str:
 
 def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str]]) -> Measured:
     names, errors = [clip for clip, _ in clips], record["errors"]
+    if any(len(values) != len(names) for values in _every(errors)):
+        raise ValueError(f"run {name} has not as many errors as clips")
     return Measured(
         id=name,
         means=_each(errors, _mean),
@@ -203,12 +205,19 @@ def _each(errors: Mapping[str, Any], what: Any) -> Errors:
     }
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
-    """Of the clips that have a number, as the evaluation does it."""
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
+def _every(errors: Mapping[str, Any]) -> list[Sequence[Any]]:
+    """Each metric's list of values."""
+    return [
+        values for branches in errors.values() for metrics in branches.values() for values in metrics.values()
+    ]
 
 
-def _short(value: float) -> float | None:
-    """A number of six digits; None for what is no number."""
-    return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
+def _mean(values: Sequence[float | str | None]) -> float:
+    """Of the clips that have a number, as the evaluation does it; NaN where none has."""
+    known = [float(value) for value in values if value is not None]
+    return float(np.mean(known)) if known else math.nan
+
+
+def _short(value: float) -> float | str | None:
+    """A number of six digits; None for what is none, infinity as a word."""
+    return None if math.isnan(value) else plain(float(f"{value:.{DIGITS}g}"))

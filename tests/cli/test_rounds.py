@@ -156,6 +156,14 @@ def test_what_was_decided_is_of_the_sweep_as_it_was(memmlp: Memmlp, runs: Runs):
     assert one_line(memmlp(*SWEEP), "rounds.json: no record of rounds")
 
 
+def test_what_cannot_be_compared_is_not_decided(memmlp: Memmlp, runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    """An arm whose network diverged on every clip has no verdict."""
+    monkeypatch.setitem(FACTORS, "same", float("nan"))
+    out = memmlp(*SWEEP).out
+    assert "of 'same' 2 comparisons have no verdict: the runs have nothing to compare" in out
+    assert "all verdicts are decided" not in out
+
+
 def page() -> str:
     return Path("docs/results/trial.md").read_text()
 
