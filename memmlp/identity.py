@@ -92,10 +92,20 @@ def run_id(kind: str, config: Mapping[str, Any], *, data: str, upstream: str | N
 
 def evaluation_id(config: Mapping[str, Any], mode: str) -> str:
     """The identity of a run's evaluation in a mode: a word and 16 hex digits."""
-    settings = evaluation_settings(config, mode)
-    used = ["metrics", f"mode.{mode}", *([f"ik.{settings['ik']}"] if settings["ik"] != "off" else [])]
-    name = mode if settings["ik"] == "off" else f"{mode}-{settings['ik']}"
-    return f"{name}-{_digest({'settings': settings, 'recipes': recipes(used)})}"
+    return evaluation_name(evaluation_settings(config, mode))
+
+
+def evaluation_name(settings: Mapping[str, Any]) -> str:
+    """The identity that an evaluation with these settings has today."""
+    mode, ik = settings["mode"], settings["ik"]
+    name = mode if ik == "off" else f"{mode}-{ik}"
+    return f"{name}-{_digest({'settings': settings, 'recipes': evaluation_recipes(settings)})}"
+
+
+def evaluation_recipes(settings: Mapping[str, Any]) -> dict[str, int]:
+    """The recipe numbers of the components that an evaluation uses."""
+    solver = [f"ik.{settings['ik']}"] if settings["ik"] != "off" else []
+    return recipes(["metrics", f"mode.{settings['mode']}", *solver])
 
 
 def evaluation_settings(config: Mapping[str, Any], mode: str) -> dict[str, Any]:
@@ -112,7 +122,11 @@ def evaluation_settings(config: Mapping[str, Any], mode: str) -> dict[str, Any]:
 
 def deployment_id(config: Mapping[str, Any]) -> str:
     """The identity of what a run is shipped as: a word and 16 hex digits."""
-    settings = deployment_settings(config)
+    return deployment_name(deployment_settings(config))
+
+
+def deployment_name(settings: Mapping[str, Any]) -> str:
+    """The identity that a deployment with these settings has today."""
     graph = settings.get("graph", "auto")
     used = [
         "export",

@@ -23,7 +23,14 @@ from memmlp.data.prepare import Manifest
 from memmlp.deployment import Deployment
 from memmlp.features import Frame, World
 from memmlp.files import read_json, write_json
-from memmlp.identity import Identity, deployment_id, deployment_settings, evaluation_id, evaluation_settings
+from memmlp.identity import (
+    Identity,
+    deployment_id,
+    deployment_settings,
+    evaluation_id,
+    evaluation_recipes,
+    evaluation_settings,
+)
 from memmlp.ik import IK
 from memmlp.losses import Loss
 from memmlp.memory import Memory
@@ -76,7 +83,7 @@ class Architecture:
 
     def load(self, run: Run) -> WindowModel:
         """The network of a finished run."""
-        tensors, _ = checkpoint.read(run.model)
+        tensors, _ = checkpoint.read(run.weights())
         codes = self.vqvae() if self.uses_codes else None
         model = self.build(Frame.raw(self.coordinates, torch.zeros(22, 3)), codes)
         checkpoint.load_module("model", model, tensors)
@@ -312,7 +319,7 @@ def vqvae_run(experiment: Experiment, cache: Path, manifest: Manifest) -> Run:
 def load_vqvae(architecture: Architecture, run: Run) -> VQVAE:
     """The VQ-VAE of a finished run."""
     model = architecture.vqvae()
-    checkpoint.load_module("model", model, checkpoint.read(run.model)[0])
+    checkpoint.load_module("model", model, checkpoint.read(run.weights())[0])
     return model.eval()
 
 
@@ -340,9 +347,10 @@ def evaluate_run(experiment: Experiment, run: Run, cache: Path, modes: Sequence[
         torch.manual_seed(experiment.seed)  # for a blend that is sampled: alike in whatever order
         found = evaluation.evaluate(model, test, [mode], experiment.evaluation_batch, experiment.ik)
         rows = [{key: row[key] for key in ("name", "group", "frames")} | row[mode] for row in found["clips"]]
-        report = {"mode": mode, "settings": evaluation_settings(experiment.config, mode)}
-        report |= {"mean": found["mean"][mode], "clips": rows, **machine(experiment)}
-        write_report(run.evaluation(experiment.evaluations[mode]), report)
+        settings, name = evaluation_settings(experiment.config, mode), experiment.evaluations[mode]
+        report = {"mode": mode, "run": run.manifest["id"], "name": name, "settings": settings}
+        report |= {"recipes": evaluation_recipes(settings), **machine(experiment)}
+        write_report(run.evaluation(name), report | {"mean": found["mean"][mode], "clips": rows})
     if not (run.folder / "poses.png").exists():
         picture(model, test, run)
     note_seconds(run, "evaluate", started)
@@ -355,8 +363,9 @@ def deploy_run(experiment: Experiment, run: Run, cache: Path) -> None:
     model = experiment.architecture.load(run)
     clips = [Frames.open(cache, split).clips() for split in ("train", "test")]
     place = run.deployment(experiment.deployed)
+    place.latency.unlink(missing_ok=True)  # of one that is made again, as a file of it is gone
     record = experiment.deployment.ship(model, place, run.id, *clips)
-    place.finish({"settings": deployment_settings(experiment.config), **record})
+    place.finish({"run": run.manifest["id"], "settings": deployment_settings(experiment.config), **record})
     note_seconds(run, "export", started)
 
 

@@ -25,7 +25,7 @@ from filelock import FileLock, Timeout
 from memmlp.environment import changes, environment, host, sources
 from memmlp.errors import InputError
 from memmlp.files import atomic_write, file_digest, plain, read_json, sync_folder, write_json
-from memmlp.identity import flatten, used_as_configured
+from memmlp.identity import deployment_name, evaluation_name, flatten, used_as_configured
 
 HEARTBEAT = 5.0  # seconds between signs of life of a run's process
 STALE = 60.0  # seconds without one after which a process on another machine counts as dead
@@ -71,8 +71,15 @@ class Deployed:
 
     @property
     def done(self) -> bool:
-        """Whether all of it is there."""
-        return self.latency.is_file()
+        """Whether all of it is there, and of the run below which it lies."""
+        record = read_json(self.latency)
+        whole = all((self.folder / name).is_file() for name in record.get("artifacts", {}))
+        return bool(record) and whole and _lies_right(record.get("run"), self.folder.parent.parent)
+
+    @property
+    def current(self) -> bool:
+        """Whether it was made by today's recipes."""
+        return self.folder.name == deployment_name(self.settings)
 
     def finish(self, record: Mapping[str, Any]) -> None:
         """Write what was measured, with the digests of the files: the sign that all of it is there."""
@@ -157,12 +164,12 @@ class Run:
 
     @property
     def shipped(self) -> Deployed:
-        """The deployment to use, of those with the run's own settings: one whose int8 is as accurate, or the
-        last one.
+        """The deployment to use, of those with the run's own settings: of today's recipes where there is one,
+        one whose int8 is as accurate, or the last one.
         """
         made = [Deployed(path.parent) for path in self.deployments.glob("*/latency.json")]
-        own = [one for one in made if used_as_configured(one.settings, self.config)]
-        best = max(own, key=lambda one: (one.prefers_int8, one.made), default=None)
+        own = [one for one in made if one.done and used_as_configured(one.settings, self.config)]
+        best = max(own, key=lambda one: (one.current, one.prefers_int8, one.made), default=None)
         return best or Deployed(self.deployments / "none")
 
     @property
@@ -308,13 +315,19 @@ class Run:
         Where a branch was evaluated by inverse kinematics of several lengths, the last one counts; tables ask
         for theirs by its identity.
         """
-        found, config = read_json(self.results_path), self.config
-        reports = [read_json(path) for path in self.evaluations.glob("*.json")]
-        own = [report for report in reports if used_as_configured(report.get("settings", {}), config)]
-        for report in sorted(own, key=lambda report: report["made"]):
+        found = read_json(self.results_path)
+        for report in map(read_json, self.own_evaluations):
             found[report["mode"]] = {**found.get(report["mode"], {}), **report["mean"]}
         latency = read_json(self.shipped.latency)
         return found | ({"latency": latency} if latency else {})
+
+    @property
+    def own_evaluations(self) -> list[Path]:
+        """The evaluations using the network as the run's config does: older recipes first, then by time."""
+        config, paths = self.config, sorted(self.evaluations.glob("*.json"))
+        every = {path: read_json(path) for path in paths}
+        own = [path for path, made in every.items() if used_as_configured(made.get("settings", {}), config)]
+        return sorted(own, key=lambda path: (_current(path, every[path]), str(every[path].get("made"))))
 
     @property
     def changed_sources(self) -> list[str]:
@@ -369,8 +382,18 @@ class Run:
 
     @property
     def done(self) -> bool:
-        """Whether the run was finished."""
-        return "artifacts" in read_json(self.marker)
+        """Whether the run was finished, and is no other's folder under its id."""
+        marker = read_json(self.marker)
+        return "artifacts" in marker and _lies_right(marker.get("id"), self.folder)
+
+    def weights(self) -> Path:
+        """The trained weights. Raises InputError where they are others than were trained."""
+        digest = read_json(self.marker).get("artifacts", {}).get(self.model.name)
+        if digest and not self._same(self.model.name, digest):
+            raise InputError(
+                f"{self.model}: not the weights that were trained; do the run again with force=true"
+            )
+        return self.model
 
     def verify(self) -> list[str]:
         """The artifacts of a finished run that are missing or changed since."""
@@ -430,6 +453,17 @@ def joined(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any
     return found
 
 
+def _lies_right(run_id: str | None, folder: Path) -> bool:
+    """Whether what was made of a run of that id lies in its folder. A folder of another name is a copy."""
+    return run_id in (None, folder.name) or not ID.fullmatch(folder.name)
+
+
+def _current(path: Path, report: Mapping[str, Any]) -> bool:
+    """Whether an evaluation was made by today's recipes."""
+    settings = report.get("settings")
+    return bool(settings) and path.stem == evaluation_name(settings)
+
+
 def write_report(path: Path, report: Mapping[str, Any]) -> None:
     """Write the file of an evaluation: what was measured, when, by what, and its digest."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -438,9 +472,11 @@ def write_report(path: Path, report: Mapping[str, Any]) -> None:
 
 
 def intact(path: Path) -> bool:
-    """Whether the file of an evaluation is as it was written."""
+    """Whether the file of an evaluation is as it was written, and where."""
     content = read_json(path)
-    return content.pop("digest", None) == _content_digest(content)
+    same = content.pop("digest", None) == _content_digest(content)
+    named = content.get("name", path.stem) == path.stem
+    return same and named and _lies_right(content.get("run"), path.parent.parent)
 
 
 def _content_digest(content: Mapping[str, Any]) -> str:
