@@ -116,8 +116,8 @@ def evaluation_settings(config: Mapping[str, Any], mode: str) -> dict[str, Any]:
     groups = ((config.get("data") or {}).get("split") or {}).get(
         "groups"
     )  # its rows say who belongs together
-    drawn = {"batch": group.get("batch")} if _inference(config).get("memory.blend") == "sampled" else {}
-    return {"mode": mode, **solver, **_inference(config), **({"groups": groups} if groups else {}), **drawn}
+    drawn = {"batch": group.get("batch")} if inference(config).get("memory.blend") == "sampled" else {}
+    return {"mode": mode, **solver, **inference(config), **({"groups": groups} if groups else {}), **drawn}
 
 
 def deployment_id(config: Mapping[str, Any]) -> str:
@@ -140,7 +140,7 @@ def deployment_name(settings: Mapping[str, Any]) -> str:
 
 def deployment_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """What a deployment's result follows from, beside the run and its data."""
-    return {key: _canonical(value) for key, value in config.get("export", {}).items()} | _inference(config)
+    return {key: _canonical(value) for key, value in config.get("export", {}).items()} | inference(config)
 
 
 def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
@@ -176,12 +176,17 @@ def _training(kind: str, config: Mapping[str, Any], data: str, upstream: str | N
     return {"kind": kind, "config": trained_by(config), "data": data, "upstream": upstream}
 
 
+def trained_with(key: str, config: Mapping[str, Any]) -> bool:
+    """Whether a dotted key can change the training of this config, or the data that it is of."""
+    return key.startswith("data.") or any(_below(name, [key]) for name in trained_by(config))
+
+
 def used_as_configured(settings: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
     """Whether a stage's settings use the network as the run's own config does."""
-    return all(settings.get(key) == value for key, value in _inference(config).items())
+    return all(settings.get(key) == value for key, value in inference(config).items())
 
 
-def _inference(config: Mapping[str, Any]) -> dict[str, Any]:
+def inference(config: Mapping[str, Any]) -> dict[str, Any]:
     """The keys that act when the network is used, where the network has them."""
     flat = flatten(config)
     return {key: _canonical(flat[key]) for key in INFERENCE if key in flat}
