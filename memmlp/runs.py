@@ -460,8 +460,8 @@ def _lies_right(run_id: str | None, folder: Path) -> bool:
 
 def _current(path: Path, report: Mapping[str, Any]) -> bool:
     """Whether an evaluation was made by today's recipes."""
-    settings = report.get("settings")
-    return bool(settings) and path.stem == evaluation_name(settings)
+    settings = report.get("settings") or {}
+    return {"mode", "ik"} <= settings.keys() and path.stem == evaluation_name(settings)
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:

@@ -80,9 +80,18 @@ def test_a_run_that_diverged_stays_one(sweep: Sweep, kept: Kept, tmp_path: Path,
 def test_kept_results_that_were_cut_are_refused(kept: Kept, tmp_path: Path):
     """A clip's error lost by hand or in a merge would shift the others to the wrong clips."""
     content = json.loads(dumps(kept))
+    del content["digest"]
     next(iter(content["runs"].values()))["errors"]["stream"]["rotation"]["MPJPE"].insert(0, 5.0)
     (tmp_path / "kept.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match="has not as many errors as clips"):
+        load_kept(tmp_path / "kept.json")
+
+
+def test_kept_results_that_were_edited_are_refused(kept: Kept, tmp_path: Path):
+    text = dumps(kept)
+    number = re.search(r'"MPJPE": \[(\S+),', text)
+    (tmp_path / "kept.json").write_text(text.replace(number[1], "9.99", 1))
+    with pytest.raises(InputError, match="edited since it was saved"):
         load_kept(tmp_path / "kept.json")
 
 

@@ -131,14 +131,17 @@ def dumps(kept: Kept) -> str:
         },
         "runs": {run.id: _record(run) for run in kept.every},
     }
+    content["digest"] = _digest(content)
     text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
     return SCALES.sub(lambda found: f"[{' '.join(found[1].split())}]", text) + "\n"
 
 
 def load_kept(path: Path) -> Kept:
-    """Read a file of results. Raises InputError where it is none."""
+    """Read a file of results. Raises InputError where it is none, or was edited since."""
     try:
         content = json.loads(path.read_bytes())
+        if content.pop("digest", None) not in (None, _digest(content)):  # None: before there was one
+            raise ValueError("edited since it was saved")
         measured = {
             name: _measured(name, record, content["clips"][record["clips"]])
             for name, record in content["runs"].items()
@@ -152,6 +155,10 @@ def load_kept(path: Path) -> Kept:
         return Kept(content["sweep"], words, cells, arms, content["rounds"], flags)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: no file of results ({error}); make it with memmlp results save") from None
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _record(run: Measured) -> dict[str, Any]:
