@@ -167,6 +167,13 @@ def test_weights_that_changed_are_not_evaluated(home, tmp_path):
     assert "not the weights that were trained" in command(home, "eval", str(copy.folder), "--again", code=2)
 
 
+def test_what_is_exported_is_checked_on_the_runs_own_data(home, tmp_path):
+    copy = Run(shutil.copytree(motion_run(home).folder, tmp_path / "best"))
+    copy.write_manifest({"data": "0" * 64})
+    words = ("--out", "other.onnx", "--precision", "int8")
+    assert "its data has changed since" in command(home, "export", str(copy.folder), *words, code=2)
+
+
 def test_an_evaluation_says_whose_and_by_which_recipes(home):
     """So that kept results of an older recipe are known for it."""
     run = motion_run(home)

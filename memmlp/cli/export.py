@@ -72,7 +72,7 @@ def export(
     import numpy as np
 
     from memmlp.avatar.full import export_full, full_parity
-    from memmlp.cli.build import build_experiment, config_of
+    from memmlp.cli.opened import opened
     from memmlp.data.dataset import Frames
     from memmlp.deployment import GRAPHS
     from memmlp.errors import InputError
@@ -95,8 +95,7 @@ def export(
             partial(export_full, space=space or "amass"),
             partial(full_parity, space=space or "amass"),
         )
-    experiment = build_experiment(config_of(found))
-    cache, _ = experiment.data.prepare()
+    _, experiment, cache, _ = opened(outputs, run)
     model = experiment.architecture.load(found)
     network = GRAPHS[graph](model)
     test = Frames.open(cache, "test").clips()
