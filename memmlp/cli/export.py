@@ -67,7 +67,7 @@ def export(
 ) -> None:
     """Export a finished run (id, its beginning, or folder) as ONNX and check it on whole test clips."""
     from memmlp.common.errors import InputError
-    from memmlp.config.build import build_experiment, config_of
+    from memmlp.config.open_run import open_run
     from memmlp.deploy.deployment import GRAPHS
     from memmlp.networks.streaming import StreamingGraph
     from memmlp.runs.lookup import find_run
@@ -79,9 +79,8 @@ def export(
         raise InputError(
             f"--space {space}: the network itself knows AMASS' world alone; allowed with --scope full"
         )
-    experiment = build_experiment(config_of(found))
-    data = experiment.data.prepare()
-    model = experiment.architecture.load(found.model)
+    _, experiment, data = open_run(outputs, run)
+    model = experiment.architecture.load(found.weights())
     network = GRAPHS[graph](model)
     test = data.open("test").clips()
     if precision == "fp32":

@@ -128,7 +128,7 @@ def predicted(run: OpenedRun, clip: str, last: int, branch: str, mode: str) -> t
     from memmlp.evaluation import modes as evaluation
     from memmlp.motion.body import SPARSE_DIM
 
-    model = run.experiment.architecture.load(run.run.model)
+    model = run.experiment.architecture.load(run.run.weights())
     frames = clip_of(run.test, clip)
     if mode == "stream":  # what comes later can't matter, as it does to the windows of the other
         frames = frames[:last]

@@ -46,7 +46,7 @@ def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | N
     """
     from memmlp.cli.rounds import shown
     from memmlp.common.files import plain
-    from memmlp.config.plan import find_sweep
+    from memmlp.config.plan import find_sweep, is_path
     from memmlp.report.store import Kept, load_kept, overrides_of, save, without_paths
     from memmlp.tables.collect import finished
     from memmlp.tables.measured import load
@@ -58,8 +58,8 @@ def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | N
     found = finished(known.sweep, finder(known.plan, functools.cache(load)))
     words = tuple(word for word in overrides if not word.startswith("seed="))
     rounds = plain(as_json(known.rounds)) if known.rounds else None
-    source = name if "/" in name else sweep.name
-    kept = Kept(source, without_paths(words), found, overrides_of(sweep), rounds)
+    source = name if is_path(name) else sweep.name
+    kept = Kept(source, without_paths(words), found, overrides_of(sweep), rounds, known.flags)
     if not kept.every:
         raise InputError(f"sweep {name}: no finished run to keep; make them with: {kept.command}")
     path = out / f"{stem or sweep.name}.json"
@@ -114,20 +114,23 @@ def sources(folder: Path) -> dict[str, KeptTable]:
 
 def _table(kept: Kept) -> Table:
     """The table that kept results come to, of the seeds that any of them has."""
+    from memmlp.cli.rounds import of_another
     from memmlp.config.plan import find_sweep
     from memmlp.tables.collect import collect
     from memmlp.tables.rounds import of_json
 
     sweep = find_sweep(kept.sweep)
-    if kept.rounds:
-        rounds = of_json(kept.rounds)
+    rounds = of_json(kept.rounds) if kept.rounds else None
+    other = of_another(rounds, sweep) if rounds else None
+    if rounds and not other:
         spent = rounds.spent(sweep)
         table = collect(spent, kept.of(spent), command=f"{kept.command} --until-decided", rounds=rounds)
     else:
         seeds = sorted({seed for runs in kept.runs.values() for seed in runs})
         sweep = sweep.with_overrides([f"seed={','.join(map(str, seeds))}"])
         table = collect(sweep, kept.of(sweep), command=kept.command)
-    return replace(table, flags=(*table.flags, *_outdated(kept)))
+    said = [*([other] if other else []), *kept.flags, *_outdated(kept)]
+    return replace(table, flags=(*table.flags, *said))
 
 
 def _outdated(kept: Kept) -> list[str]:

@@ -169,15 +169,13 @@ class Shown(NamedTuple):
 def shown(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> Shown:
     """The sweep with its rounds, where there were any and they are of what it is now."""
     from memmlp.config.plan import planned
-    from memmlp.tables.rounds import begin
 
     path = record(sweep, outputs)
     kept = read(path)
     if kept is None or not kept.taken:
         return Shown(sweep, planned(sweep, outputs), None)
-    chosen = "seeds" if any(word.startswith("seed=") for word in overrides) else None
-    if other := chosen or _difference(kept, begin(sweep, len(kept.seeds))):
-        flag = f"seeds were spent in rounds with other {other}: these verdicts do not keep the 5 %"
+    chosen = any(word.startswith("seed=") for word in overrides)
+    if flag := of_another(kept, sweep, chosen):
         return Shown(sweep, planned(sweep, outputs), None, (flag,))
     spent = kept.spent(sweep)
     plan = planned(spent, outputs)
@@ -186,6 +184,21 @@ def shown(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> Shown:
     except InputError as error:
         return Shown(spent, plan, None, (f"seeds were spent in rounds, but not of these runs: {error}",))
     return Shown(spent, plan, kept)
+
+
+def of_another(kept: Rounds, sweep: Sweep, chosen: bool = False) -> str | None:
+    """The line about looks that were of something else than the sweep is now; None where they are of it.
+
+    chosen: whether the sweep's seeds were chosen by hand.
+    """
+    from memmlp.tables.rounds import begin
+
+    other = "seeds" if chosen else _difference(kept, begin(sweep, len(kept.seeds)))
+    return (
+        f"seeds were spent in rounds with other {other}: these verdicts do not keep the 5 %"
+        if other
+        else None
+    )
 
 
 def spent_before(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
@@ -224,7 +237,12 @@ def closing(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs]) -> list[str]
     """Why it ended, what more seeds could do, and how many runs it took."""
     latest = [finding for finding, _ in rounds.latest().values()]
     still = [finding for finding in latest if finding.verdict == "open"]
-    lines = [] if still or rounds.next_looks(sweep) else ["all verdicts are decided"]
+    unseen = Counter(key.label for key in rounds.unseen(sweep))
+    lines = [] if still or unseen or rounds.next_looks(sweep) else ["all verdicts are decided"]
+    lines += [
+        f"of '{label}' {number} comparisons have no verdict: the runs have nothing to compare"
+        for label, number in unseen.items()
+    ]
     if any(finding.p is None for finding in still):
         lines.append("the test clips are one group: no number of seeds decides")
     return [*lines, *_outlooks(rounds, sweep, runs), _spent(rounds, sweep)]

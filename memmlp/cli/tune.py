@@ -103,12 +103,20 @@ def _search_config(words: Sequence[str], config_dir: Path | None) -> dict[str, A
 
 
 def _check_space(setup: Setup) -> str:
-    """Refuse a range with a value that the config refuses; the first trial's run, and its validations."""
+    """Refuse a range with a value that the config refuses, and a key that changes no trial.
+
+    Gives what the trials follow from: the first one's run, and its validations.
+    """
+    from memmlp.runs.identity import inference, trained_with
+
     space = setup.search.space
     for word in setup.words:
         if word.partition("=")[0].lstrip("+") in {one.key for one in space}:
             raise InputError(f"{word}: is searched; leave it out of the space with search.space....=null")
-    _experiments(setup, {})
+    base = _experiments(setup, {})[0].config
+    for one in space:
+        if not isinstance(base.get(one.key), Mapping) and not trained_with(one.key, base):
+            raise InputError(f"search.space: {one.key}: changes no training; allowed are keys that do")
     most = max(len(one.corners()) for one in space)
     for number in range(most):
         corner = {one.key: one.corners()[number % len(one.corners())] for one in space}
@@ -117,7 +125,8 @@ def _check_space(setup: Setup) -> str:
         except InputError as error:
             raise InputError(f"search.space: {error}") from None
     first = _tasks(setup, setup.search.first())[0][-1]
-    return f"{first.id}, validated every {first.config['optim']['validate_every']} steps"  # and may be pruned
+    often = f"validated every {first.config['optim']['validate_every']} steps"  # and may be pruned
+    return f"{first.id}, {often}, used with {inference(first.config)}"
 
 
 def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]:

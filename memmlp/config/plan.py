@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 def find_sweep(name: str) -> Sweep:
     """The sweep of a path, of a shipped file's name, or of a table's number."""
-    if name.endswith((".yaml", ".yml")) or "/" in name:
+    if is_path(name):
         return load_sweep(Path(name))
     folder = shipped("sweeps")
     stem = f"table{int(name):02d}" if name.isdecimal() else name
@@ -36,6 +36,11 @@ def find_sweep(name: str) -> Sweep:
         known = ", ".join(sorted(file.stem for file in folder.glob("*.yaml")))
         raise InputError(f"sweep '{name}': no such sweep; allowed are a path ending in .yaml, or {known}")
     return load_sweep(path)
+
+
+def is_path(name: str) -> bool:
+    """Whether a sweep's name is the path of a file."""
+    return name.endswith((".yaml", ".yml")) or "/" in name
 
 
 def sweep_folder(sweep: Sweep, outputs: Path) -> Path:

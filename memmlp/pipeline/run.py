@@ -20,7 +20,7 @@ from memmlp.evaluation.predictions import save_predictions
 from memmlp.motion.source import Prepared
 from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.evaluated import write_report
-from memmlp.runs.identity import Identity, deployment_settings, evaluation_settings
+from memmlp.runs.identity import Identity, deployment_settings, evaluation_recipes, evaluation_settings
 from memmlp.runs.run import Run
 from memmlp.runs.tracking import project_safely
 from memmlp.training.loop import Watch, unwatched
@@ -57,7 +57,7 @@ def run(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
             made.append("training")
         made += finish(experiment, run, data)
         if experiment.predictions is not None:
-            model = experiment.architecture.load(run.model).to(experiment.device)
+            model = experiment.architecture.load(run.weights()).to(experiment.device)
             test = data.open("test").to(experiment.device)
             save_predictions(experiment.evaluation, model, test, experiment.predictions)
     if made:
@@ -137,7 +137,7 @@ def train_run(
     begin(experiment, run, experiment.identity(data.digest), experiment.config)
     run.write_manifest({"body": data.manifest.body})
     run.clear_stages()
-    weights = codes.model if codes else None
+    weights = codes.weights() if codes else None
     with timed(run, "train"):
         experiment.training.train(experiment.architecture, data, weights, run, experiment.device, watch)
     run.finish(("model.safetensors",))
@@ -147,12 +147,13 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
     """Evaluate a trained run in some modes, each a file that is there whole or not at all."""
     run.attempt("evaluation")
     with timed(run, "evaluate"):
-        model = experiment.architecture.load(run.model).to(experiment.device)
+        model = experiment.architecture.load(run.weights()).to(experiment.device)
         test = data.open("test").to(experiment.device)
         for mode in modes:
-            report = {"mode": mode, "settings": evaluation_settings(experiment.config, mode)}
-            report |= {**experiment.evaluation.report(model, test, mode), **machine(experiment)}
-            write_report(run.evaluation(experiment.evaluations[mode]), report)
+            settings, name = evaluation_settings(experiment.config, mode), experiment.evaluations[mode]
+            report = {"mode": mode, "run": run.manifest["id"], "name": name, "settings": settings}
+            report |= {"recipes": evaluation_recipes(settings), **machine(experiment)}
+            write_report(run.evaluation(name), report | experiment.evaluation.report(model, test, mode))
         if not run.picture.exists():
             picture(model, test, run.picture)
 
@@ -161,11 +162,14 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared) -> None:
     """Export a trained run, prove the file, and time it."""
     run.attempt("deployment")
     with timed(run, "export"):
-        model = experiment.architecture.load(run.model)
+        model = experiment.architecture.load(run.weights())
         clips = [data.open(split).clips() for split in ("train", "test")]
         place = run.deployment(experiment.deployed)
+        place.latency.unlink(missing_ok=True)  # of one that is made again, as a file of it is gone
         record = experiment.deployment.ship(model, place, run.id, *clips)
-        place.finish({"settings": deployment_settings(experiment.config), **record})
+        place.finish(
+            {"run": run.manifest["id"], "settings": deployment_settings(experiment.config), **record}
+        )
 
 
 def begin(experiment: Experiment, run: Run, identity: Identity, config: dict[str, Any]) -> None:

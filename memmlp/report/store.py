@@ -36,6 +36,7 @@ class Kept:
         runs: the finished runs by the arm's label and the seed.
         arms: the overrides of each arm that the runs were made with.
         rounds: of seeds that were spent in rounds, as JSON holds them; None where they were not.
+        flags: what a reader has to know of how the seeds came about.
     """
 
     sweep: str
@@ -43,6 +44,7 @@ class Kept:
     runs: Mapping[str, Runs]
     arms: Mapping[str, tuple[str, ...]]
     rounds: Mapping[str, Any] | None = None
+    flags: tuple[str, ...] = ()
 
     @property
     def command(self) -> str:
@@ -58,14 +60,18 @@ class Kept:
     def merged(self, other: Kept) -> Kept:
         """With another's runs added; where both have a cell, the other's stands.
 
-        Raises InputError where they are not of one sweep and the same overrides.
+        Raises InputError where they are not of one sweep and the same overrides, or would join seeds of a
+        fixed number to such as were spent in rounds: no verdict would keep its level.
         """
         if (self.sweep, self.overrides) != (other.sweep, other.overrides):
             raise InputError(f"holds the results of '{self.command}', not of '{other.command}'")
+        if self.rounds and not other.rounds:
+            raise InputError("holds seeds that were spent in rounds, and these were not")
         self.check(other.arms)
         labels = dict.fromkeys([*self.runs, *other.runs])
         runs = {label: {**self.runs.get(label, {}), **other.runs.get(label, {})} for label in labels}
-        return replace(self, runs=runs, arms={**self.arms, **other.arms}, rounds=other.rounds)
+        arms, flags = {**self.arms, **other.arms}, tuple(dict.fromkeys([*self.flags, *other.flags]))
+        return replace(self, runs=runs, arms=arms, rounds=other.rounds, flags=flags)
 
     def check(self, arms: Mapping[str, tuple[str, ...]]) -> None:
         """Raise InputError where an arm has other overrides: the runs are of another arm of that name."""
@@ -116,6 +122,7 @@ def dumps(kept: Kept) -> str:
         "command": kept.command,
         "arms": {label: list(words) for label, words in sorted(kept.arms.items())},
         "rounds": kept.rounds,
+        **({"flags": list(kept.flags)} if kept.flags else {}),
         "clips": dict(sorted(clips.items())),
         "cells": {
             label: {str(seed): runs[seed].id for seed in sorted(runs)}
@@ -124,14 +131,17 @@ def dumps(kept: Kept) -> str:
         },
         "runs": {run.id: _record(run) for run in kept.every},
     }
+    content["digest"] = _digest(content)
     text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
     return SCALES.sub(lambda found: f"[{' '.join(found[1].split())}]", text) + "\n"
 
 
 def load_kept(path: Path) -> Kept:
-    """Read a file of results. Raises InputError where it is none."""
+    """Read a file of results. Raises InputError where it is none, or was edited since."""
     try:
         content = json.loads(path.read_bytes())
+        if content.pop("digest", None) not in (None, _digest(content)):  # None: before there was one
+            raise ValueError("edited since it was saved")
         measured = {
             name: _measured(name, record, content["clips"][record["clips"]])
             for name, record in content["runs"].items()
@@ -141,9 +151,14 @@ def load_kept(path: Path) -> Kept:
             for label, seeds in content["cells"].items()
         }
         arms = {label: tuple(words) for label, words in content["arms"].items()}
-        return Kept(content["sweep"], tuple(content["overrides"]), cells, arms, content["rounds"])
+        words, flags = tuple(content["overrides"]), tuple(content.get("flags", ()))
+        return Kept(content["sweep"], words, cells, arms, content["rounds"], flags)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: no file of results ({error}); make it with memmlp results save") from None
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _record(run: Measured) -> dict[str, Any]:
@@ -174,6 +189,8 @@ def _clips_key(run: Measured) -> str:
 
 def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str]]) -> Measured:
     names, errors = [clip for clip, _ in clips], record["errors"]
+    if any(len(values) != len(names) for values in _every(errors)):
+        raise ValueError(f"run {name} has not as many errors as clips")
     return Measured(
         id=name,
         means=_each(errors, _mean),
@@ -195,12 +212,19 @@ def _each(errors: Mapping[str, Any], what: Any) -> Errors:
     }
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
-    """Of the clips that have a number, as the evaluation does it."""
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
+def _every(errors: Mapping[str, Any]) -> list[Sequence[Any]]:
+    """Each metric's list of values."""
+    return [
+        values for branches in errors.values() for metrics in branches.values() for values in metrics.values()
+    ]
 
 
-def _short(value: float) -> float | None:
-    """A number of six digits; None for what is no number."""
-    return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
+def _mean(values: Sequence[float | str | None]) -> float:
+    """Of the clips that have a number, as the evaluation does it; NaN where none has."""
+    known = [float(value) for value in values if value is not None]
+    return float(np.mean(known)) if known else math.nan
+
+
+def _short(value: float) -> float | str | None:
+    """A number of six digits; None for what is none, infinity as a word."""
+    return None if math.isnan(value) else plain(float(f"{value:.{DIGITS}g}"))

@@ -9,6 +9,7 @@ from typing import Any
 
 from memmlp.common.files import file_digest, now, read_json, write_json
 from memmlp.runs.environment import environment
+from memmlp.runs.identity import belongs, deployment_name
 
 
 class Deployed:
@@ -26,8 +27,15 @@ class Deployed:
 
     @property
     def done(self) -> bool:
-        """Whether all of it is there."""
-        return self.latency.is_file()
+        """Whether all of it is there, and of the run below which it lies."""
+        record = self.record
+        whole = all((self.folder / name).is_file() for name in record.get("artifacts", {}))
+        return bool(record) and whole and belongs(record.get("run"), self.folder.parent.parent)
+
+    @property
+    def current(self) -> bool:
+        """Whether it was made by today's recipes."""
+        return self.folder.name == deployment_name(self.settings)
 
     def finish(self, record: Mapping[str, Any]) -> None:
         """Write what was measured, with the digests of the files: the sign that all of it is there."""

@@ -10,6 +10,7 @@ from typing import Any
 
 from memmlp.common.files import now, plain, read_json, write_json
 from memmlp.runs.environment import environment
+from memmlp.runs.identity import belongs, evaluation_name
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:
@@ -20,9 +21,17 @@ def write_report(path: Path, report: Mapping[str, Any]) -> None:
 
 
 def intact(path: Path) -> bool:
-    """Whether the file of an evaluation is as it was written."""
+    """Whether the file of an evaluation is as it was written, and where."""
     content = read_json(path)
-    return content.pop("digest", None) == _content_digest(content)
+    same = content.pop("digest", None) == _content_digest(content)
+    named = content.get("name", path.stem) == path.stem
+    return same and named and belongs(content.get("run"), path.parent.parent)
+
+
+def current(path: Path, report: Mapping[str, Any]) -> bool:
+    """Whether an evaluation was made by today's recipes."""
+    settings = report.get("settings") or {}
+    return {"mode", "ik"} <= settings.keys() and path.stem == evaluation_name(settings)
 
 
 def _content_digest(content: Mapping[str, Any]) -> str:

@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from memmlp.common.files import plain
@@ -44,6 +46,9 @@ EVALUATION = ("evaluation",)
 DEPLOYMENT = ("export",)
 INFERENCE = ("memory.blend", "memory.history", "model.sampling_steps")
 """Keys of the later stages; those of INFERENCE count for both, and for a training that rolls out."""
+
+ID = re.compile(r"[0-9a-f]{16}")
+"""What the id of a run looks like."""
 
 SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand")
 
@@ -95,10 +100,20 @@ def run_id(kind: str, config: Mapping[str, Any], *, data: str, upstream: str | N
 
 def evaluation_id(config: Mapping[str, Any], mode: str) -> str:
     """The identity of a run's evaluation in a mode: a word and 16 hex digits."""
-    settings = evaluation_settings(config, mode)
-    used = ["metrics", f"mode.{mode}", *([f"ik.{settings['ik']}"] if settings["ik"] != "off" else [])]
-    name = mode if settings["ik"] == "off" else f"{mode}-{settings['ik']}"
-    return f"{name}-{_digest({'settings': settings, 'recipes': recipes(used)})}"
+    return evaluation_name(evaluation_settings(config, mode))
+
+
+def evaluation_name(settings: Mapping[str, Any]) -> str:
+    """The identity that an evaluation with these settings has today."""
+    mode, ik = settings["mode"], settings["ik"]
+    name = mode if ik == "off" else f"{mode}-{ik}"
+    return f"{name}-{_digest({'settings': settings, 'recipes': evaluation_recipes(settings)})}"
+
+
+def evaluation_recipes(settings: Mapping[str, Any]) -> dict[str, int]:
+    """The recipe numbers of the components that an evaluation uses."""
+    solver = [f"ik.{settings['ik']}"] if settings["ik"] != "off" else []
+    return recipes(["metrics", f"mode.{settings['mode']}", *solver])
 
 
 def evaluation_settings(config: Mapping[str, Any], mode: str) -> dict[str, Any]:
@@ -109,13 +124,17 @@ def evaluation_settings(config: Mapping[str, Any], mode: str) -> dict[str, Any]:
     groups = ((config.get("data") or {}).get("split") or {}).get(
         "groups"
     )  # its rows say who belongs together
-    drawn = {"batch": group.get("batch")} if _inference(config).get("memory.blend") == "sampled" else {}
-    return {"mode": mode, **solver, **_inference(config), **({"groups": groups} if groups else {}), **drawn}
+    drawn = {"batch": group.get("batch")} if inference(config).get("memory.blend") == "sampled" else {}
+    return {"mode": mode, **solver, **inference(config), **({"groups": groups} if groups else {}), **drawn}
 
 
 def deployment_id(config: Mapping[str, Any]) -> str:
     """The identity of what a run is shipped as: a word and 16 hex digits."""
-    settings = deployment_settings(config)
+    return deployment_name(deployment_settings(config))
+
+
+def deployment_name(settings: Mapping[str, Any]) -> str:
+    """The identity that a deployment with these settings has today."""
     graph = settings.get("graph", "auto")
     used = [
         "export",
@@ -129,7 +148,7 @@ def deployment_id(config: Mapping[str, Any]) -> str:
 
 def deployment_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """What a deployment's result follows from, beside the run and its data."""
-    return {key: _canonical(value) for key, value in config.get("export", {}).items()} | _inference(config)
+    return {key: _canonical(value) for key, value in config.get("export", {}).items()} | inference(config)
 
 
 def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
@@ -165,12 +184,22 @@ def _training(kind: str, config: Mapping[str, Any], data: str, upstream: str | N
     return {"kind": kind, "config": trained_by(config), "data": data, "upstream": upstream}
 
 
+def trained_with(key: str, config: Mapping[str, Any]) -> bool:
+    """Whether a dotted key can change the training of this config, or the data that it is of."""
+    return key.startswith("data.") or any(_below(name, [key]) for name in trained_by(config))
+
+
+def belongs(run_id: str | None, folder: Path) -> bool:
+    """Whether what was made of a run of that id lies in its folder. A folder of another name is a copy."""
+    return run_id in (None, folder.name) or not ID.fullmatch(folder.name)
+
+
 def used_as_configured(settings: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
     """Whether a stage's settings use the network as the run's own config does."""
-    return all(settings.get(key) == value for key, value in _inference(config).items())
+    return all(settings.get(key) == value for key, value in inference(config).items())
 
 
-def _inference(config: Mapping[str, Any]) -> dict[str, Any]:
+def inference(config: Mapping[str, Any]) -> dict[str, Any]:
     """The keys that act when the network is used, where the network has them."""
     flat = flatten(config)
     return {key: _canonical(flat[key]) for key in INFERENCE if key in flat}

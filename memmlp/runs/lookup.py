@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
-from memmlp.runs.identity import flatten
+from memmlp.runs.identity import ID, flatten
 from memmlp.runs.run import Run
-
-ID = re.compile(r"[0-9a-f]{16}")
 
 
 class Diff(NamedTuple):

@@ -19,8 +19,8 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, file_digest, now, read_json, sync_folder, write_json
 from memmlp.runs.deployed import Deployed
 from memmlp.runs.environment import changes, environment, host, sources
-from memmlp.runs.evaluated import intact
-from memmlp.runs.identity import used_as_configured
+from memmlp.runs.evaluated import current, intact
+from memmlp.runs.identity import belongs, used_as_configured
 from memmlp.runs.lock import Lock
 from memmlp.runs.log import Metrics, MetricsLog
 from memmlp.runs.origin import joined
@@ -88,12 +88,12 @@ class Run:
 
     @property
     def shipped(self) -> Deployed:
-        """The deployment to use, of those with the run's own settings: one whose int8 is as accurate, or the
-        last one.
+        """The deployment to use, of those with the run's own settings: of today's recipes where there is one,
+        one whose int8 is as accurate, or the last one.
         """
         made = [Deployed(path.parent) for path in self.deployments.glob("*/latency.json")]
-        own = [one for one in made if used_as_configured(one.settings, self.config)]
-        best = max(own, key=lambda one: (one.prefers_int8, one.made), default=None)
+        own = [one for one in made if one.done and used_as_configured(one.settings, self.config)]
+        best = max(own, key=lambda one: (one.current, one.prefers_int8, one.made), default=None)
         return best or Deployed(self.deployments / "none")
 
     @property
@@ -203,13 +203,19 @@ class Run:
         Where a branch was evaluated by inverse kinematics of several lengths, the last one counts; tables ask
         for theirs by its identity.
         """
-        found, config = read_json(self.results_path), self.config
-        reports = [read_json(path) for path in self.evaluations.glob("*.json")]
-        own = [report for report in reports if used_as_configured(report.get("settings", {}), config)]
-        for report in sorted(own, key=lambda report: report["made"]):
+        found = read_json(self.results_path)
+        for report in map(read_json, self.own_evaluations):
             found[report["mode"]] = {**found.get(report["mode"], {}), **report["mean"]}
         latency = self.shipped.record
         return found | ({"latency": latency} if latency else {})
+
+    @property
+    def own_evaluations(self) -> list[Path]:
+        """The evaluations using the network as the run's config does: older recipes first, then by time."""
+        config, paths = self.config, sorted(self.evaluations.glob("*.json"))
+        every = {path: read_json(path) for path in paths}
+        own = [path for path, made in every.items() if used_as_configured(made.get("settings", {}), config)]
+        return sorted(own, key=lambda path: (current(path, every[path]), str(every[path].get("made"))))
 
     @property
     def changed_sources(self) -> list[str]:
@@ -239,8 +245,18 @@ class Run:
 
     @property
     def done(self) -> bool:
-        """Whether the run was finished."""
-        return "artifacts" in read_json(self.marker)
+        """Whether the run was finished, and is no other's folder under its id."""
+        marker = read_json(self.marker)
+        return "artifacts" in marker and belongs(marker.get("id"), self.folder)
+
+    def weights(self) -> Path:
+        """The trained weights. Raises InputError where they are others than were trained."""
+        digest = read_json(self.marker).get("artifacts", {}).get(self.model.name)
+        if digest and not self._same(self.model.name, digest):
+            raise InputError(
+                f"{self.model}: not the weights that were trained; do the run again with force=true"
+            )
+        return self.model
 
     def verify(self) -> list[str]:
         """The artifacts of a finished run that are missing or changed since."""

@@ -14,6 +14,7 @@ from pathlib import Path
 from optuna.trial import Trial, TrialState
 
 from memmlp.common.errors import InputError
+from memmlp.runs.identity import inference
 from memmlp.runs.log import Metrics
 from memmlp.runs.run import Run
 from memmlp.search.board import SearchBoard
@@ -101,6 +102,9 @@ class Director:
         """Whether the trial has ended; the study is told. With its first run done it wants the others."""
         runs = [self.plan.run_of(tasks[-1]) for tasks in going.seeds]
         done = [self.plan.complete(tasks[-1]) for tasks in going.seeds]
+        if other := next((reason for tasks in going.seeds if (reason := self._otherwise(tasks[-1]))), None):
+            self.study.fail(going.trial, other)
+            return True
         news = self._report(going.trial, runs[0])
         if done[0]:
             going.want(len(runs))
@@ -113,6 +117,13 @@ class Director:
                 return True
         total = total_steps(going.seeds[0][-1])
         return going.wanted == 1 and 0 < news < total and self.study.prune(going.trial)
+
+    def _otherwise(self, task: RunTask) -> str | None:
+        """Why a finished run's validations are not the task's: its network was used otherwise."""
+        run, wanted = self.plan.run_of(task), inference(task.config)
+        if not run.done or inference(run.config) == wanted:
+            return None
+        return f"run {run.id} was validated with {inference(run.config)}, not {wanted}; it has no others"
 
     def _busy(self) -> int:
         """How many workers the trials under way can use: for each, one a run that is wanted and not done."""

@@ -63,7 +63,10 @@ class Error:
         return np.sqrt(np.maximum(np.maximum(a, b), a + b - np.minimum(seeds, groups) * e))
 
     def level(self, distance: np.ndarray) -> np.ndarray:
-        """The level (K,) at which `half` is this distance (K,); 1 for 0 and below."""
+        """The level (K,) at which `half` is this distance (K,); 1 for 0 and below, NaN for what is no number.
+
+        An error without a number, of a network that diverged, is evidence of nothing.
+        """
         from scipy.optimize.elementwise import find_root  # slow to import
 
         # The wider side alone, at its lightest, is too narrow; twice its square, at its heaviest, too wide.
@@ -76,7 +79,7 @@ class Error:
             unsure, args = unsure[wider], tuple(part[wider] for part in args)
             bracket = np.log(levels[unsure]), np.log(most[unsure])
             levels[unsure] = np.exp(find_root(self._excess, bracket, args=args).x)
-        return levels
+        return np.where(np.isfinite(distance + self.variances.sum(0)), levels, np.nan)
 
     def _wider(self, distance: np.ndarray, groups: float) -> np.ndarray:
         """The larger of the p-values (K,) of the two sides by themselves."""

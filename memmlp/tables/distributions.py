@@ -52,10 +52,10 @@ def _errors(runs: Runs, clips: list[str], mode: str, arm: Arm, metric: str) -> n
 
 def _distribution(label: str, errors: Mapping[str, np.ndarray], other: Arm | None) -> Distribution:
     every, theirs = errors[label], errors.get(other.label) if other else None
-    known = ~np.isnan(every).any(0)
+    known = np.isfinite(every).all(0)
     ours = every[:, known]
     middle = interquartile_mean(ours) if ours.size else None
-    both = known & ~np.isnan(theirs).any(0) if theirs is not None else known
+    both = known & np.isfinite(theirs).all(0) if theirs is not None else known
     if theirs is None or not both.any():
         return Distribution(label, ours, middle, None)
     return Distribution(label, ours, middle, probability_of_improvement(every[:, both], theirs[:, both]))

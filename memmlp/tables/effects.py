@@ -95,7 +95,7 @@ def _paired(
         for runs, branch in zip((ours, theirs), branches, strict=True)
     ]
     matrix = (sides[0] - sides[1]).reshape(len(seeds), len(clips))
-    known = ~np.isnan(matrix).any(0)
+    known = np.isfinite(matrix).all(0)
     names = [ours[seeds[0]].group(clip) for clip in clips] if seeds else []
     groups = np.unique(np.array(names, dtype=str), return_inverse=True)[1]
     return Paired(matrix[:, known], groups[known])

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numpy as np
 
 from memmlp.sweep.spec import COSTS, Arm, Sweep
 from memmlp.tables.effects import Runs, control_arm, one_and_the_same
@@ -38,6 +41,8 @@ def flags(
     yield from _branches(sweep, asked, runs, command)
     yield from _same(sweep, runs)
     yield from _unequal_clips(sweep, runs)
+    yield from _unequal_groups(every)
+    yield from _no_numbers(sweep, runs)
     for attribute, what in ORIGIN.items():
         yield from _differing(what, [(getattr(run.origin, attribute), label) for label, run in every])
     yield from _recipes(every)
@@ -103,6 +108,46 @@ def _unequal_clips(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
                 f"unequal test clips: '{arm.label}' and '{other.label}' share {len(shared)} of "
                 f"{len(every)}; only those are compared, the means are over all"
             )
+
+
+def _unequal_groups(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
+    """Clips that are of one group in some runs and of another in others: replicates by two countings."""
+    groups: dict[str, set[str]] = defaultdict(set)
+    for _, run in every:
+        for clip in run.clips:
+            groups[clip].add(run.group(clip))
+    several = [clip for clip, names in groups.items() if len(names) > 1]
+    if several:
+        yield f"runs differ in the groups of test clips (data.split.groups): {_quoted(several)}"
+
+
+def _no_numbers(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+    """Runs without a number of clips of which others have one: networks that diverged there.
+
+    A clip of which no run has one is too short for the metric.
+    """
+    lost: dict[tuple[str, int], set[str]] = defaultdict(set)
+    every = [(arm, seed, run) for arm in sweep.runnable() for seed, run in runs[arm.label].items()]
+    modes = {mode for _, _, run in every for mode in run.means}
+    for mode, metric in itertools.product(modes, set(sweep.metrics) - set(COSTS)):
+        lacking = {
+            (arm.label, seed): _lacking(run, mode, arm.branch, metric)
+            for arm, seed, run in every
+            if run.value(mode, arm.branch, metric) is not None
+        }
+        short = set.intersection(*lacking.values()) if lacking else set()
+        for cell, clips in lacking.items():
+            lost[cell] |= clips - short
+    found = [f"'{label}' seed {seed} ({len(clips)} clips)" for (label, seed), clips in lost.items() if clips]
+    if found:
+        yield f"errors that are no numbers, of clips that are left out of differences: {_listed(found)}"
+
+
+def _lacking(run: Measured, mode: str, branch: str, metric: str) -> set[str]:
+    """The clips of which a run has no number."""
+    names = list(run.clips)
+    known = np.isfinite(run.by_clip(names, mode, branch, metric))
+    return {name for name, there in zip(names, known, strict=True) if not there}
 
 
 def _differing(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:

@@ -13,7 +13,6 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.runs.evaluated import intact
-from memmlp.runs.identity import used_as_configured
 from memmlp.runs.run import Run
 
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # mode -> branch -> metric -> value
@@ -113,7 +112,7 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     means: dict[str, dict[str, Any]] = {}
     clips: dict[str, dict[str, Any]] = {}
     groups: dict[str, str] = {}
-    reports = sorted(map(_read, _evaluations(run, stages)), key=lambda report: report["made"])
+    reports = list(map(_read, _evaluations(run, stages)))
     for report in reports:
         means.setdefault(report["mode"], {}).update(report["mean"])
         for clip in report["clips"]:
@@ -129,8 +128,7 @@ def _evaluations(run: Run, stages: Sequence[str] | None) -> list[Path]:
     """The files of some evaluations, or of all that use the network as the run's own config does."""
     if wanted := [path for name in stages or () if (path := run.evaluation(name)).is_file()]:
         return wanted
-    config, every = run.config, sorted(run.evaluations.glob("*.json"))
-    return [path for path in every if used_as_configured(read_json(path).get("settings", {}), config)]
+    return run.own_evaluations
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -187,6 +185,8 @@ def _evaluated(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Origin:
     for name in ("code", "hardware", "device", "gpu", "threads", "torch"):
         known = [word for other in others if (word := getattr(other, name)) not in (UNKNOWN, "version ?")]
         found[name] = ", ".join(dict.fromkeys([getattr(origin, name), *known]))
+    for other in others:
+        found["recipes"] = {**found.get("recipes", origin.recipes), **other.recipes}
     return replace(origin, **found)
 
 

@@ -137,6 +137,11 @@ class Rounds:
         new = [arm for arm, _ in _compared(sweep) if not self.position(arm.label)]
         return list(dict.fromkeys([*self.latest(), *(key for arm in new for key in _keys(sweep, arm))]))
 
+    def unseen(self, sweep: Sweep) -> list[Key]:
+        """Comparisons of arms that were looked at, of which there was nothing: no numbers, or one run."""
+        looked = [arm for arm, _ in _compared(sweep) if self.position(arm.label)]
+        return [key for arm in looked for key in _keys(sweep, arm) if key not in self.latest()]
+
     def judged(self, effects: Mapping[Key, Effect]) -> dict[Key, Effect]:
         """Effects with the verdicts of the looks in place of those of a fixed number of seeds."""
         latest = self.latest()

@@ -156,6 +156,42 @@ def test_what_was_decided_is_of_the_sweep_as_it_was(memmlp: Memmlp, runs: Runs):
     assert one_line(memmlp(*SWEEP), "rounds.json: no record of rounds")
 
 
+def test_what_cannot_be_compared_is_not_decided(memmlp: Memmlp, runs: Runs, monkeypatch: pytest.MonkeyPatch):
+    """An arm whose network diverged on every clip has no verdict."""
+    monkeypatch.setitem(FACTORS, "same", float("nan"))
+    out = memmlp(*SWEEP).out
+    assert "of 'same' 2 comparisons have no verdict: the runs have nothing to compare" in out
+    assert "all verdicts are decided" not in out
+
+
+def page() -> str:
+    return Path("docs/results/trial.md").read_text()
+
+
+def test_kept_rounds_of_another_sweep_decide_nothing(memmlp: Memmlp, runs: Runs):
+    """What was decided by one smallest effect of interest is not shown beside another."""
+    memmlp(*SWEEP)
+    memmlp("results", "save", "trial.yaml")
+    assert memmlp("results", "docs").code == 0
+    assert "do not keep" not in page()
+    write(ARMS, smallest={"MPJPE": 0.5})
+    memmlp("results", "docs")
+    assert "seeds were spent in rounds with other smallest: these verdicts do not keep the 5 %" in page()
+
+
+def test_what_is_kept_says_that_seeds_were_spent_in_rounds(memmlp: Memmlp, runs: Runs):
+    """Those of the looks and those of a fixed number don't become one table."""
+    memmlp(*SWEEP)
+    memmlp("results", "save", "trial.yaml", "--name", "chosen", "seed=0,1,2")
+    memmlp("results", "save", "trial.yaml")
+    line = "trial.json: holds seeds that were spent in rounds, and these were not; allowed is another --name"
+    assert one_line(memmlp("results", "save", "trial.yaml", "seed=0,1,2"), line)
+    assert memmlp("results", "docs").code == 0
+    assert "do not keep" not in page()
+    chosen = Path("docs/results/chosen.md").read_text()
+    assert "seeds were spent in rounds with other seeds: these verdicts do not keep the 5 %" in chosen
+
+
 def test_one_group_of_clips_is_said(memmlp: Memmlp, runs: Runs):
     runs.groups = dict.fromkeys(CLIPS, "one take")
     out = memmlp(*SWEEP).out

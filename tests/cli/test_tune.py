@@ -105,6 +105,10 @@ def test_a_second_owner_is_refused(home: Path):
         ),
         ("optim.lr=-1", "memmlp: optim.lr=-1"),
         ("loss.rotation=5", "loss.rotation=5: is searched"),
+        (
+            "+search.space.memory.blend={low: 0.0, high: 1.0}",
+            "search.space: memory.blend: changes no training",
+        ),
         ("~search", "search: has no value"),
         ("~search.n_trials", "search.n_trials: has no value"),
         ("+search.nonsense=1", "search.nonsense: no such key; allowed are name"),
@@ -135,12 +139,18 @@ def test_what_counts_gives_a_search_of_its_own(tmp_path: Path):
 
 
 def test_a_search_is_named_after_what_its_trials_follow_from(tmp_path: Path):
-    """When a run is validated changes no run, but which trials are pruned."""
+    """When a run is validated changes no run, but which trials are pruned; how it is used, what they show."""
     names = {
         prepared([*TINY, *words], None, tmp_path).folder.name
-        for words in ([], ["search.seeds=2"], ["optim.validate_every=11"], ["optim.lr=0.1"])
+        for words in (
+            [],
+            ["search.seeds=2"],
+            ["optim.validate_every=11"],
+            ["optim.lr=0.1"],
+            ["memory.blend=0"],
+        )
     }
-    assert len(names) == 4
+    assert len(names) == 5
     assert prepared([*TINY, "search.n_trials=7"], None, tmp_path).folder.name in names
 
 

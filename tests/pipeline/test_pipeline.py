@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,9 @@ from memmlp.config.shipped import shipped
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline.run import vqvae_run
 from memmlp.runs.lookup import list_runs
+from memmlp.runs.recipes import RECIPES
 from memmlp.runs.run import Run
+from memmlp.tables.measured import load
 
 
 def motion_run(folder: Path) -> Run:
@@ -155,6 +158,30 @@ def test_a_nan_on_a_later_clip_is_not_exported(home, memmlp, monkeypatch):
     ran = memmlp("export", motion_run(home).id, "--out", "never.onnx", "--clips", "0")
     assert (ran.code, "not written" in ran.err) == (1, True)
     assert not list(home.glob("*never*")) + list(home.glob(".export-*"))
+
+
+def test_weights_that_changed_are_not_evaluated(home, tmp_path):
+    copy = Run(shutil.copytree(motion_run(home).folder, tmp_path / "best"))
+    weights = bytearray(copy.model.read_bytes())
+    weights[-1] ^= 1
+    copy.model.write_bytes(weights)
+    assert "not the weights that were trained" in command(home, "eval", str(copy.folder), "--again", code=2)
+
+
+def test_what_is_exported_is_checked_on_the_runs_own_data(home, tmp_path):
+    copy = Run(shutil.copytree(motion_run(home).folder, tmp_path / "best"))
+    copy.write_manifest({"data": "0" * 64})
+    words = ("--out", "other.onnx", "--precision", "int8")
+    assert "its data has changed since" in command(home, "export", str(copy.folder), *words, code=2)
+
+
+def test_an_evaluation_says_whose_and_by_which_recipes(home):
+    """So that kept results of an older recipe are known for it."""
+    run = motion_run(home)
+    report = json.loads(next(run.evaluations.glob("stream-*.json")).read_text())
+    assert report["run"] == run.id
+    assert report["recipes"] == {"metrics": RECIPES["metrics"], "mode.stream": RECIPES["mode.stream"]}
+    assert load(run.folder).origin.recipes.items() >= {**run.manifest["recipes"], **report["recipes"]}.items()
 
 
 def test_foreign_targets_in_a_runs_config_are_refused(home, tmp_path):

@@ -60,6 +60,41 @@ def test_kept_results_make_the_runs_table(sweep: Sweep, kept: Kept, tmp_path: Pa
     assert [run.origin for run in read.every] == [run.origin for run in kept.every]
 
 
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_a_run_that_diverged_stays_one(sweep: Sweep, kept: Kept, tmp_path: Path, number: float):
+    """It is no run less: its arm has no mean, and no other arm's looks better for it."""
+    run = kept.runs["2"][1]
+    for clip in run.clips:
+        run.clips[clip]["stream"]["combined"]["MPJPE"] = number
+    run.means["stream"]["combined"]["MPJPE"] = number
+    save(tmp_path / "kept.json", kept)
+    cells = [
+        next(row for row in collect(sweep, one.of(sweep)).rows if row.label == "2").cells["stream"]["MPJPE"]
+        for one in (kept, load_kept(tmp_path / "kept.json"))
+    ]
+    for cell in cells:
+        assert sorted(cell.values) == [0, 1, 2]
+        assert not np.isfinite(cell.mean)
+
+
+def test_kept_results_that_were_cut_are_refused(kept: Kept, tmp_path: Path):
+    """A clip's error lost by hand or in a merge would shift the others to the wrong clips."""
+    content = json.loads(dumps(kept))
+    del content["digest"]
+    next(iter(content["runs"].values()))["errors"]["stream"]["rotation"]["MPJPE"].insert(0, 5.0)
+    (tmp_path / "kept.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="has not as many errors as clips"):
+        load_kept(tmp_path / "kept.json")
+
+
+def test_kept_results_that_were_edited_are_refused(kept: Kept, tmp_path: Path):
+    text = dumps(kept)
+    number = re.search(r'"MPJPE": \[(\S+),', text)
+    (tmp_path / "kept.json").write_text(text.replace(number[1], "9.99", 1))
+    with pytest.raises(InputError, match="edited since it was saved"):
+        load_kept(tmp_path / "kept.json")
+
+
 def test_kept_results_have_the_same_bytes(kept: Kept, tmp_path: Path):
     """Whatever order the runs are found in, and after being read."""
     turned = {label: dict(reversed(runs.items())) for label, runs in reversed(kept.runs.items())}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import subprocess
 import sys
 import threading
@@ -17,9 +18,19 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, write_json
 from memmlp.runs.environment import environment
 from memmlp.runs.evaluated import intact, write_report
-from memmlp.runs.identity import NEUTRAL, Identity, deployment_id, evaluation_id, flatten, run_id
+from memmlp.runs.identity import (
+    NEUTRAL,
+    Identity,
+    deployment_id,
+    deployment_settings,
+    evaluation_id,
+    evaluation_settings,
+    flatten,
+    run_id,
+)
 from memmlp.runs.lookup import diff, find_run, list_runs
 from memmlp.runs.run import Run
+from memmlp.tables.measured import load
 
 CONFIG = {"seed": 0, "model": {"width": 16, "layers": [2, 4]}, "optim": {"lr": 1e-3, "log_every": 5}}
 
@@ -184,6 +195,88 @@ def test_a_run_is_done_when_its_marker_is_whole(tmp_path: Path):
         assert not run.done
 
 
+def finished(outputs: Path, config: dict = CONFIG) -> Run:
+    """A run with weights, an evaluation and a deployment in int8."""
+    run = begun(outputs, config)
+    run.model.write_bytes(b"weights")
+    run.finish(["model.safetensors"])
+    report = {"mode": "stream", "run": run.id, "name": "stream-0", "mean": {}, "clips": []}
+    write_report(run.evaluation("stream-0"), report)
+    place = run.deployment("int8-0")
+    place.folder.mkdir(parents=True)
+    for path in (place.onnx, place.int8):
+        path.write_bytes(b"graph")
+    place.finish({"run": run.id, "int8": {"default": True}})
+    return run
+
+
+def test_a_folder_under_anothers_id_is_no_run(tmp_path: Path):
+    """Its numbers would stand for a training that never was. A copy of another name is one."""
+    run = finished(tmp_path)
+    other = Run.of(tmp_path, "0123456789abcdef")
+    shutil.copytree(run.folder, other.folder)
+    copy = Run(shutil.copytree(run.folder, tmp_path / "best"))
+    assert (run.done, other.done, copy.done) == (True, False, True)
+    assert (run.has("int8-0"), other.has("int8-0"), copy.has("int8-0")) == (True, False, True)
+
+
+@pytest.mark.parametrize("name", ["stream-0", "stream-1"])
+def test_an_evaluation_of_another_run_or_name_is_refused(tmp_path: Path, name: str):
+    run = finished(tmp_path)
+    other = run if name == "stream-1" else finished(tmp_path, CONFIG | {"seed": 1})
+    shutil.copy(run.evaluation("stream-0"), other.evaluation(name))
+    load(run.folder, ["stream-0"])
+    with pytest.raises(InputError, match=rf"evaluations/{name}\.json: cannot be read"):
+        load(other.folder, [name])
+    assert other.verify() == [f"evaluations/{name}.json"]
+
+
+def test_a_deployment_that_lost_a_file_is_made_again(tmp_path: Path):
+    """And is not, in silence, the float32 one."""
+    run = finished(tmp_path)
+    assert run.deployed == run.deployment("int8-0").int8
+    run.deployment("int8-0").int8.unlink()
+    assert not run.has("int8-0")
+    assert run.deployed != run.deployment("int8-0").onnx
+
+
+def test_weights_that_changed_since_are_refused(tmp_path: Path):
+    run = finished(tmp_path)
+    assert run.weights() == run.model
+    run.model.write_bytes(b"other")
+    with pytest.raises(InputError, match="not the weights that were trained"):
+        run.weights()
+
+
+def test_todays_recipes_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """What is shown and shipped of a run, where some is of an older recipe, be it the later."""
+    run = begun(tmp_path)
+    config = {"export": {"graph": "naive", "precision": "int8"}, "evaluation": {}}
+    fp32 = {"export": {"graph": "naive", "precision": "fp32"}}
+
+    def make(config: dict, value: float, graph: bytes) -> None:
+        settings = evaluation_settings(config, "stream")
+        report = {"mode": "stream", "settings": settings, "mean": {"rotation": {"MPJPE": value}}, "clips": []}
+        write_report(run.evaluation(evaluation_id(config, "stream")), report)
+        place = run.deployment(deployment_id(config))
+        place.folder.mkdir(parents=True)
+        for path in (place.onnx, *([place.int8] if graph == b"old" else [])):
+            path.write_bytes(graph)
+        place.finish({"settings": deployment_settings(config), "int8": {"default": True}})
+
+    with monkeypatch.context() as today:
+        today.setitem(memmlp.runs.recipes.RECIPES, "metrics", 2)
+        today.setitem(memmlp.runs.recipes.RECIPES, "graph.naive", 2)
+        make(fp32, 2.0, b"new")
+    make(config, 1.0, b"old")
+    assert run.results["stream"]["rotation"]["MPJPE"] == 1.0
+    monkeypatch.setitem(memmlp.runs.recipes.RECIPES, "metrics", 2)
+    monkeypatch.setitem(memmlp.runs.recipes.RECIPES, "graph.naive", 2)
+    assert run.results["stream"]["rotation"]["MPJPE"] == 2.0
+    assert load(run.folder).means["stream"]["rotation"]["MPJPE"] == 2.0
+    assert run.deployed.read_bytes() == b"new"
+
+
 def test_a_run_without_its_artifact_cannot_finish(tmp_path: Path):
     run = begun(tmp_path)
     with pytest.raises(FileNotFoundError):
@@ -320,6 +413,7 @@ def test_a_log_may_go_on_after_a_reset(tmp_path: Path):
 HOLD = """
 import sys, time
 from memmlp.runs.run import Run
+from memmlp.tables.measured import load
 with Run(sys.argv[1]).lock():
     print("held", flush=True)
     sys.stdin.read()

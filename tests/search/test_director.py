@@ -513,3 +513,25 @@ def test_what_is_no_journal_is_left_alone_and_named(tmp_path: Path, content: byt
         with pytest.raises(InputError, match=r"study.journal: not a journal of Optuna's"):
             look(tmp_path)
     assert journal(tmp_path).read_bytes() == content
+
+
+def test_validations_of_a_network_used_otherwise_are_no_trials(tmp_path: Path):
+    """The blend acts when the network is used: the run is the same, what it logged is not."""
+
+    def blended(value: float) -> Callable:
+        def composed(values: Mapping[str, Value]) -> list[list[RunTask]]:
+            ((task,),) = compose(values)
+            return [[replace(task, config={**task.config, "memory": {"blend": value}})]]
+
+        return composed
+
+    for value, state in ((0.5, "COMPLETE"), (0.1, "FAIL")):
+        folder = tmp_path / f"blend {value}"
+        folder.mkdir()
+        study = Study.own(search(n_trials=1), folder.name, folder)
+        one = director(study, tmp_path, blended(value))
+        while (plan := one.look(1)).tasks:
+            finish(plan)
+        (trial,) = study.trials
+        assert trial.state.name == state
+    assert "was validated with {'memory.blend': 0.5}, not {'memory.blend': 0.1}" in trial.user_attrs["reason"]

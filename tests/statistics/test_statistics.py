@@ -413,3 +413,16 @@ def test_interquartile_mean_by_hand():
 def test_performance_profile_by_hand():
     errors = np.array([[1.0, 2.0], [3.0, 4.0]])
     np.testing.assert_array_equal(performance_profile(errors, np.array([0.5, 2.0, 3.5])), [0, 0.5, 0.75])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_an_error_that_is_no_number_is_evidence_of_nothing(value: float):
+    """Of a network that diverged on one clip; the other comparison keeps its own."""
+    differences = np.random.default_rng(0).normal(1, 0.1, size=(2, 3, 8))
+    alone = paired_effects(differences[1:]).p
+    differences[0, 1, 2] = value
+    with np.errstate(invalid="ignore"):
+        p, equal = paired_effects(differences).p, equivalence_p(differences, 5.0)
+    assert np.isnan([p[0], equal[0]]).all()
+    assert p[1] == alone[0]
+    assert equal[1] < 0.05

@@ -321,6 +321,37 @@ def test_a_clip_that_is_no_number_is_left_out(sweep: Sweep, tmp_path: Path):
     assert [cell(table, "no | memory", metric).effect.clips for metric in ("Jitter", "MPJPE")] == [11, 12]
 
 
+@pytest.mark.parametrize("word", ["nan", "inf"])
+def test_a_network_that_diverged_on_a_clip_is_said(sweep: Sweep, tmp_path: Path, word: str):
+    """What its arm is compared by are the clips where it did not; too short a clip is so for every run."""
+    find = fake_sweep(tmp_path, sweep)
+    for arm in sweep.runnable():
+        for seed in sweep.seeds:
+            path = find(arm, seed).evaluation("stream-0")
+            report = json.loads(path.read_text())
+            for branch in ("rotation", "position"):
+                report["clips"][0][branch]["Jitter"] = "nan"
+            for number in (1, 2) if (arm.label, seed) == (sweep.arms[3].label, 1) else ():
+                report["clips"][number]["rotation"]["MPJPE"] = word
+            path.write_text(json.dumps(report))
+    table = table_of(sweep, find)
+    assert [cell(table, "no | memory", metric).effect.clips for metric in ("Jitter", "MPJPE")] == [11, 10]
+    line = (
+        "errors that are no numbers, of clips that are left out of differences: 'full_model' seed 1 (2 clips)"
+    )
+    assert [flag for flag in table.flags if "no numbers" in flag] == [line]
+
+
+def test_groups_that_differ_between_runs_are_said(sweep: Sweep, tmp_path: Path):
+    find = fake_sweep(tmp_path, sweep, groups={clip: f"take {i // 2}" for i, clip in enumerate(CLIPS)})
+    assert not any("data.split.groups" in flag for flag in table_of(sweep, find).flags)
+    for path in find(sweep.runnable()[0], 1).evaluations.glob("*.json"):
+        report = json.loads(path.read_text())
+        report["clips"][0]["group"] = "alone"
+        path.write_text(json.dumps(report))
+    assert any("runs differ in the groups of test clips" in flag for flag in table_of(sweep, find).flags)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
