@@ -10,8 +10,9 @@ from jinja2 import Environment, StrictUndefined, TemplateError
 from memmlp.common.errors import InputError
 from memmlp.report.claims import claims
 from memmlp.report.store import Kept
+from memmlp.statistics import Verdict
 from memmlp.tables.formats import escaped, markdown
-from memmlp.tables.grid import MINUS, caption, effect_words, number_words, unit, value_words
+from memmlp.tables.grid import MINUS, MISSING, caption, effect_words, number_words, unit, value_words
 from memmlp.tables.measured import UNKNOWN, Measured
 from memmlp.tables.table import Cell, Row, Table
 
@@ -20,6 +21,10 @@ ORIGIN = {
     "code": "commit", "torch": "torch", "hardware": "processor", "device": "device", "gpu": "GPU",
     "threads": "threads", "precision": "precision", "data": "data", "body": "body",
 }  # fmt: skip
+
+
+TURNED = {Verdict.HIGHER: Verdict.LOWER, Verdict.LOWER: Verdict.HIGHER}
+"""The verdict on a difference that is turned round; the others stay."""
 
 
 class KeptTable(NamedTuple):
@@ -97,7 +102,19 @@ class Words:
 
     def functions(self) -> dict[str, object]:
         """The placeholders by the name that templates call them by."""
-        names = ("has", "effect", "verdict", "value", "paper", "seen", "table", "title", "origin", "summary")
+        names = (
+            "has",
+            "effect",
+            "verdict",
+            "value",
+            "paper",
+            "seen",
+            "table",
+            "title",
+            "origin",
+            "summary",
+            "way",
+        )
         return {"names": sorted(self.sources), **{name: getattr(self, name) for name in names}}
 
     def has(self, name: str) -> bool:
@@ -157,6 +174,26 @@ class Words:
                 lines.append(f"| {escaped(row.label)} | {escaped(row.against)} | {' | '.join(cells)} |")
         return "\n".join(lines)
 
+    def way(self, name: str, mode: str = "stream") -> str:
+        """How each step of a table's chain of arms changes each metric, and its share of the whole way.
+
+        The chain leads from arm to control, from the table's control on; it is empty where that has none. A
+        share is shown where the interval of the whole way leaves 0 out.
+        """
+        table = self._table(name)
+        steps = _chain(table)
+        if not steps:
+            return ""
+        first = next(row for row in table.rows if row.label == steps[0].against)
+        lines = [f"| step | {' | '.join(table.measured_metrics)} |"]
+        lines += [f"| --- |{' --- |' * len(table.measured_metrics)}"]
+        for row in steps:
+            cells = [_share(row.cells[mode][m], first.cells[mode][m], m) for m in table.measured_metrics]
+            lines.append(f"| {escaped(row.label)} | {' | '.join(map(escaped, cells))} |")
+        whole = [_whole(first.cells[mode][metric]) for metric in table.measured_metrics]
+        title = f"the whole way, from {escaped(first.label)}"
+        return "\n".join([*lines, f"| **{title}** | {' | '.join(map(escaped, whole))} |"])
+
     def _summed(self, name: str, row: Row, mode: str, metric: str) -> str:
         printed = row.cells[mode][metric].paper_effect
         paper = "" if printed is None else f"; paper {self.paper(name, row.label, metric)}"
@@ -173,6 +210,36 @@ class Words:
         _allowed("mode", mode, rows[arm].cells)
         _allowed(f"metric of {name}", metric, rows[arm].cells[mode])
         return rows[arm].cells[mode][metric]
+
+
+def _chain(table: Table) -> list[Row]:
+    """The arms from the one after the chain's first to the table's control, each the control of the next."""
+    rows = {row.label: row for row in table.rows}
+    found: list[Row] = []
+    row = rows[table.control]
+    while row.against in rows and row.against != table.control:
+        found.insert(0, row)
+        row = rows[row.against]
+    return found
+
+
+def _share(cell: Cell, way: Cell, metric: str) -> str:
+    """A step's difference, its share of the way to the control, and its verdict."""
+    if cell.effect is None:
+        return MISSING
+    words = [effect_words(cell, metric)[0].replace("*", "")]
+    if way.effect is not None and (way.effect.low or 0) * (way.effect.high or 0) > 0:
+        words.append(f"{round(100 * cell.effect.mean / -way.effect.mean)} %".replace("-", MINUS))
+    return ", ".join([*words, str(cell.effect.verdict or "no verdict")])
+
+
+def _whole(cell: Cell) -> str:
+    """The way from an arm to its control: the difference turned round, its verdict, and the paper's."""
+    if cell.effect is None:
+        return MISSING
+    verdict = TURNED.get(cell.effect.verdict, cell.effect.verdict) if cell.effect.verdict else "no verdict"
+    printed = "" if cell.paper_effect is None else f"; paper {-cell.paper_effect:+.2f}"
+    return f"{-cell.effect.mean:+.2f}, {verdict}{printed}".replace("-", MINUS)
 
 
 def _allowed(what: str, name: str, known: Iterable[str]) -> None:

@@ -14,11 +14,12 @@ from fake_runs import CLIPS, fake_run, fake_sweep, nothing, runs_of
 from memmlp.cli.results import sources
 from memmlp.common.errors import InputError
 from memmlp.report.claims import NEVER, WORDS, claims
-from memmlp.report.markdown import KeptTable, pages
+from memmlp.report.markdown import KeptTable, Words, pages
 from memmlp.report.store import Kept, dumps, load_kept, overrides_of, save, without_paths
 from memmlp.statistics import Verdict, holm, paired_effects
 from memmlp.sweep.spec import Sweep, load_sweep
 from memmlp.tables.collect import collect
+from memmlp.tables.grid import MINUS
 
 ROOT = Path(__file__).parent.parent.parent
 DOCS = ROOT / "docs" / "results"
@@ -261,6 +262,27 @@ def by_hand(content: dict, row, table, mode: str, metric: str) -> tuple[float, f
     difference = np.array(sides[0]) - np.array(sides[1])
     effects = paired_effects(difference[None], np.array(groups))
     return float(effects.low[0]), float(effects.high[0])
+
+
+def test_the_way_from_the_first_arm_to_the_last_is_the_sum_of_its_steps(sweep: Sweep, tmp_path: Path):
+    """Errors grow from arm to arm of a chain; a share is shown where the interval leaves 0 out."""
+    labels = [arm.label for arm in sweep.arms]
+    against = {labels[0]: labels[1], labels[1]: labels[2], labels[2]: labels[0]}  # the control, two before it
+    arms = tuple(replace(arm, against=against.get(arm.label)) for arm in sweep.arms)
+    chained = replace(sweep, arms=arms, control=labels[0])
+    find = fake_sweep(tmp_path, chained, {labels[1]: 1.1, labels[2]: 1.3}, groups=GROUPS)
+    words = Words({"t": source(chained, Kept("table14", (), runs_of(chained, find), overrides_of(chained)))})
+    rows = [line.split(" | ") for line in words.way("t").splitlines()[2:]]
+    assert [row[0].strip("| ") for row in rows] == [
+        labels[1], labels[0], f"**the whole way, from {labels[2]}**"
+    ]  # fmt: skip
+    column = 1 + chained.metrics.index("MPJPE")
+    parts = [[word.replace(MINUS, "-") for word in row[column].split(", ")] for row in rows]
+    assert float(parts[0][0]) + float(parts[1][0]) == pytest.approx(float(parts[2][0]), abs=0.011)
+    assert [part[1] for part in parts[:2]] == ["67 %", "33 %"]  # 1.3 to 1.1 to 1
+    assert parts[2][1].split("; paper ")[0] == str(words.verdict("t", labels[2], "stream", "MPJPE"))
+    plain = Words({"t": source(sweep, Kept("table14", (), runs_of(sweep, find), overrides_of(sweep)))})
+    assert plain.way("t") == ""
 
 
 def test_results_of_an_arm_that_was_another_are_refused(sweep: Sweep, kept: Kept):
