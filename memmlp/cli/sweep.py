@@ -33,6 +33,7 @@ OPTIONS = ("partition", "time", "mem_gb", "cpus", "gpus", "account", "qos", "con
 @click.option("--status", is_flag=True, help="Show how far it is, and do nothing.")
 @click.option("--dry-run", is_flag=True, help="Show what would be run, and do nothing.")
 @click.option("--retry", is_flag=True, help="Run again what failed.")
+@click.option("--again", is_flag=True, help="Do its finished networks again; their VQ-VAEs stay.")
 @click.option("--fail-fast", is_flag=True, help="End the sweep with the first run that fails.")
 @click.option("--until-decided", is_flag=True, help="Spend seeds in rounds, where verdicts are open.")
 @click.option("--max-seeds", type=int, help="Of an arm, with --until-decided; 13 by default.")
@@ -45,6 +46,7 @@ def sweep(
     status: bool,
     dry_run: bool,
     retry: bool,
+    again: bool,
     fail_fast: bool,
     until_decided: bool,
     max_seeds: int | None,
@@ -66,6 +68,8 @@ def sweep(
 
     engine, options, rest = split_executor(overrides)
     rounds.check(rest, until_decided, max_seeds)
+    if again and (until_decided or status or dry_run):
+        raise InputError("--again: allowed is without --until-decided, --status and --dry-run")
     count = workers or os.cpu_count() or 1
     chosen = find_sweep(name).with_overrides(rest)
     outputs = outputs.absolute()
@@ -84,6 +88,8 @@ def sweep(
     if retry:
         for task in plan.tasks:
             plan.run_of(task).retry()
+    if again:
+        reset(plan)
     work = partial(bring_to_end, engine=engine, options=options, workers=count)
     if known:
         known, plan = rounds.until_decided(chosen, outputs, known, work, fail_fast)
@@ -93,6 +99,13 @@ def sweep(
     if plan.left():
         work(chosen, plan)
     report(rounds.Shown(chosen, plan, None, rounds.spent_before(chosen, outputs)), [name, *rest], chosen)
+
+
+def reset(plan: Plan) -> None:
+    """Remove what the plan's networks are so far, so that all of them are to be made."""
+    for run in {task.id: plan.run_of(task) for task in plan.tasks if task.kind != "vqvae"}.values():
+        with run.lock():
+            run.reset()
 
 
 def split_executor(words: tuple[str, ...]) -> tuple[str, dict[str, object], tuple[str, ...]]:

@@ -108,6 +108,8 @@ def _experiments(sweep: Sweep, arm: Arm, outputs: Path) -> Iterable[tuple[int, E
 
     try:
         cfg = composed(list(sweep.overrides(arm)))
+        if cfg.force:  # arms that share a run would make it again and again
+            raise InputError("force=true: allowed is --again, which does a sweep's finished runs again")
         for seed in sweep.seeds_of(arm):
             cfg.seed, cfg.paths.outputs = seed, str(outputs)
             yield seed, build_experiment(cfg)

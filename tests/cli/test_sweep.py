@@ -6,6 +6,7 @@ import importlib.util
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import time
@@ -131,6 +132,23 @@ def test_retry_takes_failed_runs_up_again(home: Path):
     assert "3 of 4 runs done" in run_apart(home, "sweep", "trial.yaml", *TINY, "--retry", code=1)
     assert len(Run(failed.folder).manifest["attempts"]) == attempts + 1
     assert failed.failure is not None
+
+
+def test_again_does_networks_again_and_force_is_refused(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """With force=true two arms that share a run would make each other's stages again and again."""
+    copy = Path(shutil.copytree(home, tmp_path / "copy"))
+    left = []
+    monkeypatch.setattr(
+        "memmlp.cli.sweep.bring_to_end", lambda chosen, plan, **options: left.extend(plan.left())
+    )
+    command(copy, "--again")
+    assert sorted(task.kind for task in left) == ["memmlp", "memmlp", "memmlp"]
+    kinds = {run.manifest.get("kind") for run in list_runs(copy / "outputs") if run.done}
+    assert kinds == {"vqvae"}
+    assert "--again: allowed is without" in command(copy, "--again", "--status", code=2)
+    assert "force=true: allowed is --again" in command(copy, "force=true", code=2)
 
 
 def test_debug_mode_works_in_this_process(home: Path):
