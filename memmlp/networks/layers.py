@@ -41,7 +41,7 @@ class MLPBlock(nn.Module):
     Args:
         hidden: d, the width of the hidden state.
         frames: T, the window's length.
-        extra: width of further inputs of the second linear layer.
+        extra: width of further inputs of the linear layer.
     """
 
     def __init__(self, hidden: int, frames: int, extra: int = 0):
