@@ -16,16 +16,14 @@ from memmlp.networks.streaming import StreamingGraph, streaming
 from memmlp.networks.window_model import WindowModel
 from memmlp.runs.deployed import Deployed
 
+# What is exported of a network, by the graph's name; "auto" is "streaming" where there is such a graph.
 GRAPHS: dict[str, Callable[[WindowModel], WindowModel | StreamingGraph]] = {
     "naive": lambda model: model,
     "streaming": streaming,
     "auto": lambda model: streaming(model) if model.settled else model,
 }
-"""The graphs by name.
-
-`streaming` computes what depends on one frame alone once; `naive` is the network as it was trained; `auto` is
-`streaming` where the network has such a graph, else `naive`.
-"""
+"""`streaming` computes each frame's own share once, `naive` is the network as it was trained, `auto` the
+first of them that there is."""
 
 
 @dataclass(frozen=True)

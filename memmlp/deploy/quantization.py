@@ -24,8 +24,8 @@ from memmlp.evaluation.modes import rotations_report
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 
-MAX_GROWTH = 0.01
-"""Relative growth of MPJPE up to which int8 may replace float32."""
+MAX_GROWTH = 0.01  # relative
+"""Of MPJPE, up to which int8 may stand for float32."""
 
 CALIBRATION_CLIPS, CALIBRATION_FRAMES, CALIBRATION_EVERY = 40, 400, 20
 TEST_FRAMES = 20_000  # accuracy is measured on at most this many

@@ -1,4 +1,4 @@
-"""The files of evaluations, each with its digest."""
+"""The files of evaluations, each of which holds a digest of itself."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from memmlp.runs.environment import environment
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:
-    """Write the file of an evaluation: what was measured, when, by what, and its digest."""
+    """Write the file of an evaluation: what was measured, when, with what environment, and a digest."""
     path.parent.mkdir(parents=True, exist_ok=True)
     content = plain({**report, "made": now(), "made_by": environment()})
     write_json(path, content | {"digest": _content_digest(content)})
 
 
 def intact(path: Path) -> bool:
-    """Whether the file of an evaluation is as it was written."""
+    """Return whether the file of an evaluation is as it was written."""
     content = read_json(path)
     return content.pop("digest", None) == _content_digest(content)
 
