@@ -79,7 +79,7 @@ def save(
     quiet.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings(), deterministic(step):
-            warnings.simplefilter("ignore")  # the exporter's own deprecations are no news to our users
+            warnings.simplefilter("ignore")  # users can do nothing about the exporter's own deprecations
             program = torch.onnx.export(
                 step,
                 arguments,

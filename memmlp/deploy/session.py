@@ -111,7 +111,7 @@ def open_session(path: Path, profile: Path | None = None) -> onnxruntime.Inferen
         options.enable_profiling, options.profile_file_prefix = True, str(profile)
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # its own kinds of error have no common name
+    except Exception as error:  # ONNX Runtime's own exceptions have no common base class
         raise InputError(
             f"{path}: no ONNX file that runs here ({' '.join(str(error).split())[:120]})"
         ) from error

@@ -48,9 +48,8 @@ class Evaluation:
 
 def picture(model: WindowModel, test: MotionDataset, path: Path) -> None:
     """Draw the start of the first test clip, streamed, beside the truth, as a PNG."""
-    from memmlp.render.figure import (
-        poses_png,
-    )  # imports matplotlib: half a second that planning a sweep spares
+    # Imported here, since it imports matplotlib: half a second that planning a sweep need not spend.
+    from memmlp.render.figure import poses_png
 
     device = model.normalizer.rest.device
     clip = test.clip(0)[:PICTURE_FRAMES].to(device)

@@ -92,7 +92,7 @@ def window_by_window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor
         inputs = torch.stack([padded[i][b : b + size] for i, b in zip(order, begin, strict=True)])
         output, state = network.advance(inputs, state)
         for i, b, result in zip(order, begin, output, strict=True):
-            motion[i][start : b + size] = result[start - b :]
+            motion[i][start : b + size] = result[start - b :]  # the tail window begins at b < start
     return [whole[-len(clip) :] for whole, clip in zip(motion, clips, strict=True)]
 
 

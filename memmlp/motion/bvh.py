@@ -20,8 +20,8 @@ from memmlp.motion.clip import FRAME_RATE_RANGE
 
 AXES = "XYZ"
 CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in AXES)
-END = ".end"  # an end site's name is its joint's and this
-LIMIT = 1e6  # of any number in the file, in its units or degrees
+END = ".end"  # an end site's name is that of its joint with this suffix
+LIMIT = 1e6  # the largest size of any number in the file, in its units or degrees
 MAX_JOINTS = 1000
 MAX_BYTES = 2**30
 RATE_DIGITS = 1e-4  # relative: 1 / 0.00833333 s is 120 Hz, as the header has no more digits

@@ -16,7 +16,7 @@ from memmlp.motion.body import FPS, N_JOINTS
 SMPLH_POSE_DIM = 156
 FRAME_RATE_KEYS = ("mocap_framerate", "mocap_frame_rate")  # SMPL+H and SMPL-X releases
 FRAME_RATE_RANGE = (1.0, 1000.0)
-# What NumPy and zipfile raise on damaged bytes.
+# The exceptions that NumPy and zipfile raise on damaged bytes.
 DAMAGE = (
     OSError, ValueError, EOFError, KeyError, AttributeError, TypeError, IndexError, MemoryError,
     NotImplementedError, SyntaxError, RuntimeError, OverflowError, zipfile.BadZipFile, zlib.error,

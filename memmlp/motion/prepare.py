@@ -289,7 +289,7 @@ def _sync(file: BinaryIO) -> None:
 
 def _frames(clip: Clip, rest: np.ndarray) -> Iterator[np.ndarray]:
     """Yield the frames of a 60 Hz clip in blocks (<= CHUNK, 252), float32, computed in float64."""
-    import torch  # seconds to import, and not needed to find a finished cache
+    import torch  # takes seconds to import, and finding a finished cache does not need it
 
     from memmlp.motion.features import motion_frames
 

@@ -17,7 +17,7 @@ from memmlp.motion.clip import FRAME_RATE_RANGE
 SKELETONS = Path(__file__).parent / "skeletons"
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # Y-up axes to the world's: y becomes z
 HIPS = (1, 2)
-LEGS = {1: 4, 2: 5, 4: 7, 5: 8}  # joint: the joint its bone points to
+LEGS = {1: 4, 2: 5, 4: 7, 5: 8}  # joint -> the joint at the other end of its bone
 LIMBS = LEGS | {16: 18, 17: 19, 18: 20, 19: 21}
 REQUIRED = ("pelvis", "head", *(JOINTS[joint] for joint in sorted({*LIMBS, *LIMBS.values()})))
 

@@ -34,7 +34,8 @@ class Prepared(NamedTuple):
 
     def open(self, split: str) -> MotionDataset:
         """Open a split of the cache, memory-mapped (`MotionDataset.open`)."""
-        from memmlp.motion.dataset import MotionDataset  # imports torch, which finding finished work spares
+        # Imported here, since it imports torch, which finding finished work does not need.
+        from memmlp.motion.dataset import MotionDataset
 
         return MotionDataset.open(self.cache, split)
 

@@ -20,14 +20,14 @@ from typing import Any, Protocol
 from memmlp.common.errors import InputError
 
 PARTS = ("train", "val", "test")
-PHASES = ("train", "test")  # of a published list
+PHASES = ("train", "test")  # the parts for which there are published lists
 
 S2_TRAIN = (
     "CMU", "MPI_Limits", "TotalCapture", "Eyes_Japan_Dataset", "KIT", "BioMotionLab_NTroje", "BMLmovi",
     "EKUT", "ACCAD", "MPI_mosh", "SFU", "MPI_HDM05",
 )  # fmt: skip
 S2_TEST = ("HumanEva", "Transitions_mocap")
-# Later AMASS downloads renamed some subsets; lower case, new name -> the name of the protocols.
+# Later AMASS downloads renamed some subsets: new name -> the name that the protocols use, in lower case.
 RENAMED = {
     "bmlrub": "biomotionlab_ntroje",
     "eyesjapandataset": "eyes_japan_dataset",

@@ -70,9 +70,8 @@ class MLflowTracking:
     def project(self, run: Run) -> None:
         """Create the MLflow run, or bring it up to date."""
         self.outputs.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(
-            self.outputs / ".mlflow.lock"
-        )  # two processes that create it at once ruin a sqlite store
+        # Two processes that create a sqlite store at the same time ruin it.
+        lock = FileLock(self.outputs / ".mlflow.lock")
         with _quiet(), lock:
             from mlflow import MlflowClient
 

@@ -119,6 +119,7 @@ class PersistentStreams(Rollout):
 
     def draw(self, model: WindowModel, frames: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """Draw the call of a training step: the next streams, each one stride further."""
+        # The drawn clips and frames are where streams that have ended, or not begun, start afresh.
         clips, end = sampler.draw(step)
         who = (step * len(clips) + torch.arange(len(clips), device=clips.device)) % self.streams
         going = self.lives[who] & (self.end[who] + model.stride < frames.lengths[self.clip[who]])

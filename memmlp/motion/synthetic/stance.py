@@ -13,7 +13,7 @@ from memmlp.motion.synthetic.puppet import Puppet
 from memmlp.motion.synthetic.steps import Feet, FootStep, tread
 
 STANDING = 0.992  # metres, the root's height with nearly straight legs
-FOLLOW = 0.3  # seconds in which the pelvis follows the feet
+FOLLOW = 0.3  # seconds within which the pelvis follows the feet
 LEFT_RIGHT = np.array([1.0, -1.0])
 
 

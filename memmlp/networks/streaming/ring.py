@@ -102,6 +102,8 @@ class StreamingGraph(nn.Module):
         Returns:
             Motion (1, 1, 198) in the world, and the new state.
         """
+        # Parts of the state that are empty (a queue of no frames) are no inputs of the exported graph, so
+        # they are taken out of the new state and put back from `windows` here.
         ring = Ring.at(state["count"], self.frames)
         motion, kept = self.step(sparse[0], self.windows() | state, ring)
         kept["count"] = counted(state["count"], self.frames)
