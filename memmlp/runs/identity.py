@@ -78,7 +78,10 @@ class Identity:
 
     @property
     def what(self) -> str:
-        """The same less the recipe numbers: equal in runs that differ in the age of their code alone."""
+        """Everything that `id` is a digest of but the recipe numbers.
+
+        It is equal in runs that differ by the age of their code alone.
+        """
         above = self.upstream.what if self.upstream else None
         return _digest(_training(self.kind, self.config, self.data, above))
 

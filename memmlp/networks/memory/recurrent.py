@@ -166,12 +166,12 @@ class RecurrentMemory(FeatureMemory):
 
 
 class LSTMMemory(RecurrentMemory):
-    """Table 15's LSTM-MB."""
+    """A memory of LSTM layers (Table 15's LSTM-MB)."""
 
     recurrence = LSTM
 
 
 class GRUMemory(RecurrentMemory):
-    """Table 15's GRU-MB."""
+    """A memory of GRU layers (Table 15's GRU-MB)."""
 
     recurrence = GRU
