@@ -29,7 +29,7 @@ REST = torch.tensor(builtin_rest_joints())
 
 
 def clip(length: int, seed: int = 0, spread: float = 0.3) -> torch.Tensor:
-    """World frames (length, 252) of smooth random motion of an upright person."""
+    """Make world frames (length, 252) of smooth random motion of an upright person."""
     rng = np.random.default_rng(seed)
     t = np.arange(length + 1)[:, None, None] / 60
     waves = rng.normal(size=(3, 22, 3)) * spread
@@ -41,7 +41,7 @@ def clip(length: int, seed: int = 0, spread: float = 0.3) -> torch.Tensor:
 
 
 def frames(lengths: tuple[int, ...] = (60, 45, 80), seed: int = 0) -> MotionDataset:
-    """A split with clips of these lengths."""
+    """Make a dataset with clips of these lengths."""
     clips = [clip(length, seed + i) for i, length in enumerate(lengths)]
     starts = torch.tensor([0, *np.cumsum(lengths)[:-1]])
     return MotionDataset(
@@ -50,14 +50,14 @@ def frames(lengths: tuple[int, ...] = (60, 45, 80), seed: int = 0) -> MotionData
 
 
 def normalizer(coordinates: World | None = None) -> Normalizer:
-    """World <-> network space with made-up statistics."""
+    """Make a normalizer with made-up statistics."""
     draw = torch.Generator().manual_seed(5)
     std = 0.2 + torch.rand(FRAME_DIM, generator=draw)
     return Normalizer(coordinates or HeadRelative(), REST, 0.1 * torch.randn(FRAME_DIM, generator=draw), std)
 
 
 def vqvae() -> VQVAE:
-    """A VQ-VAE with random code-vectors."""
+    """Make a VQ-VAE with random code-vectors."""
     torch.manual_seed(3)
     model = VQVAE(codes=8, width=12, encoder_depth=2)
     model.codebook.vectors.normal_()
@@ -65,7 +65,7 @@ def vqvae() -> VQVAE:
 
 
 def memory(kind: type[Memory] = CodeMemory, **changes) -> Memory:
-    """A memory for the tiny network, with changed settings."""
+    """Make a memory for the tiny network, with changed settings."""
     if kind is NoMemory:
         return NoMemory(depth=DEPTH, **SIZES)
     settings = {"layers": (2, 4), "width": 6, "fusion": "residual"}
@@ -85,7 +85,7 @@ def model(
     seed: int = 0,
     **changes,
 ) -> MemMLP:
-    """A tiny network with random weights, in evaluation mode."""
+    """Make a tiny network with random weights, in evaluation mode."""
     torch.manual_seed(seed)
     slot = memory(kind, **changes)
     torch.manual_seed(seed)
@@ -108,6 +108,6 @@ BASELINE_LOSSES: dict[str, type[Loss]] = {
 
 
 def baseline(name: str, coordinates: World | None = None, seed: int = 0, **changes) -> WindowModel:
-    """A tiny baseline with random weights, in evaluation mode."""
+    """Make a tiny baseline with random weights, in evaluation mode."""
     torch.manual_seed(seed)
     return BASELINES[name](normalizer(coordinates), **changes).eval()

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, and JSON that can hold every number.
+"""Atomic writing of files, and JSON that can hold every number.
 
 JSON has no word for NaN and infinities: they are stored as the strings "nan", "inf" and "-inf".
 """
@@ -16,12 +16,16 @@ from typing import Any
 
 
 def now() -> str:
-    """The time in UTC, to the second, ISO 8601."""
+    """Return the current time in UTC, to the second, in ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def plain(value: Any) -> Any:
-    """The value as JSON can hold it."""
+    """Return the value in a form that JSON can hold.
+
+    Tuples become lists, keys become strings, and NaN and infinities become the strings "nan", "inf" and
+    "-inf".
+    """
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -47,12 +51,12 @@ def atomic_write(path: Path, content: bytes | str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON atomically, keys in the order given."""
+    """Write JSON atomically, with the keys in the order given."""
     atomic_write(path, json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
 
 
 def sync_folder(folder: Path) -> None:
-    """Make renames and removals in a folder durable."""
+    """Make the renames and removals in a folder durable."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -61,13 +65,13 @@ def sync_folder(folder: Path) -> None:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file, hexadecimal."""
+    """Return the SHA-256 of a file in hexadecimal."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file; empty if there is none or it does not parse."""
+    """Return the object in a JSON file, or an empty one if the file is missing or does not parse."""
     try:
         value = json.loads(path.read_bytes())
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Progress bars with time left, the same everywhere; silent where nobody watches."""
+"""Progress bars that show the time left; they are silent where stderr is no terminal."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 def progress() -> Progress:
-    """A progress display on stderr: description, bar, count, elapsed and remaining time, a note."""
+    """Make a progress display on stderr: description, bar, count, elapsed time, time left, and a note."""
     console = Console(stderr=True)
     return Progress(
         TextColumn("{task.description:<12}"),
@@ -35,7 +35,13 @@ def progress() -> Progress:
 
 
 def track(items: Iterable[T], description: str, total: int | None = None) -> Iterator[T]:
-    """The items, with a progress bar."""
+    """Yield the items while a progress bar counts them.
+
+    Args:
+        items: what to iterate over.
+        description: the bar's label.
+        total: the number of items, where `items` does not know its length.
+    """
     if total is None and isinstance(items, Sized):
         total = len(items)
     with progress() as bar:

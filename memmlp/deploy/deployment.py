@@ -1,4 +1,4 @@
-"""What a trained network is shipped as: its live step as ONNX, checked, timed, and in int8 where asked."""
+"""What a trained network is shipped as: its live step as ONNX, checked and timed, and as int8 if asked."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from memmlp.networks.streaming import StreamingGraph, streaming
 from memmlp.networks.window_model import WindowModel
 from memmlp.runs.deployed import Deployed
 
+# What is exported of a network, by the graph's name; "auto" is "streaming" where there is such a graph.
 GRAPHS: dict[str, Callable[[WindowModel], WindowModel | StreamingGraph]] = {
     "naive": lambda model: model,
     "streaming": streaming,
@@ -29,9 +30,10 @@ first of them that there is."""
 class Deployment:
     """How networks are shipped.
 
-    Args:
-        latency_steps: timed steps, after a warm-up.
-        graph: "auto", "streaming" or "naive". precision: "fp32", or "int8" for a file beside it.
+    Attributes:
+        latency_steps: number of timed steps, after a warm-up.
+        graph: "auto", "streaming" or "naive" (see GRAPHS).
+        precision: "fp32", or "int8" for an int8 file beside the float32 one.
     """
 
     latency_steps: int
@@ -46,13 +48,20 @@ class Deployment:
         train: Sequence[Tensor],
         test: Sequence[Tensor],
     ) -> dict[str, Any]:
-        """Write a run's ONNX files, proved on the first test clip; their sizes, times and int8's accuracy.
+        """Write a run's ONNX files and check the float32 one against torch on the first test clip.
 
         Args:
-            deployed: where the files go. run_id: of the run, for their metadata. train, test: clips (N, 252).
+            model: the trained network.
+            deployed: where the files go.
+            run_id: the run's id, for the files' metadata.
+            train: training clips (N, 252), to calibrate int8.
+            test: test clips (N, 252), to check the file and measure int8's accuracy.
+
+        Returns:
+            The files' sizes, times and int8's accuracy.
 
         Raises:
-            RuntimeError: where ONNX Runtime's numbers are not torch's.
+            RuntimeError: if ONNX Runtime's numbers differ from torch's by more than the tolerance.
         """
         deployed.folder.mkdir(parents=True, exist_ok=True)
         network = GRAPHS[self.graph](model)
@@ -76,7 +85,7 @@ class Deployment:
     def _int8(
         self, network: StreamingGraph, deployed: Deployed, train: Sequence[Tensor], test: Sequence[Tensor]
     ) -> dict[str, Any]:
-        """Write the int8 file beside the float32 one: its accuracy, time and size."""
+        """Write the int8 file beside the float32 one, and return its accuracy, times and size."""
         quantise(deployed.onnx, deployed.int8, network.ends, train)
         cost = compared(deployed.onnx, deployed.int8, network.normalizer, test)
         measured = latency.measure(deployed.int8, self.latency_steps)

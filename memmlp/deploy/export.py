@@ -1,4 +1,4 @@
-"""ONNX of one streaming step with its state explicit.
+"""Export of one streaming step to ONNX, with its state explicit.
 
 Inputs: `sparse` (1, 54), the world features of the newest frame (order: memmlp.motion.body), and `state.*`,
 all zeros for a fresh start. Outputs: `rotation6d` (1, 22, 6) local rotations, `position` (1, 22, 3) metres in
@@ -26,7 +26,7 @@ OPSET = 18
 
 
 class StreamStep(nn.Module):
-    """One step of the live stream with flat inputs and outputs."""
+    """One step of the live stream with flat inputs and outputs, as ONNX wants them."""
 
     def __init__(self, model: WindowModel | StreamingGraph):
         super().__init__()
@@ -34,7 +34,7 @@ class StreamStep(nn.Module):
         self.names = list(model.initial_state(1))
 
     def forward(self, sparse: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        """sparse (1, 54) and the state -> rotation6d (1, 22, 6), position (1, 22, 3), the new state."""
+        """Map `sparse` (1, 54) and the state to (1, 22, 6) rotations, (1, 22, 3) positions, the new state."""
         motion, new = self.model.advance(sparse[:, None], dict(zip(self.names, state, strict=True)), 1)
         last = motion[:, -1]
         rotation = last[:, ROTATION].unflatten(-1, (N_JOINTS, 6))
@@ -64,13 +64,22 @@ def save(
     path: Path,
     meta: dict[str, str],
 ) -> None:
-    """Write a step with named flat inputs and outputs as one ONNX file, atomically."""
+    """Write a step as one ONNX file, atomically.
+
+    Args:
+        step: the module to export.
+        arguments: example arguments of its `forward`.
+        inputs: their names in the file.
+        outputs: names of its outputs in the file.
+        path: the file to write.
+        meta: the file's metadata.
+    """
     quiet = logging.getLogger("torch.onnx")
     level = quiet.level
     quiet.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings(), deterministic(step):
-            warnings.simplefilter("ignore")  # the exporter's own deprecations are no news to our users
+            warnings.simplefilter("ignore")  # users can do nothing about the exporter's own deprecations
             program = torch.onnx.export(
                 step,
                 arguments,
@@ -91,7 +100,7 @@ def save(
 
 
 def metadata(model: WindowModel | StreamingGraph, run_id: str) -> dict[str, str]:
-    """What a program needs to know to drive the file."""
+    """Return the metadata that tell a program how to drive the file."""
     return {
         "joints": json.dumps(JOINTS),
         "parents": json.dumps(PARENTS),

@@ -1,4 +1,4 @@
-"""How long one streaming step takes on a CPU, and how much work it is."""
+"""How long one streaming step takes on a CPU, and how many operations it needs."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.networks.streaming import StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
-WARM_UP = 30
-SETTLING = 3
+WARM_UP = 30  # steps before the timed ones
+SETTLING = 3  # untimed steps of a file at the start of each round
 Key = TypeVar("Key", bound=Hashable)
 YARDSTICK_SHAPE = (41, 512, 8)  # rows, width, layers: 86 M multiply-adds of plain matrix products
 
 
 def measure(path: Path, steps: int = 200) -> dict[str, Any]:
-    """Median and p95 milliseconds a step of an exported file, one thread, beside the yardstick.
+    """Time one step of an exported file on one thread: median and 95th percentile, in milliseconds.
 
-    The two are timed in turn, step by step, in the same minute, so that machines can be compared by the
-    ratio. `steps` is at least 200.
+    The step and the yardstick are timed in turn, step by step, in the same minute, so that their ratio
+    compares machines. At least 200 steps are timed, however few are asked for.
     """
     stream, yardstick = OnnxStream(path), yardstick_session()
     sparse = np.zeros((1, SPARSE_DIM), np.float32)
@@ -56,9 +56,12 @@ def measure(path: Path, steps: int = 200) -> dict[str, Any]:
 
 
 def interleaved(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, np.ndarray]:
-    """Seconds (rounds, steps) a step of each exported file, one thread, the files in turn in each round.
+    """Time a step of each exported file on one thread, the files in turn in each round.
 
     A file's first steps of a round, in which the caches fill, do not count.
+
+    Returns:
+        For each file the seconds of its steps (rounds, steps).
     """
     streams = {key: OnnxStream(path) for key, path in paths.items()}
     seconds = {key: np.zeros((rounds, steps)) for key in paths}
@@ -74,10 +77,13 @@ def interleaved(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key,
 
 
 def profile(path: Path, steps: int = 100) -> list[tuple[str, str, float, float]]:
-    """Where a step's time goes: operation, shape of its first input, times a step, microseconds each.
+    """Measure where a step's time goes, by ONNX Runtime's own profile.
 
-    The median of each, by ONNX Runtime's own profile, which adds one or two microseconds to each; the
-    costliest first.
+    The profile adds one or two microseconds to each operation.
+
+    Returns:
+        For each kind of operation its name, the shape of its first input, how often it runs in a step, and
+        the median microseconds of one run; the costliest kind first.
     """
     with tempfile.TemporaryDirectory() as folder:
         stream = OnnxStream(path, profile=Path(folder) / "profile")
@@ -94,12 +100,15 @@ def profile(path: Path, steps: int = 100) -> list[tuple[str, str, float, float]]
 
 
 def size(model: WindowModel, step: WindowModel | StreamingGraph, path: Path) -> dict[str, Any]:
-    """Parameters, MACs and FLOPs of the network, which the papers count, MACs of the step, the file's bytes.
+    """Measure a network: its parameters, MACs and FLOPs, the MACs of its exported step, the file's bytes.
 
-    A FLOP is a multiplication or an addition of the matrix products, a MAC one of each.
+    "macs" and "flops" are the network's, which papers count; "step_macs" are those of the exported graph.
+    Only matrix products are counted; a FLOP is one multiplication or addition, a MAC is one of each.
 
     Args:
-        model: the network as it was trained. step: what was exported of it. path: that file.
+        model: the network as it was trained.
+        step: the network or streaming graph that was exported.
+        path: the exported file.
     """
     multiplied = macs(model.cpu().eval())
     return {
@@ -114,14 +123,14 @@ def size(model: WindowModel, step: WindowModel | StreamingGraph, path: Path) -> 
 
 @torch.no_grad()
 def macs(model: WindowModel | StreamingGraph) -> int:
-    """Multiply-adds of the matrix products of one streaming step."""
+    """Count the multiply-adds of the matrix products of one streaming step."""
     with FlopCounterMode(display=False) as counter:
         model.advance(torch.zeros(1, 1, SPARSE_DIM), model.initial_state(1), 1)
     return counter.get_total_flops() // 2
 
 
 def yardstick_session() -> onnxruntime.InferenceSession:
-    """A fixed stack of matrix products and ReLUs, the same for ever, as a yardstick for machines."""
+    """Make the yardstick for comparing machines: a fixed stack of matrix products and ReLUs."""
     rows, width, layers = YARDSTICK_SHAPE
     weight = np.random.default_rng(0).standard_normal((width, width), np.float32) / np.sqrt(width)
     nodes, name = [], "input"
@@ -146,7 +155,7 @@ def yardstick_session() -> onnxruntime.InferenceSession:
 
 
 def _milliseconds(prefix: str, seconds: list[float]) -> dict[str, float]:
-    """Median and 95th percentile in milliseconds."""
+    """Return median and 95th percentile of seconds, in milliseconds, their keys preceded by the prefix."""
     return {
         f"{prefix}median_ms": 1000 * float(np.median(seconds)),
         f"{prefix}p95_ms": 1000 * float(np.percentile(seconds, 95)),

@@ -1,4 +1,4 @@
-"""The proof that an ONNX file computes what the network does: both stream a whole clip."""
+"""Parity: proof that an ONNX file computes what the network does, by streaming a whole clip through both."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.networks.memory import Blend
 from memmlp.networks.window_model import WindowModel
 
-TOLERANCE = 1e-4
+TOLERANCE = 1e-4  # on 6D components and metres
 
 
 @contextmanager
 def deterministic(model: nn.Module) -> Iterator[None]:
-    """No draws, which torch and ONNX Runtime could not share: a sampled m (reading 7) is its mean."""
+    """Replace a sampled m (reading 7) by its mean, since torch and ONNX Runtime could not share draws."""
     sampled = [module for module in model.modules() if isinstance(module, Blend) and module.sampled]
     values = [blend.value for blend in sampled]
     try:
@@ -36,11 +36,16 @@ def deterministic(model: nn.Module) -> Iterator[None]:
 
 @torch.no_grad()
 def parity(model: WindowModel, path: Path, clip: Tensor) -> float:
-    """Largest difference between torch and ONNX Runtime, each with its own history, over a clip (N, 252).
+    """Return the largest difference between torch and ONNX Runtime, each on its own history, over a clip.
 
-    A network without a position branch: its positions are compared with those that follow from the same
-    rotations. Where 6D columns are almost parallel, which an untrained network makes now and then, a
-    difference between rotations within float32's rounding would come out a hundredfold.
+    The positions of a network without a position branch are compared with those that follow, in float64, from
+    ONNX Runtime's rotations. Where 6D columns are almost parallel, which an untrained network produces now
+    and then, a difference between rotations within float32's rounding would otherwise come out a hundredfold.
+
+    Args:
+        model: the trained network.
+        path: the exported file.
+        clip: (N, 252).
     """
     model, clip = model.cpu().eval(), clip.cpu()
     made, found = in_torch(model, clip), streamed(OnnxStream(path), clip)
@@ -53,7 +58,7 @@ def parity(model: WindowModel, path: Path, clip: Tensor) -> float:
 
 @torch.no_grad()
 def in_torch(model: WindowModel, clip: Tensor) -> Tensor:
-    """Motion (N, 198) in the world that the network streams of a clip's inputs (N, 252 or 54)."""
+    """Return the world motion (N, 198) that the network streams of a clip's inputs (N, 252 or 54)."""
     state, made = model.initial_state(1), []
     with deterministic(model):
         for sparse in track(clip[:, None, None, :SPARSE_DIM], "check"):
@@ -63,7 +68,7 @@ def in_torch(model: WindowModel, clip: Tensor) -> Tensor:
 
 
 def streamed(stream: OnnxStream, clip: Tensor) -> Tensor:
-    """Motion (N, 198) in the world that a fresh stream makes of a clip's inputs (N, 252)."""
+    """Return the world motion (N, 198) that a fresh ONNX stream makes of a clip's inputs (N, 252 or 54)."""
     stream.reset()
     outputs = [stream.step(sparse) for sparse in clip[:, None, :SPARSE_DIM].numpy()]
     return torch.tensor(np.stack([np.concatenate([r.ravel(), p.ravel()]) for r, p in outputs]))

@@ -1,9 +1,9 @@
 """int8 of an exported stream, by ONNX Runtime's static quantisation, and what it costs in accuracy.
 
-Weights have a scale for each output and seven bits, since CPUs without VNNI add products of eight in
-sixteen and overflow. Activations have eight bits and one scale, from training clips streamed through the
-network. What stands at the network's ends stays in float32 (`Stream.ends`): the stem's input has
-outliers, and the heads' rounding would be seen as jitter.
+Weights get one scale for each output and seven bits: CPUs without VNNI add products of eight-bit numbers in
+sixteen bits, and overflow. Activations get eight bits and one scale, found by streaming training clips
+through the network. The modules at the network's ends stay in float32 (`StreamingGraph.ends`): the stem's
+input has outliers, and rounding in the heads would be seen as jitter.
 """
 
 from __future__ import annotations
@@ -24,21 +24,24 @@ from memmlp.evaluation.modes import rotations_report
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 
-MAX_GROWTH = 0.01
+MAX_GROWTH = 0.01  # relative
 """Of MPJPE, up to which int8 may stand for float32."""
 
 CALIBRATION_CLIPS, CALIBRATION_FRAMES, CALIBRATION_EVERY = 40, 400, 20
-TEST_FRAMES = 20_000  # that accuracy is measured on, at most
+TEST_FRAMES = 20_000  # accuracy is measured on at most this many
 
 
 class Calibration(CalibrationDataReader):
-    """Inputs and states of a stream of the middle of each clip (N, 252), every twentieth frame of it."""
+    """Calibration samples, inputs and states: every twentieth frame of streams of clips (N, 252).
+
+    Of each clip the middle 400 frames are streamed.
+    """
 
     def __init__(self, path: Path, clips: Sequence[Tensor]):
         self.samples = _samples(OnnxStream(path), clips[:CALIBRATION_CLIPS])
 
     def get_next(self) -> dict[str, np.ndarray] | None:  # type: ignore[override]
-        """The next sample, None at the end."""
+        """Return the next sample, or None at the end."""
         return next(self.samples, None)  # type: ignore[arg-type]
 
 
@@ -56,13 +59,14 @@ def quantise(source: Path, path: Path, ends: Sequence[str], clips: Sequence[Tens
     """Write the int8 form of an exported stream.
 
     Args:
-        source: of a streaming graph, float32. path: the file to write.
-        ends: names of the stream's modules that stay in float32.
-        clips: training clips (N, 252) for the activations' ranges.
+        source: the float32 ONNX file of a streaming graph.
+        path: the file to write.
+        ends: names of the graph's modules that stay in float32.
+        clips: training clips (N, 252), from which the activations' ranges are found.
     """
     temporary, quiet = path.with_name(path.name + ".tmp"), logging.getLogger()
     level = quiet.level
-    quiet.setLevel(logging.ERROR)  # it advises a preparation that torch's exporter has done
+    quiet.setLevel(logging.ERROR)  # it advises to prepare the graph, which torch's exporter has done already
     try:
         quantize_static(
             source,
@@ -72,7 +76,7 @@ def quantise(source: Path, path: Path, ends: Sequence[str], clips: Sequence[Tens
             nodes_to_quantize=_inner_layers(onnx.load(source), ends),
             op_types_to_quantize=["Gemm", "MatMul"],
             per_channel=True,
-            reduce_range=True,
+            reduce_range=True,  # seven bits
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
             extra_options={"OpTypesToExcludeOutputQuantization": ["Gemm", "MatMul"]},
@@ -84,7 +88,7 @@ def quantise(source: Path, path: Path, ends: Sequence[str], clips: Sequence[Tens
 
 
 def _inner_layers(graph: onnx.ModelProto, ends: Sequence[str]) -> list[str]:
-    """Names of the nodes that multiply by a layer's weight, those at the ends left out."""
+    """Return the names of the nodes that multiply by a layer's weight, except those at the ends."""
     weights = {tensor.name for tensor in graph.graph.initializer}
     kept = tuple(f"model.{end}." for end in ends)
     return [
@@ -98,9 +102,9 @@ def _inner_layers(graph: onnx.ModelProto, ends: Sequence[str]) -> list[str]:
 
 
 def accuracy(path: Path, normalizer: Normalizer, clips: Sequence[Tensor]) -> dict[str, float]:
-    """Means over clips (N, 252) of the rotation branch's metrics, streamed in ONNX Runtime.
+    """Measure the rotation branch's metrics, streamed in ONNX Runtime: means over clips (N, 252).
 
-    At most 20,000 frames of them are streamed, of each clip the same share.
+    At most 20,000 frames are streamed; where there are more, the same share of each clip.
     """
     stream, share = OnnxStream(path), min(1.0, TEST_FRAMES / sum(map(len, clips)))
     rows = []
@@ -111,7 +115,11 @@ def accuracy(path: Path, normalizer: Normalizer, clips: Sequence[Tensor]) -> dic
 
 
 def compared(exact: Path, quantised: Path, normalizer: Normalizer, clips: Sequence[Tensor]) -> dict[str, Any]:
-    """What int8 costs: metrics of both on test clips, MPJPE's growth, and whether it may be the default."""
+    """Measure what int8 costs on test clips.
+
+    Returns:
+        The metrics of both files, MPJPE's relative growth, and whether int8 may be the default.
+    """
     before, after = (accuracy(path, normalizer, clips) for path in (exact, quantised))
     growth = after["MPJPE"] / before["MPJPE"] - 1
     return {"fp32": before, "int8": after, "growth": growth, "default": growth <= MAX_GROWTH}

@@ -1,4 +1,4 @@
-"""An exported step in ONNX Runtime on one thread: arrays bound once, the state carried. Needs no torch."""
+"""An exported step in ONNX Runtime, on one thread and without torch."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ STATE, NEXT = "state.", ".next"
 class OnnxStream:
     """An ONNX file whose inputs `state.*` are fed by its outputs `state.*.next`.
 
-    A step writes the new state beside the old one, and the two change places, so that nothing is allocated
-    or copied.
+    The state is held in two sets of arrays: a step reads the old state from one and writes the new one to the
+    other, and the two change places. So nothing is allocated or copied at a step.
 
     Args:
-        path: the ONNX file. profile: where ONNX Runtime's profile goes, if anywhere: the start of the path.
+        path: the ONNX file.
+        profile: start of the path to which ONNX Runtime writes its profile; None for no profile.
 
     Attributes:
-        inputs: the other inputs, to be written before a step. outputs: the other outputs of the last step,
-            overwritten by the next.
+        inputs: arrays of the other inputs, to be written before a step.
+        outputs: arrays of the other outputs, which hold those of the last step until the next one.
 
     Raises:
-        InputError: for a file that is missing, does not run, or has not the form of such a step.
+        InputError: if the file is missing, does not run, or does not have the form of such a step.
     """
 
     def __init__(self, path: Path, profile: Path | None = None):
@@ -44,7 +45,7 @@ class OnnxStream:
         self._other_binding = self._bound(self._other, self._state)
 
     def _check(self) -> None:
-        """Refuse a file of other inputs and outputs."""
+        """Raise InputError if the file's inputs and outputs are not those of an exported step."""
         inputs = {i.name: i.shape for i in self.session.get_inputs()}
         outputs = {o.name: o.shape for o in self.session.get_outputs()}
         ends = [*self.session.get_inputs(), *self.session.get_outputs()]
@@ -55,34 +56,38 @@ class OnnxStream:
 
     @property
     def state(self) -> Arrays:
-        """The state as it stands, a copy."""
+        """A copy of the present state."""
         return {name: array.copy() for name, array in self._state.items()}
 
     def reset(self) -> None:
-        """A fresh start: zeros."""
+        """Set the state to a fresh start, all zeros."""
         for array in self._state.values():
             array[:] = 0
 
     def peek(self) -> None:
-        """A step whose new state is not kept."""
+        """Run a step without keeping its new state."""
         self.session.run_with_iobinding(self._binding)
 
     def advance(self) -> None:
-        """A step from `inputs` to `outputs`."""
+        """Run a step from `inputs` to `outputs` and keep its new state."""
         self.peek()
         self._state, self._other = self._other, self._state
         self._binding, self._other_binding = self._other_binding, self._binding
 
     def step(self, *given: np.ndarray) -> list[np.ndarray]:
-        """A step with inputs and outputs in the file's order: for scope `network`, sparse (1, 54) ->
-        rotation6d (1, 22, 6) and position (1, 22, 3)."""
+        """Run a step and return copies of its outputs, in the file's order.
+
+        Args:
+            given: values of the inputs, in the file's order. A file of scope `network` takes sparse (1, 54)
+                and returns rotation6d (1, 22, 6) and position (1, 22, 3).
+        """
         for array, value in zip(self.inputs.values(), given, strict=True):
             array[:] = value
         self.advance()
         return [array.copy() for array in self.outputs.values()]
 
     def _bound(self, old: Arrays, new: Arrays) -> onnxruntime.IOBinding:
-        """A step from one set of state arrays to the other."""
+        """Bind a step that reads the state from one set of arrays and writes it to the other."""
         binding = self.session.io_binding()
         for name, array in {**self.inputs, **old}.items():
             binding.bind_input(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
@@ -93,7 +98,11 @@ class OnnxStream:
 
 
 def open_session(path: Path, profile: Path | None = None) -> onnxruntime.InferenceSession:
-    """An ONNX file in ONNX Runtime on one thread. Raises InputError where it is none."""
+    """Open an ONNX file in ONNX Runtime on one thread.
+
+    Raises:
+        InputError: if there is no such file, or it is no ONNX file that runs here.
+    """
     if not path.is_file():
         raise InputError(f"{path}: no such file; allowed: what memmlp export writes, or a run's folder")
     options = onnxruntime.SessionOptions()
@@ -102,7 +111,7 @@ def open_session(path: Path, profile: Path | None = None) -> onnxruntime.Inferen
         options.enable_profiling, options.profile_file_prefix = True, str(profile)
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # its own kinds of error have no common name
+    except Exception as error:  # ONNX Runtime's own exceptions have no common base class
         raise InputError(
             f"{path}: no ONNX file that runs here ({' '.join(str(error).split())[:120]})"
         ) from error

@@ -23,8 +23,10 @@ class Evaluation:
     """How a network is evaluated.
 
     Attributes:
-        modes: "stream", "window". batch: clips side by side, at most.
-        ik: inverse kinematics, whose branch comes beside the network's. seed: of a blend that is sampled.
+        modes: the evaluation modes, of "stream" and "window".
+        batch: how many clips are evaluated side by side, at most.
+        ik: inverse kinematics, whose result is reported as a branch beside the network's own.
+        seed: seed of the draws of a blend that is sampled.
     """
 
     modes: Sequence[str]
@@ -33,16 +35,21 @@ class Evaluation:
     seed: int
 
     def report(self, model: WindowModel, test: MotionDataset, mode: str) -> dict[str, Any]:
-        """The metrics in a mode: `{"mean": {branch: {metric: value}}, "clips": [...]}`, a row a clip."""
-        torch.manual_seed(self.seed)  # the modes are alike in whatever order they are made
+        """Compute the metrics in a mode.
+
+        Returns:
+            `{"mean": {branch: {metric: value}}, "clips": [...]}`, where the list has a row for each clip.
+        """
+        torch.manual_seed(self.seed)  # a mode's result does not depend on which modes came before it
         found = modes.evaluate(model, test, [mode], self.batch, self.ik)
         rows = [{key: row[key] for key in ("name", "group", "frames")} | row[mode] for row in found["clips"]]
         return {"mean": found["mean"][mode], "clips": rows}
 
 
 def picture(model: WindowModel, test: MotionDataset, path: Path) -> None:
-    """Draw the start of the first test clip, streamed."""
-    from memmlp.render.figure import poses_png  # with matplotlib: half a second that planning needs not
+    """Draw the start of the first test clip, streamed, beside the truth, as a PNG."""
+    # Imported here, since it imports matplotlib: half a second that planning a sweep need not spend.
+    from memmlp.render.figure import poses_png
 
     device = model.normalizer.rest.device
     clip = test.clip(0)[:PICTURE_FRAMES].to(device)

@@ -1,4 +1,4 @@
-"""The inverse-kinematics slot: local rotations that bring the pose to the position branch (App. A).
+"""The inverse-kinematics slot: finds local rotations that bring the pose to the position branch (App. A).
 
 The paper runs L-BFGS for at most 15 iterations from the rotation branch's pose (Table 6, reading 11).
 """
@@ -21,47 +21,51 @@ Objective = Callable[[Tensor, Tensor], Tensor]
 
 
 class NoIK:
-    """No third result beside the two branches."""
+    """No inverse kinematics: there is no third result beside the two branches."""
 
     def solutions(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
-        """None."""
+        """Return no result."""
         return {}
 
 
 @dataclass(frozen=True)
 class LBFGS:
-    """Table 6's "Rotation + Position Branch".
+    """L-BFGS on every frame by itself: Table 6's "Rotation + Position Branch".
 
-    The variables are an axis-angle increment for each joint, applied on the right of its predicted
-    rotation: smooth around the start, without the redundant scale of 6D. The head stays on its tracker as
-    in `Frame.pose`, so that what is minimised is what is measured. A rotation that moves no joint (those of
-    the leaves) stays as predicted. In float64, so that a frame's result does not depend on its neighbours.
+    The variables are an axis-angle increment for each joint, applied on the right of its predicted rotation:
+    smooth around the start, without the redundant scale of 6D. The head stays on its tracker as in
+    `Normalizer.pose`, so that what is minimised is what is measured. A rotation that moves no joint (those of
+    the leaves) stays as predicted. All of it is computed in float64, so that a frame's result does not depend
+    on its neighbours.
 
-    Every frame is solved by itself. torch.optim.LBFGS (strong Wolfe) over a batch has one step length and one
-    curvature for all its frames, so that a frame's result depends on which others stand beside it. Measured
-    on 3000 streamed frames of CMU salsa, one thread, 15 iterations: from 3.13 cm between the branches to 0.98
-    in 2 s, Jitter from 16.4 to 17.9; torch's to 1.02 in 5 s, Jitter 16.6.
+    torch.optim.LBFGS (strong Wolfe) is not used: over a batch it has one step length and one curvature for
+    all frames, so that a frame's result depends on which others stand beside it. Measured on 3000 streamed
+    frames of CMU salsa, one thread, 15 iterations: the distance between the branches falls from 3.13 cm to
+    0.98 cm in 2 s and Jitter rises from 16.4 to 17.9; torch's L-BFGS reaches 1.02 cm in 5 s with a Jitter of
+    16.6.
 
     Attributes:
-        iterations: at most.
-        chunk: frames side by side.
+        iterations: number of iterations, at most.
+        chunk: number of frames that are solved side by side.
     """
 
     iterations: int = 15
     chunk: int = 4096
 
     def solutions(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
-        """The motion (N, 198) with the rotations that fit best, as "combined".
+        """Return the motion (N, 198) with the rotations that fit best, under the name "combined".
 
         Args:
-            motion: predicted (N, 198), world. sparse: inputs (N, 54).
+            normalizer: converts between the world and network space; its rest pose is used.
+            motion: predicted motion (N, 198), world.
+            sparse: inputs (N, 54), world.
         """
         parts = zip(motion.split(self.chunk), sparse.split(self.chunk), strict=True)
         rotations = torch.cat([self.solve(normalizer, *part) for part in parts])
         return {"combined": torch.cat([rotations, motion[:, POSITION]], -1)}
 
     def solve(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> Tensor:
-        """Rotations (N, 132) in 6D, frame by frame, whose joints are nearest to the position branch's."""
+        """Return rotations (N, 132) in 6D that bring each frame's joints nearest to the position branch's."""
         start = sixd_to_matrix(motion[:, ROTATION].double().unflatten(-1, (N_JOINTS, 6)))
         head = sparse[:, SPARSE_POSITION][:, :3].double()
         target = motion[:, POSITION].double().unflatten(-1, (N_JOINTS, 3)) - head[:, None]
@@ -74,18 +78,21 @@ IK = NoIK | LBFGS
 
 
 class JointDistance:
-    """Sum over joints of the squared distance (m^2) to targets relative to the head, frame by frame.
+    """The objective: the sum over joints of the squared distance (m^2) to targets relative to the head.
 
     Args:
-        start: local rotations (N, 22, 3, 3). target: metres (N, 22, 3). rest: rest positions (22, 3), metres.
+        start: local rotations (N, 22, 3, 3).
+        target: positions (N, 22, 3) relative to the head, metres.
+        rest: rest positions (22, 3), metres.
     """
 
-    LEVER = 0.1  # m^2, keeps the unit of a joint that moves little within bounds
+    LEVER = 0.1  # m^2, bounds the unit of a joint whose turn moves little
 
     def __init__(self, start: Tensor, target: Tensor, rest: Tensor):
         self.start, self.target, self.rest = start, target, rest
-        # A hip moves more than a wrist: in units of 1 / lever all variables bend the objective alike, so that
-        # few iterations get far and neighbouring frames go the same way (without: 1.19 cm, Jitter 24).
+        # Turning a hip moves more than turning a wrist. Each variable gets a unit in which the objective's
+        # curvature is about the same, so that few iterations get far and neighbouring frames go the same way
+        # (without: 1.19 cm, Jitter 24).
         still = torch.eye(3).to(start).expand(1, N_JOINTS, 3, 3)
         moved = jacobian(
             lambda turn: self.joints(still, turn[None])[0].flatten(), torch.zeros_like(start[0, ..., 0])
@@ -93,43 +100,57 @@ class JointDistance:
         self.unit = (2 * moved.square().sum(0).mean(-1, keepdim=True) + self.LEVER).rsqrt()
 
     def __call__(self, increment: Tensor, rows: Tensor) -> Tensor:
-        """The objective (n,) at increments (n, 66) of those rows (n,)."""
+        """Return the objective (n,) at increments (n, 66) of the rows (n,) of `start` and `target`."""
         joints = self.joints(self.start[rows], self.turn(increment))
         return (joints - self.target[rows]).square().sum((1, 2))
 
     def turned(self, increment: Tensor) -> Tensor:
-        """Local rotations (N, 22, 3, 3) after increments (N, 66)."""
+        """Return the local rotations (N, 22, 3, 3) after increments (N, 66)."""
         return self.start @ axis_angle_to_matrix(self.turn(increment))
 
     def turn(self, increment: Tensor) -> Tensor:
-        """Increments (n, 66) as axis-angle (n, 22, 3)."""
+        """Convert increments (n, 66) to axis-angle (n, 22, 3), radians."""
         return increment.unflatten(-1, (N_JOINTS, 3)) * self.unit
 
     def joints(self, start: Tensor, turn: Tensor) -> Tensor:
-        """Positions (n, 22, 3) relative to the head after turns (n, 22, 3) of rotations (n, 22, 3, 3)."""
+        """Return the joints' positions (n, 22, 3) relative to the head.
+
+        Args:
+            start: local rotations (n, 22, 3, 3).
+            turn: axis-angle increments (n, 22, 3), applied on their right.
+        """
         local = start @ axis_angle_to_matrix(turn)
         _, positions = forward_kinematics(local, torch.zeros_like(local[:, 0, 0]), self.rest)
         return positions - positions[:, HEAD : HEAD + 1]
 
 
 class Curvature(NamedTuple):
-    """A change of the variables and of the gradient (N, D), and 1 / their product (N,), 0 where useless."""
+    """How the gradient changed along a step that was taken: what L-BFGS knows of the curvature.
+
+    Attributes:
+        x: change of the variables (N, D).
+        gradient: change of the gradient (N, D).
+        inverse: 1 / (their inner product) (N,), or 0 for a row where the step says nothing.
+    """
 
     x: Tensor
     gradient: Tensor
     inverse: Tensor
 
 
-ARMIJO = 1e-4  # of the decrease that the slope promises
-HALVINGS = 10
-CURVATURE = 1e-12  # the least, relative to the gradient's change, for a step to say something of it
+ARMIJO = 1e-4  # the share of the decrease promised by the slope that a step must reach
+HALVINGS = 10  # step lengths tried, each half of the one before
+CURVATURE = 1e-12  # a step's product with the gradient's change must exceed this times the latter's square
 
 
 def minimise(objective: Objective, x: Tensor, iterations: int, history: int = 10) -> Tensor:
-    """L-BFGS (Nocedal and Wright, Algorithm 7.4) on every row of x (N, D) by itself.
+    """Run L-BFGS (Nocedal and Wright, Algorithm 7.4) on every row of x (N, D) by itself.
 
     Each row has its own curvature and step length (halved from 1 until Armijo's condition holds), and stays
-    where no step helps: the objective never rises.
+    where it is when no step helps: the objective never rises.
+
+    Returns:
+        The variables (N, D) at the end.
     """
     everyone = torch.arange(len(x), device=x.device)
     value, gradient = value_and_gradient(objective, x, everyone)
@@ -144,7 +165,7 @@ def minimise(objective: Objective, x: Tensor, iterations: int, history: int = 10
 
 
 def value_and_gradient(objective: Objective, x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Objective (N,) and gradient (N, D)."""
+    """Return the objective (N,) and its gradient (N, D)."""
     with torch.enable_grad():
         x = x.detach().requires_grad_()
         value = objective(x, rows)
@@ -153,14 +174,14 @@ def value_and_gradient(objective: Objective, x: Tensor, rows: Tensor) -> tuple[T
 
 
 def curvature(x: Tensor, gradient: Tensor) -> Curvature:
-    """The step of these changes; none for a row without positive curvature."""
+    """Return the curvature of a step from its changes (N, D); rows without positive curvature say nothing."""
     product = (x * gradient).sum(-1)
     useful = product > CURVATURE * gradient.square().sum(-1)
     return Curvature(x, gradient, torch.where(useful, 1 / torch.where(useful, product, 1), 0))
 
 
 def two_loop(gradient: Tensor, steps: list[Curvature]) -> Tensor:
-    """The inverse Hessian's estimate times the gradient (N, D)."""
+    """Return the estimated inverse Hessian times the gradient (N, D), by the two-loop recursion."""
     q, weights = gradient, []
     for step in reversed(steps):
         weight = step.inverse * (step.x * q).sum(-1)
@@ -173,7 +194,10 @@ def two_loop(gradient: Tensor, steps: list[Curvature]) -> Tensor:
 
 
 def first_guess(gradient: Tensor, steps: list[Curvature]) -> Tensor:
-    """The inverse Hessian (N,) as a number: from the newest useful step, at first at most 1 / |gradient|."""
+    """Return the first estimate of the inverse Hessian, a multiple (N,) of the identity.
+
+    It comes from the row's newest useful step; without one it makes the first step at most 1 long.
+    """
     length = 1 / gradient.norm(dim=-1).clamp_min(1)
     for step in steps:
         square = step.gradient.square().sum(-1)
@@ -185,7 +209,11 @@ def first_guess(gradient: Tensor, steps: list[Curvature]) -> Tensor:
 def line_search(
     objective: Objective, x: Tensor, value: Tensor, gradient: Tensor, direction: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Variables (N, D) and values (N,) after each row's largest of the halved steps that is good enough."""
+    """Halve each row's step until it is good enough (Armijo's condition).
+
+    Returns:
+        Variables (N, D) and values (N,) after the step; a row that found no good step is unchanged.
+    """
     slope = (gradient * direction).sum(-1)
     rows = (slope < 0).nonzero()[:, 0]
     x, value, length = x.clone(), value.clone(), 1.0

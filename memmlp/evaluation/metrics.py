@@ -1,4 +1,4 @@
-"""The field's metrics (brief definitions beside each), as pure functions per clip. Lower is better.
+"""The field's metrics as pure functions of one clip; lower is better.
 
 Positions (N, 22, 3) are metres in the world at 60 Hz; rotations (N, 22, 3, 3) are local, the root's global.
 """
@@ -17,9 +17,10 @@ POSITION_GROUPS = {"Hand PE": HANDS, "Upper PE": UPPER, "Lower PE": LOWER, "Root
 
 
 def mpjre(predicted: Tensor, truth: Tensor) -> Tensor:
-    """AGRoL's MPJRE, degrees: mean |difference of the 63 axis-angle components| of joints 1-21.
+    """Return AGRoL's MPJRE in degrees: the mean absolute difference of the axis-angle components.
 
-    Each difference is wrapped to [-pi, pi]. It is no angle: a 5 degree error reads 2.5 to 3.2.
+    The 63 components are those of joints 1-21, and each difference is wrapped to [-pi, pi]. This is not an
+    angle: an error of 5 degrees reads 2.5 to 3.2.
     """
     difference = matrix_to_axis_angle(predicted[:, 1:]) - matrix_to_axis_angle(truth[:, 1:])
     wrapped = torch.remainder(difference + math.pi, 2 * math.pi) - math.pi
@@ -27,28 +28,31 @@ def mpjre(predicted: Tensor, truth: Tensor) -> Tensor:
 
 
 def geodesic(predicted: Tensor, truth: Tensor) -> Tensor:
-    """Mean angle between predicted and true local rotations of joints 1-21, degrees."""
+    """Return the mean angle between predicted and true local rotations of joints 1-21, in degrees."""
     return torch.rad2deg(geodesic_angle(predicted[:, 1:], truth[:, 1:]).mean())
 
 
 def position_error(predicted: Tensor, truth: Tensor, joints: tuple[int, ...] | None = None) -> Tensor:
-    """Mean distance over frames and the given joints (all 22 by default), cm."""
+    """Return the mean distance over frames and the given joints (all 22 by default), in cm."""
     distance = (predicted - truth).norm(dim=-1)
     return 100 * (distance if joints is None else distance[:, list(joints)]).mean()
 
 
 def velocity_error(predicted: Tensor, truth: Tensor) -> Tensor:
-    """Mean norm of the difference of frame-to-frame velocities (MPJVE), cm/s; NaN under 2 frames."""
+    """Return the mean norm of the difference of velocities between frames (MPJVE), in cm/s.
+
+    It is NaN under 2 frames.
+    """
     return 100 * FPS * (predicted.diff(dim=0) - truth.diff(dim=0)).norm(dim=-1).mean()
 
 
 def jitter(positions: Tensor) -> Tensor:
-    """Mean norm of the third difference of position, 10^2 m/s^3; NaN under 4 frames."""
+    """Return the mean norm of the third difference of positions, in 10^2 m/s^3; NaN under 4 frames."""
     return positions.diff(n=3, dim=0).norm(dim=-1).mean() * FPS**3 / 100
 
 
 def positions_report(predicted: Tensor, truth: Tensor) -> dict[str, float]:
-    """The position metrics of one clip."""
+    """Return the position metrics of one clip by name."""
     report = {"MPJPE": position_error(predicted, truth)}
     report |= {name: position_error(predicted, truth, group) for name, group in POSITION_GROUPS.items()}
     report |= {
@@ -60,5 +64,5 @@ def positions_report(predicted: Tensor, truth: Tensor) -> dict[str, float]:
 
 
 def rotations_report(predicted: Tensor, truth: Tensor) -> dict[str, float]:
-    """The rotation metrics of one clip."""
+    """Return the rotation metrics of one clip by name."""
     return {"MPJRE": float(mpjre(predicted, truth)), "geodesic": float(geodesic(predicted, truth))}

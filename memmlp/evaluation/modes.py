@@ -1,10 +1,10 @@
-"""Evaluation in the two modes of the field, all clips side by side in one batch.
+"""Evaluation in the two modes of the field, with all clips side by side in one batch.
 
-`stream` is live use: one frame at a time, the network's own history, the last frame of each window kept.
-`window` is AGRoL's: non-overlapping windows whose T frames all count; the tail window is shifted back and
-its overlap dropped. A network that recalls the window which ended one frame before is led through each
-window frame by frame, so that it recalls what it was trained on: in one call it would get the window of T
-frames ago. What it shows of a window is its last call's output.
+`stream` is live use: one frame at a time, on the network's own history, the last frame of each window kept.
+`window` is AGRoL's: non-overlapping windows whose T frames all count; the tail window is shifted back and its
+overlap dropped. A network that recalls the window which ended one frame before is led through each window
+frame by frame, so that it recalls what it was trained on: in one call it would get the window of T frames
+ago. Its result for a window is the last call's output.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ from memmlp.networks.memory import State
 
 
 class Evaluable(Protocol):
-    """What can be evaluated: Mem-MLP, or anything that moves in time as it does."""
+    """What can be evaluated: a WindowModel, or anything else with these attributes and methods."""
 
     normalizer: Normalizer
     frames: int
 
     @property
     def shift(self) -> int:
-        """Frames by which its own past, which it sees, ends before the newest; 0 without one."""
+        """By how many frames the network's own past, which it sees, ends before the newest frame; else 0."""
 
     def initial_state(self, batch: int = 1) -> State:
-        """A fresh start."""
+        """Return the state of a fresh start."""
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """New inputs (B, n, 54) -> motion (B, newest or T, 198) in the world, and the new state."""
+        """Map new inputs (B, n, 54) to motion (B, newest or T, 198) in the world, and the new state."""
 
 
 def stream(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
-    """Motion (N, 198) in the world of clips' frames (N, 252), frame by frame."""
+    """Predict the world motion (N, 198) of clips (N, 252), frame by frame."""
     return frame_by_frame(network, clips, 1)
 
 
 def window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
-    """Motion (N, 198) in the world of clips' frames (N, 252), by non-overlapping windows."""
+    """Predict the world motion (N, 198) of clips (N, 252), by non-overlapping windows."""
     if 0 < network.shift < network.frames:
         return frame_by_frame(network, clips, network.frames)
     return window_by_window(network, clips)
@@ -56,7 +56,11 @@ def window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
 
 @torch.no_grad()
 def frame_by_frame(network: Evaluable, clips: Sequence[Tensor], size: int) -> list[Tensor]:
-    """Motion (N, 198) of clips (N, 252), of each `size` frames (and those left) as the last call made it."""
+    """Predict the motion (N, 198) of clips (N, 252) by calls of one new frame each.
+
+    Each window of `size` frames (and what is left at a clip's end) is taken from the call that took in its
+    last frame. With `size` 1 that is a live stream.
+    """
     order = sorted(range(len(clips)), key=lambda i: -len(clips[i]))
     lengths = [len(clips[i]) for i in order]
     inputs = torch.nn.utils.rnn.pad_sequence([clips[i][:, :SPARSE_DIM] for i in order], batch_first=True)
@@ -64,18 +68,18 @@ def frame_by_frame(network: Evaluable, clips: Sequence[Tensor], size: int) -> li
     state = network.initial_state(len(clips))
     active = len(clips)
     for t in track(range(lengths[0]), "stream"):
-        while lengths[active - 1] <= t:  # the clips are sorted: those that ended are the last ones
+        while lengths[active - 1] <= t:  # the clips are sorted by length: the last ones end first
             active -= 1
             state = {name: tensor[:active] for name, tensor in state.items()}
         since = t - t % size
         output, state = network.advance(inputs[:active, t : t + 1], state, t + 1 - since)
-        motion[:active, since : t + 1] = output[:, since - t - 1 :]  # over what earlier calls made
+        motion[:active, since : t + 1] = output[:, since - t - 1 :]  # overwrites what earlier calls made
     return [motion[order.index(i), : len(clip)] for i, clip in enumerate(clips)]
 
 
 @torch.no_grad()
 def window_by_window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
-    """Motion (N, 198) of clips (N, 252), T new frames at each call."""
+    """Predict the motion (N, 198) of clips (N, 252) by calls of T new frames each."""
     size = network.frames
     padded = [_at_least(clip[:, :SPARSE_DIM], size) for clip in clips]
     order = sorted(range(len(clips)), key=lambda i: -len(padded[i]))
@@ -88,7 +92,7 @@ def window_by_window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor
         inputs = torch.stack([padded[i][b : b + size] for i, b in zip(order, begin, strict=True)])
         output, state = network.advance(inputs, state)
         for i, b, result in zip(order, begin, output, strict=True):
-            motion[i][start : b + size] = result[start - b :]
+            motion[i][start : b + size] = result[start - b :]  # the tail window begins at b < start
     return [whole[-len(clip) :] for whole, clip in zip(motion, clips, strict=True)]
 
 
@@ -98,10 +102,16 @@ MODES: dict[str, Callable[[Evaluable, Sequence[Tensor]], list[Tensor]]] = {"wind
 def evaluate(
     network: Evaluable, frames: MotionDataset, modes: Sequence[str], batch: int, ik: IK | None = None
 ) -> dict[str, Any]:
-    """Metrics of a split: `{"mean": {mode: {branch: {metric: value}}}, "clips": [...]}`.
+    """Compute the metrics of a split: `{"mean": {mode: {branch: {metric: value}}}, "clips": [...]}`.
 
-    The mean is over clips of each clip's mean over frames. At most `batch` clips stand side by side. What
-    `ik` makes of the two branches is a branch more.
+    The mean is over clips of each clip's mean over frames.
+
+    Args:
+        network: the network to evaluate.
+        frames: the split.
+        modes: the evaluation modes.
+        batch: how many clips are evaluated side by side, at most.
+        ik: inverse kinematics, whose result is a further branch.
     """
     clips = frames.clips()
     rows: list[dict[str, Any]] = [
@@ -115,7 +125,7 @@ def evaluate(
 
 
 def predict(network: Evaluable, clips: Sequence[Tensor], mode: str, batch: int) -> list[Tensor]:
-    """Motion (N, 198) of each clip (N, 252), at most `batch` clips side by side."""
+    """Predict the motion (N, 198) of each clip (N, 252), at most `batch` clips side by side."""
     groups = [clips[i : i + batch] for i in range(0, len(clips), batch)]
     return [motion for group in groups for motion in MODES[mode](network, group)]
 
@@ -123,7 +133,7 @@ def predict(network: Evaluable, clips: Sequence[Tensor], mode: str, batch: int) 
 def clip_report(
     normalizer: Normalizer, motion: Tensor, truth: Tensor, ik: IK | None = None
 ) -> dict[str, dict[str, float]]:
-    """Metrics of both branches and of what `ik` makes of them, for motion (N, 198) and truth (N, 252)."""
+    """Return the metrics of both branches and of `ik`'s result, for motion (N, 198) and truth (N, 252)."""
     sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
     position = metrics.positions_report(joint_positions(motion), joint_positions(target))
     report = {"rotation": rotations_report(normalizer, motion, truth), "position": position}
@@ -132,43 +142,49 @@ def clip_report(
 
 
 def rotations_report(normalizer: Normalizer, motion: Tensor, truth: Tensor) -> dict[str, float]:
-    """Metrics of the rotations of motion (N, 198), their joints by forward kinematics; truth (N, 252)."""
+    """Return the metrics of the rotations of motion (N, 198) against the truth (N, 252).
+
+    The positions that they are measured by follow by forward kinematics, the head on its tracker.
+    """
     sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
     report = metrics.rotations_report(local_rotations(motion), local_rotations(target))
     return report | metrics.positions_report(normalizer.pose(motion, sparse), joint_positions(target))
 
 
 def local_rotations(motion: Tensor) -> Tensor:
-    """Rotation matrices (N, 22, 3, 3) of motion (N, 198)."""
+    """Return the rotation matrices (N, 22, 3, 3) of motion (N, 198)."""
     return sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6)))
 
 
 def joint_positions(motion: Tensor) -> Tensor:
-    """Positions (N, 22, 3) of motion (N, 198), metres, world."""
+    """Return the joint positions (N, 22, 3) of motion (N, 198), metres, world."""
     return motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
 
 
 def chunks(frames: MotionDataset, length: int, least: int) -> list[Tensor]:
-    """A split's clips cut into pieces of `length` frames, those under `least` left out unless alone."""
+    """Cut a split's clips into pieces of `length` frames.
+
+    Pieces under `least` frames are left out, unless all of them are so short.
+    """
     pieces = [piece for clip in frames.clips() for piece in clip.split(length)]
     return [p for p in pieces if len(p) >= least] or pieces
 
 
 @torch.no_grad()
 def quick_stream(network: Evaluable, pieces: Sequence[Tensor]) -> dict[str, float]:
-    """Stream-mode means over pieces of clips: for validation during training."""
+    """Return the stream-mode metrics, means over pieces of clips, for validation during training."""
     motions = stream(network, pieces)
     mean = _mean([clip_report(network.normalizer, m, p) for m, p in zip(motions, pieces, strict=True)])
     return {f"{branch} {name}": value for branch, values in mean.items() for name, value in values.items()}
 
 
 def _at_least(sparse: Tensor, size: int) -> Tensor:
-    """Inputs (N, 54), the first repeated in front up to `size` frames."""
+    """Repeat the first of the inputs (N, 54) in front until there are `size` frames."""
     return torch.cat([sparse[:1].expand(max(size - len(sparse), 0), -1), sparse])
 
 
 def _mean(rows: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
-    """Mean over clips of each branch's metrics; a clip too short for a metric does not count in it."""
+    """Return each branch's metrics, mean over clips; a clip too short for a metric does not count in it."""
     first = rows[0]
     return {
         branch: {name: float(torch.tensor([row[branch][name] for row in rows]).nanmean()) for name in values}

@@ -1,4 +1,4 @@
-"""A network's predictions as files."""
+"""Files of a network's predictions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from memmlp.networks.window_model import WindowModel
 
 
 def save_predictions(evaluation: Evaluation, model: WindowModel, test: MotionDataset, folder: Path) -> None:
-    """Write `<folder>/<mode>/<clip>.npz` for every test clip: positions (N, 22, 3) and rotations."""
+    """Write `<folder>/<mode>/<clip>.npz` for every mode and test clip; see `prediction_arrays`."""
     clips = test.clips()
     for mode in evaluation.modes:
         motions = modes.predict(model, clips, mode, evaluation.batch)
@@ -30,10 +30,10 @@ def save_predictions(evaluation: Evaluation, model: WindowModel, test: MotionDat
 
 
 def prediction_arrays(normalizer: Normalizer, clip: Tensor, motion: Tensor, ik: IK) -> dict[str, np.ndarray]:
-    """What a prediction file holds: metres in the world, local rotation matrices, float32.
+    """Return the content of a prediction file: metres in the world, local rotation matrices, float32.
 
-    `predicted_positions` are those of the rotation branch by forward kinematics, the head on its tracker;
-    what inverse kinematics makes of the branches follows as `combined_positions` and `combined_rotations`.
+    `predicted_positions` (N, 22, 3) are those of the rotation branch by forward kinematics, the head on its
+    tracker. The result of inverse kinematics, if any, is in `combined_positions` and `combined_rotations`.
     """
     sparse, truth = clip[:, :SPARSE_DIM], clip[:, SPARSE_DIM:]
     arrays = {

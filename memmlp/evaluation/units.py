@@ -1,4 +1,4 @@
-"""The names of the field's metrics with their units, and what difference matters. Lower is better."""
+"""The field's metrics by name: their units, and the smallest differences that matter. Lower is better."""
 
 UNITS = {
     "MPJRE": "deg", "geodesic": "deg", "MPJPE": "cm", "Hand PE": "cm", "Upper PE": "cm", "Lower PE": "cm",

@@ -1,8 +1,8 @@
 """The body and every convention of the project, stated once: joints, tree, feature layout.
 
-Frames of reference: motion lives in AMASS' world (Z up, metres). A rest pose lives in SMPL's body
-frame (Y up, the person faces +Z, left is +X, T-pose), and the root's rotation carries the one to the
-other. A body joint's rotation is local, relative to its parent; the root's is global.
+Frames of reference: motion lives in AMASS' world (Z up, metres). A rest pose lives in SMPL's body frame (Y
+up, the person faces +Z, left is +X, T-pose), and the root's rotation carries the one to the other. A body
+joint's rotation is local, relative to its parent; the root's is global.
 """
 
 from __future__ import annotations
@@ -49,9 +49,10 @@ POSITION = slice(132, 198)  # global positions of the 22 joints, metres
 # One frame of a prepared cache: X, then Theta.
 FRAME_DIM = SPARSE_DIM + MOTION_DIM
 
-# An adult of 1.72 m in T-pose. Segment lengths follow the usual anthropometric fractions of stature
-# (Drillis & Contini 1966, in Winter, "Biomechanics and Motor Control of Human Movement"), shoulders
-# and hips are taken at the joint centres. The pelvis is the origin.
+# An adult of 1.72 m in T-pose; only the left side is listed, the right one is its mirror image. Segment
+# lengths follow the usual anthropometric fractions of stature (Drillis & Contini 1966, in Winter,
+# "Biomechanics and Motor Control of Human Movement"); shoulders and hips are at the joint centres. The
+# pelvis is the origin.
 _REST = {
     "pelvis": (0.0, 0.0, 0.0),
     "left_hip": (0.085, -0.085, -0.005),
@@ -71,7 +72,7 @@ _REST = {
 
 
 def builtin_rest_joints() -> np.ndarray:
-    """Rest positions (22, 3) of the built-in adult skeleton, metres, SMPL's body frame, pelvis at 0."""
+    """Return the built-in adult's rest positions (22, 3), metres, SMPL's body frame, pelvis at 0."""
 
     def rest(name: str) -> tuple[float, float, float]:
         if name.startswith("right_"):
@@ -83,10 +84,15 @@ def builtin_rest_joints() -> np.ndarray:
 
 
 def load_rest_joints(body: str | Path) -> np.ndarray:
-    """Rest positions (22, 3), metres, of `builtin` or of an SMPL-H `model.npz` with zero betas.
+    """Load the rest positions (22, 3), metres, of a body with zero betas.
 
-    Only `J_regressor @ v_template` is needed: no mesh is skinned. Raises InputError for a file that is
-    no such model.
+    Only `J_regressor @ v_template` is computed: no mesh is skinned.
+
+    Args:
+        body: "builtin", or the path of an SMPL-H `model.npz`.
+
+    Raises:
+        InputError: if the file is no such model.
     """
     if str(body) == "builtin":
         return builtin_rest_joints()

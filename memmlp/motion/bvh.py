@@ -1,8 +1,8 @@
-"""BVH text -> joints, channels and, by forward kinematics, global rotations and positions.
+"""Reads BVH files, and computes their joints' global rotations and positions by forward kinematics.
 
 Everything here is in the file's own units and axes. A joint's rotation is the product of its rotation
 channels in the file's order (Z X Y means Rz Rx Ry, on column vectors, degrees in the file); its position
-channels, where it has any, stand in place of the OFFSET's numbers.
+channels, if it has any, replace the numbers of its OFFSET.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from memmlp.motion.clip import FRAME_RATE_RANGE
 
 AXES = "XYZ"
 CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in AXES)
-END = ".end"  # an end site's name is its joint's and this
-LIMIT = 1e6  # of any number in the file, in its units or degrees
+END = ".end"  # an end site's name is that of its joint with this suffix
+LIMIT = 1e6  # the largest size of any number in the file, in its units or degrees
 MAX_JOINTS = 1000
 MAX_BYTES = 2**30
 RATE_DIGITS = 1e-4  # relative: 1 / 0.00833333 s is 120 Hz, as the header has no more digits
@@ -29,7 +29,13 @@ RATE_DIGITS = 1e-4  # relative: 1 / 0.00833333 s is 120 Hz, as the header has no
 
 @dataclass(frozen=True)
 class EndSite:
-    """The tip of a chain: its name (`<joint>.end`), its joint's index and its offset (3,) from it."""
+    """The tip of a chain of joints.
+
+    Attributes:
+        name: `<joint>.end`.
+        parent: index of the joint that it belongs to.
+        offset: (3,) from that joint.
+    """
 
     name: str
     parent: int
@@ -41,13 +47,13 @@ class Bvh:
     """A BVH file. Its nodes are its J joints, each after its parent, and then its E end sites.
 
     Attributes:
-        path: where it was read, for messages.
-        names: joint names, J, no two alike.
-        parents: index of each joint's parent, J; the root's is -1.
+        path: where it was read from, for messages.
+        names: the J joints' names, all different.
+        parents: index of each joint's parent; the root's is -1.
         offsets: joint minus parent in the zero pose (J, 3).
         channels: each joint's channels in the file's order, of `CHANNELS`.
-        ends: end sites, E.
-        frame_time: seconds.
+        ends: the E end sites.
+        frame_time: seconds between frames.
         values: channel values (N, C), degrees and the file's unit.
     """
 
@@ -70,7 +76,7 @@ class Bvh:
 
     @property
     def node_parents(self) -> tuple[int, ...]:
-        """Parents of the J joints and E end sites."""
+        """Parents' indices of the J joints and E end sites."""
         return self.parents + tuple(end.parent for end in self.ends)
 
     @property
@@ -80,7 +86,7 @@ class Bvh:
         return float(round(rate)) if abs(rate - round(rate)) <= RATE_DIGITS * rate else rate
 
     def zero_pose(self) -> np.ndarray:
-        """Positions (J+E, 3) of the nodes with all rotations zero, the root at the origin."""
+        """Return positions (J+E, 3) of the nodes with all rotations zero and the root at the origin."""
         offsets = np.concatenate([self.offsets, *(end.offset[None] for end in self.ends)])
         positions = np.zeros_like(offsets)
         for node, parent in enumerate(self.node_parents[1:], start=1):
@@ -88,7 +94,10 @@ class Bvh:
         return positions
 
     def kinematics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Global rotations (N, J+E, 3, 3) and positions (N, J+E, 3); an end site turns with its joint."""
+        """Return the nodes' global rotations (N, J+E, 3, 3) and positions (N, J+E, 3).
+
+        An end site has its joint's rotation.
+        """
         rotations = np.empty((len(self.nodes), len(self), 3, 3))
         positions = np.empty((len(self.nodes), len(self), 3))
         for joint, parent in enumerate(self.parents):
@@ -106,12 +115,12 @@ class Bvh:
         return rotations.swapaxes(0, 1), positions.swapaxes(0, 1)
 
     def _joint_values(self, joint: int) -> np.ndarray:
-        """The values (N, c) of a joint's channels."""
+        """Return the values (N, c) of a joint's channels."""
         first = sum(map(len, self.channels[:joint]))
         return self.values[:, first : first + len(self.channels[joint])]
 
     def _shift(self, joint: int, values: np.ndarray) -> np.ndarray:
-        """A joint's position (N, 3) in its parent's frame."""
+        """Return a joint's position (N, 3) in its parent's frame."""
         shift = np.tile(self.offsets[joint], (len(values), 1))
         for name, column in zip(self.channels[joint], values.T, strict=True):
             if name.endswith("position"):
@@ -131,8 +140,9 @@ def _turn(rotations: np.ndarray, axis: int, angles: np.ndarray) -> None:
 def read_bvh(path: Path) -> Bvh:
     """Read a BVH file; line ends, blanks and letter case of keywords may vary, nothing else.
 
-    Raises InputError, naming the file and where it helps the line, for anything damaged: braces, numbers,
-    counts, names, channels, an absurd frame time, more than 1000 joints, text that is none.
+    Raises:
+        InputError: for anything damaged (braces, numbers, counts, names, channels, an absurd frame time, more
+            than 1000 joints, bytes that are no text); the message names the file and where possible the line.
     """
     lines = _lines(path)
     start = next((n for n, line in enumerate(lines) if line.strip().upper() == b"MOTION"), None)
@@ -153,7 +163,7 @@ def read_bvh(path: Path) -> Bvh:
 
 
 def _lines(path: Path) -> list[bytes]:
-    """The file's lines, whatever ends them (LF, CRLF or CR)."""
+    """Return the file's lines, whatever ends them (LF, CRLF or CR)."""
     try:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: too large; allowed: a BVH of at most {MAX_BYTES >> 20} MiB")
@@ -167,7 +177,7 @@ def _fail(path: Path, line: int, wrong: str, allowed: str) -> NoReturn:
 
 
 def _number(word: str) -> float:
-    """A number as BVH has it; NaN for everything else (Python alone would take `1_0` or `Infinity`)."""
+    """Parse a number as BVH writes it; NaN for anything else, as Python would take `1_0` or `Infinity`."""
     try:
         return float(word) if re.fullmatch(r"[-+.0-9eE]+", word) else float("nan")
     except ValueError:
@@ -175,12 +185,12 @@ def _number(word: str) -> float:
 
 
 def _show(word: str) -> str:
-    """A word of the file for a message: one line, short."""
+    """Quote a word of the file for a message, shortened to 40 characters."""
     return repr(word)[:40]
 
 
 class _Words:
-    """The words of the hierarchy, one after the other, and the line of the last."""
+    """The words of the hierarchy, one after the other; `line` is the line of the last one."""
 
     def __init__(self, path: Path, lines: list[bytes]) -> None:
         self.path = path
@@ -199,17 +209,17 @@ class _Words:
         _fail(self.path, self.line, wrong, allowed)
 
     def next(self, allowed: str) -> str:
-        """The next word, of which `allowed` says what it may be."""
+        """Return the next word; `allowed` says what it may be, for the message."""
         word = next(self._words, None)
         return word if word is not None else self.fail("the hierarchy ends before its time", allowed)
 
     def expect(self, *keywords: str) -> str:
-        """The next word, which must be one of the keywords, in capitals."""
+        """Return the next word in capitals, which must be one of the keywords."""
         word = self.next(" or ".join(keywords))
         return word.upper() if word.upper() in keywords else self.fail(_show(word), " or ".join(keywords))
 
     def offset(self) -> np.ndarray:
-        """Three numbers."""
+        """Read three numbers."""
         return np.array([self._coordinate() for _ in range(3)])
 
     def _coordinate(self) -> float:
@@ -218,7 +228,7 @@ class _Words:
         return _number(word) if abs(_number(word)) <= LIMIT else self.fail(_show(word), allowed)
 
     def channels(self) -> tuple[str, ...]:
-        """A count and as many different channels."""
+        """Read a count and as many different channels."""
         allowed = f"0 to {len(CHANNELS)} and as many different ones of {', '.join(CHANNELS)} after CHANNELS"
         count = self.next(allowed)
         if count not in map(str, range(len(CHANNELS) + 1)):
@@ -228,7 +238,7 @@ class _Words:
         return names if wrong is None else self.fail(_show(wrong), allowed)
 
     def finish(self) -> None:
-        """There must be no further word."""
+        """Check that there is no further word."""
         word = next(self._words, None)
         if word is not None:
             self.fail(_show(word), "MOTION after the root's last }")
@@ -236,7 +246,7 @@ class _Words:
 
 @dataclass
 class _Hierarchy:
-    """The joints as they are read, without recursion; `open` are those whose } is still to come."""
+    """The joints as they are read, without recursion; `open` holds those whose } is still to come."""
 
     words: _Words
     names: list[str] = field(default_factory=list)
@@ -261,7 +271,7 @@ class _Hierarchy:
         self.words.finish()
 
     def _joint(self) -> None:
-        """`name { OFFSET x y z CHANNELS n ...`, its children still to come."""
+        """Read `name { OFFSET x y z CHANNELS n ...`; the joint's children follow later."""
         if len(self.names) == MAX_JOINTS:
             self.words.fail("one joint more", f"up to {MAX_JOINTS} joints")
         self.names.append(self._new_name(self.words.next("a joint's name")))
@@ -274,7 +284,7 @@ class _Hierarchy:
         self.channels.append(self.words.channels())
 
     def _end(self) -> None:
-        """`Site { OFFSET x y z }`, after `End`."""
+        """Read `Site { OFFSET x y z }`, which stands after `End`."""
         joint = self.open[-1]
         name = self._new_name(self.names[joint] + END)
         for keyword in ("SITE", "{", "OFFSET"):
@@ -289,7 +299,7 @@ class _Hierarchy:
 
 
 def _motion(path: Path, lines: list[bytes], start: int, width: int) -> tuple[float, np.ndarray]:
-    """Frame time and values (N, width) from the lines after MOTION, of which blank ones do not count."""
+    """Read frame time and values (N, width) from the lines after MOTION; blank lines do not count."""
     rows = [(number, line) for number, line in enumerate(lines[start:], start + 1) if line.strip()]
     if len(rows) < 2 or width == 0:
         _fail(path, start, "no motion", "channels, Frames:, Frame Time: and the frames")
@@ -307,7 +317,7 @@ def _motion(path: Path, lines: list[bytes], start: int, width: int) -> tuple[flo
 
 
 def _header(path: Path, number: int, line: bytes, key: str) -> str:
-    """The value of `key: value`, of which case and blanks may vary."""
+    """Return the value of `key: value`; letter case and blanks may vary."""
     text = line.decode("latin-1").strip()
     pattern = key.replace(" ", r"\s*").replace(":", r"\s*:\s*(\S+)")
     match = re.fullmatch(pattern, text, re.IGNORECASE)
@@ -315,7 +325,7 @@ def _header(path: Path, number: int, line: bytes, key: str) -> str:
 
 
 def _values(path: Path, rows: list[tuple[int, bytes]], width: int) -> np.ndarray:
-    """The numbers (N, width) of the frames' lines."""
+    """Parse the numbers (N, width) of the frames' lines."""
     values = np.empty((len(rows), width))
     for row, (number, line) in zip(values, rows, strict=True):
         words = line.split()
@@ -335,7 +345,11 @@ def _values(path: Path, rows: list[tuple[int, bytes]], width: int) -> np.ndarray
 
 
 def find_bvh(source: Path) -> dict[Path, Path]:
-    """BVH files of a folder (or one file), sorted, by their path below it. Raises InputError for none."""
+    """Find the BVH files of a folder, or a single one: sorted, by their path below the folder.
+
+    Raises:
+        InputError: if there is none.
+    """
     if not source.exists():
         raise InputError(f"{source}: no such file or folder; allowed: BVH files")
     top = source if source.is_dir() else source.parent

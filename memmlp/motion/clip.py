@@ -1,4 +1,4 @@
-"""A motion clip on disk (AMASS npz) and in memory, and its exact resampling to 60 Hz."""
+"""Motion clips on disk (AMASS npz) and in memory, and their exact resampling to 60 Hz."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from memmlp.motion.body import FPS, N_JOINTS
 SMPLH_POSE_DIM = 156
 FRAME_RATE_KEYS = ("mocap_framerate", "mocap_frame_rate")  # SMPL+H and SMPL-X releases
 FRAME_RATE_RANGE = (1.0, 1000.0)
-# What NumPy and zipfile raise on damaged bytes.
+# The exceptions that NumPy and zipfile raise on damaged bytes.
 DAMAGE = (
     OSError, ValueError, EOFError, KeyError, AttributeError, TypeError, IndexError, MemoryError,
     NotImplementedError, SyntaxError, RuntimeError, OverflowError, zipfile.BadZipFile, zlib.error,
@@ -26,7 +26,12 @@ RATE_TOLERANCE = 1e-4  # relative: 59.94 is not 60, and 120.0005 (a BVH's frame 
 
 @dataclass(frozen=True)
 class Skipped:
-    """A file that was passed over, and why: its path below the folder, and one line."""
+    """A file that was skipped.
+
+    Attributes:
+        file: its path below the folder.
+        reason: why it was skipped, in one line.
+    """
 
     file: str
     reason: str
@@ -53,12 +58,17 @@ class Clip:
 
 
 def read_clip(path: Path, name: str) -> Clip:
-    """Read an SMPL+H or SMPL-X AMASS npz, never unpickling.
+    """Read an SMPL+H or SMPL-X AMASS npz, without ever unpickling.
 
-    Raises InputError, naming the file, for anything damaged, mis-shaped, empty or not finite.
+    Args:
+        path: the file.
+        name: the clip's name.
+
+    Raises:
+        InputError: if the file is damaged, of the wrong shapes, empty, or not finite; the message names it.
     """
     try:
-        # opened here, for np.load leaves a file that is no zip open
+        # The file is opened here, since np.load does not close one that is no zip.
         with open(path, "rb") as open_run, np.load(open_run, allow_pickle=False) as file:
             missing = {"poses", "trans"} - set(file.files)
             rate_key = next((key for key in FRAME_RATE_KEYS if key in file.files), None)
@@ -88,7 +98,7 @@ def read_clip(path: Path, name: str) -> Clip:
 
 
 def write_clip(path: Path, clip: Clip) -> None:
-    """Write AMASS' SMPL+H layout (hands at rest, zero betas, neutral gender), atomically."""
+    """Write a clip in AMASS' SMPL+H layout (hands at rest, zero betas, neutral gender), atomically."""
     poses = np.zeros((len(clip), SMPLH_POSE_DIM), np.float32)
     poses[:, : 3 * N_JOINTS] = clip.poses.reshape(len(clip), -1)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -106,10 +116,13 @@ def write_clip(path: Path, clip: Clip) -> None:
 
 
 def resample(clip: Clip, fps: float = FPS) -> tuple[Clip, str]:
-    """The clip at exactly `fps`, and how: `kept`, `every k-th frame`, or `interpolated`.
+    """Resample a clip to exactly `fps`, and say how: `kept`, `every k. frame`, or `interpolated`.
 
-    Where the rate divides, frames are taken by stride; otherwise rotations by slerp and translation
-    linearly, on the times k / fps that lie inside the clip.
+    Where the rate divides, frames are taken by stride; otherwise rotations are interpolated by slerp and the
+    translation linearly, at the times k / fps that lie inside the clip.
+
+    Raises:
+        InputError: if a clip of one frame would have to be interpolated.
     """
     ratio = clip.fps / fps
     stride = round(ratio)
@@ -129,7 +142,7 @@ def resample(clip: Clip, fps: float = FPS) -> tuple[Clip, str]:
 
 
 def _frame_rate(path: Path, value: np.ndarray) -> float:
-    """The rate from a float, an int, bytes or text, as a 0-d or 1-element array."""
+    """Parse the rate from a float, an int, bytes or text, as a 0-d or 1-element array."""
     if value.size != 1 or value.dtype.kind not in "fiuSU":
         raise InputError(f"{path}: the frame rate is {value.dtype} {value.shape}, not one number")
     try:
@@ -144,5 +157,5 @@ def _frame_rate(path: Path, value: np.ndarray) -> float:
 
 
 def _brief(error: Exception) -> str:
-    """An exception in one line."""
+    """Shorten an exception's message to one line."""
     return " ".join(str(error).split())[:120] or type(error).__name__

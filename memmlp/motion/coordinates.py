@@ -1,4 +1,4 @@
-"""The coordinates slot: where the network's space lies in the world."""
+"""The coordinates slot: how the network's space lies in the world."""
 
 from __future__ import annotations
 
@@ -19,49 +19,49 @@ from memmlp.motion.body import (
 
 
 class World:
-    """Positions and directions as they are: the most literal reading of the paper.
+    """The world's own coordinates: the most literal reading of the paper. Also the slot's interface.
 
-    The coordinates slot: `origin` says, from the inputs of a frame alone, where its local coordinates lie;
-    `sparse_in`, `motion_in` and `motion_out` carry inputs and motion there and back.
+    `origin` says, from a frame's inputs alone, where its local coordinates lie; `sparse_in`, `motion_in` and
+    `motion_out` convert inputs and motion to and from them.
     """
 
     def origin(self, sparse: Tensor) -> Tensor:
-        """The origin (..., 3), metres, of the local coordinates of inputs (..., 54)."""
+        """Return the origin (..., 3), metres, of the local coordinates of inputs (..., 54): here zeros."""
         return torch.zeros_like(sparse[..., :3])
 
     def sparse_in(self, sparse: Tensor, origin: Tensor) -> Tensor:
-        """World inputs (..., 54) in local coordinates."""
+        """Convert world inputs (..., 54) to local coordinates."""
         position = sparse[..., SPARSE_POSITION] - _tile(origin, len(TRACKED))
         return torch.cat([sparse[..., : SPARSE_POSITION.start], position, sparse[..., SPARSE_VELOCITY]], -1)
 
     def motion_in(self, motion: Tensor, origin: Tensor) -> Tensor:
-        """World motion (..., 198) in local coordinates."""
+        """Convert world motion (..., 198) to local coordinates."""
         return torch.cat([motion[..., ROTATION], motion[..., POSITION] - _tile(origin, N_JOINTS)], -1)
 
     def motion_out(self, motion: Tensor, origin: Tensor) -> Tensor:
-        """Local motion (..., 198) in the world."""
+        """Convert local motion (..., 198) to the world."""
         return torch.cat([motion[..., ROTATION], motion[..., POSITION] + _tile(origin, N_JOINTS)], -1)
 
 
 class HeadRelative(World):
-    """Horizontal positions relative to the head of the same frame; heights stay (reading 20)."""
+    """Coordinates whose horizontal origin is the head of the same frame; heights stay (reading 20)."""
 
     def origin(self, sparse: Tensor) -> Tensor:
-        """The head's position on the floor (..., 3), metres."""
+        """Return the head's position on the floor (..., 3), metres, for inputs (..., 54)."""
         head = sparse[..., SPARSE_POSITION][..., :3]
         return head * head.new_tensor([1.0, 1.0, 0.0])
 
 
 class Heading(HeadRelative):
-    """Relative to the head on the floor, and turned so that the head of the same frame looks ahead.
+    """Coordinates relative to the head on the floor, turned so that the head of the same frame faces ahead.
 
-    Not in the paper. It takes the heading away, which the motion does not depend on. The head's angular
-    velocity is local already and stays. The heading is the twist of the head's rotation about the vertical,
-    which is defined but where the head is upside down.
+    They are not in the paper. They remove the heading, on which the motion does not depend. The head's
+    angular velocity is local already and stays. The heading is the twist of the head's rotation about the
+    vertical, which is defined unless the head is upside down.
     """
 
     def origin(self, sparse: Tensor) -> Tensor:
-        """The head's position on the floor and cosine and sine of its heading (..., 5)."""
+        """Return the head's position on the floor, metres, and its heading's cosine and sine (..., 5)."""
         first, second = sparse[..., 0:3], sparse[..., 3:6]  # columns of the head's rotation, body frame
         up = torch.linalg.cross(first, second, dim=-1)  # the rest pose has Y up and faces Z
         # A = R Rx(-90 deg) is the rotation from upright; its twist is atan2(a10 - a01, a00 + a11).
@@ -70,7 +70,7 @@ class Heading(HeadRelative):
         return torch.cat([super().origin(sparse), heading], -1)
 
     def sparse_in(self, sparse: Tensor, origin: Tensor) -> Tensor:
-        """World inputs (..., 54) in local coordinates."""
+        """Convert world inputs (..., 54) to local coordinates."""
         sparse = super().sparse_in(sparse, origin[..., :3])
         turned = [
             _turn(sparse[..., SPARSE_ROTATION], origin, -1),
@@ -81,26 +81,26 @@ class Heading(HeadRelative):
         return torch.cat(turned, -1)
 
     def motion_in(self, motion: Tensor, origin: Tensor) -> Tensor:
-        """World motion (..., 198) in local coordinates."""
+        """Convert world motion (..., 198) to local coordinates."""
         return self._turned(super().motion_in(motion, origin[..., :3]), origin, -1)
 
     def motion_out(self, motion: Tensor, origin: Tensor) -> Tensor:
-        """Local motion (..., 198) in the world."""
+        """Convert local motion (..., 198) to the world."""
         return super().motion_out(self._turned(motion, origin, 1), origin[..., :3])
 
     def _turned(self, motion: Tensor, origin: Tensor, way: int) -> Tensor:
-        """The root's rotation and the positions turned; the other rotations are local anyway."""
+        """Turn the root's rotation and the positions; the other rotations are local anyway."""
         root, body = motion[..., :6], motion[..., 6 : ROTATION.stop]
         return torch.cat([_turn(root, origin, way), body, _turn(motion[..., POSITION], origin, way)], -1)
 
 
 def _turn(vectors: Tensor, origin: Tensor, way: int) -> Tensor:
-    """Vectors (..., 3 n) turned about the vertical by the heading of an origin (..., 5), or back (way -1)."""
+    """Turn vectors (..., 3 n) about the vertical by the heading of an origin (..., 5), or back (way -1)."""
     x, y, z = vectors.unflatten(-1, (-1, 3)).unbind(-1)
     cosine, sine = origin[..., 3:4], way * origin[..., 4:5]
     return torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], -1).flatten(-2)
 
 
 def _tile(point: Tensor, times: int) -> Tensor:
-    """(..., 3) -> (..., 3 * times)."""
+    """Repeat a point: (..., 3) to (..., 3 * times)."""
     return torch.cat([point] * times, -1)

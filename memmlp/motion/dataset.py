@@ -1,4 +1,4 @@
-"""A prepared cache as tensors: segments for training, whole clips for evaluation, and the sampler."""
+"""A prepared cache as tensors: segments for training, whole clips for evaluation, and the window sampler."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ class MotionDataset:
 
     Attributes:
         frames: [X | Theta] (F, 252), float32, world.
-        starts, lengths: of the clips (C,), int64, on the device of `frames`.
-        names: of the clips.
-        groups: of the clips, what belongs together having one name; by default each clip is its own.
+        starts: first frames of the clips (C,), int64, on the device of `frames`.
+        lengths: numbers of frames of the clips (C,), int64, on the device of `frames`.
+        names: names of the clips.
+        groups: group of each clip; clips that belong together share one. By default each clip is its own.
     """
 
     def __init__(
@@ -40,9 +41,10 @@ class MotionDataset:
 
     @classmethod
     def open(cls, cache: Path, split: str) -> MotionDataset:
-        """A split of a prepared cache, memory-mapped; `.to(device)` holds it on a device.
+        """Open a split of a prepared cache, memory-mapped; `.to(device)` copies it to a device.
 
-        Raises InputError where the cache is unfinished or damaged, or the split has no clip.
+        Raises:
+            InputError: if the cache is unfinished or damaged, or the split has no clip.
         """
         if split not in PARTS:
             raise InputError(f"data: no split {split!r}; allowed: {', '.join(PARTS)}")
@@ -57,22 +59,23 @@ class MotionDataset:
         return cls(frames, starts, lengths, [clip.name for clip in clips], [clip.group for clip in clips])
 
     def to(self, device: torch.device | str) -> MotionDataset:
-        """The same frames on a device."""
+        """Return the same dataset on a device."""
         tensors = (self.frames.to(device), self.starts.to(device), self.lengths.to(device))
         return MotionDataset(*tensors, list(self.names), list(self.groups))
 
     def __len__(self) -> int:
-        """Number of clips."""
+        """Return the number of clips."""
         return len(self.names)
 
     def segments(self, clip: Tensor, end: Tensor, length: int) -> Tensor:
-        """The `length` frames up to and including frame `end` of each clip.
+        """Return the `length` frames of each clip up to and including frame `end`.
 
         Before a clip's start its first frame repeats, as in the warm-up of a live stream.
 
         Args:
             clip: indices of clips (B,).
             end: frames of those clips (B,), 0 <= end < lengths[clip].
+            length: number of frames.
 
         Returns:
             (B, length, 252).
@@ -83,27 +86,31 @@ class MotionDataset:
         return self.frames[self.starts[clip.to(device)][:, None] + frame]
 
     def clip(self, index: int) -> Tensor:
-        """All frames (N, 252) of a clip."""
+        """Return all frames (N, 252) of a clip."""
         start, length = int(self.starts[index]), int(self.lengths[index])
         return self.frames[start : start + length]
 
     def clips(self) -> list[Tensor]:
-        """All frames (N, 252) of each clip, not copied."""
+        """Return all frames (N, 252) of each clip, without copying."""
         return [self.clip(index) for index in range(len(self.names))]
 
 
 class WindowSampler:
-    """Random windows; a draw depends on seed and step alone, so a sampler's position is the step.
+    """Draws random windows; a draw depends on seed and step alone, so a sampler needs no state but the step.
 
-    A window of a clip is named by its last frame. Every window can be drawn, the clip's last included; a
-    clip shorter than the window has one, which ends at its last frame.
+    A window of a clip is named by its last frame. Every window can be drawn, including the clip's last one; a
+    clip shorter than the window has one window, which ends at its last frame.
 
     Args:
         frames: the clips.
-        batch: windows a draw.
-        window: frames a window.
-        seed: of the draws.
-        weighting: "frames": every window of the split is equally likely; "clips": every clip is.
+        batch: number of windows a draw.
+        window: number of frames a window.
+        seed: seed of the draws.
+        weighting: "frames" if every window of the split is equally likely (reading 23), "clips" if every clip
+            is.
+
+    Raises:
+        InputError: for another weighting.
     """
 
     def __init__(self, frames: MotionDataset, batch: int, window: int, seed: int, weighting: str = "frames"):
@@ -117,7 +124,7 @@ class WindowSampler:
         self.bounds = np.cumsum(weights)
 
     def draw(self, step: int) -> tuple[Tensor, Tensor]:
-        """Clips (B,) and the last frames (B,) of their windows, int64, on the frames' device."""
+        """Draw clips (B,) and the last frames (B,) of their windows, int64, on the dataset's device."""
         random = np.random.Generator(np.random.Philox(key=[self.seed, step]))
         clip = np.searchsorted(self.bounds, random.integers(0, self.bounds[-1], self.batch), side="right")
         end = self.first_end[clip] + random.integers(0, self.windows[clip])
@@ -125,7 +132,7 @@ class WindowSampler:
 
 
 def _map(path: Path) -> Tensor:
-    """A memory-mapped .npy as a tensor, to be read only."""
+    """Open a memory-mapped .npy as a tensor, which must only be read."""
     try:
         array = np.lib.format.open_memmap(path, mode="r")
     except (OSError, ValueError) as error:

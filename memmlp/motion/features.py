@@ -1,4 +1,4 @@
-"""From motion to the network's 54 inputs, and from the world to the network's space and back."""
+"""From motion to frames [X | Theta]: the 54 inputs and the 198 targets of the networks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics, mat
 
 
 def sparse_features(rotations: Tensor, positions: Tensor) -> Tensor:
-    """The input X of three trackers (AvatarPoser's features, Sec. 3.1 of the paper).
+    """Compute the inputs X of three trackers (AvatarPoser's features, Sec. 3.1 of the paper).
 
     Args:
         rotations: global rotations of head, left and right wrist (N, 3, 3, 3).
@@ -32,7 +32,7 @@ def sparse_features(rotations: Tensor, positions: Tensor) -> Tensor:
 
 
 def motion_frames(poses: Tensor, trans: Tensor, rest: Tensor) -> Tensor:
-    """Frames [X | Theta] (N - 1, 252) of a clip.
+    """Compute the frames [X | Theta] (N - 1, 252) of a clip, world.
 
     Args:
         poses: axis-angle (N, 22, 3), the root's global.

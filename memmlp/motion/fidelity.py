@@ -1,4 +1,4 @@
-"""The check of an import: the written clip beside the BVH file it came from."""
+"""The check of an import: compares the written clip with the BVH file that it came from."""
 
 from __future__ import annotations
 
@@ -21,15 +21,17 @@ from memmlp.motion.skeleton import LIMBS, Z_UP, find_skeleton, load_skeleton
 
 @dataclass(frozen=True)
 class Fidelity:
-    """How far an import is off its source, in the worst frame.
+    """How far an import is from its source, in the worst frame.
 
     Attributes:
         name: the file's path below the source folder.
-        skeleton: the map.
-        frames: frames compared.
-        worst_mm: millimetres between a mapped joint in the file and in the import on the source's own bones.
+        skeleton: name of the skeleton map.
+        frames: number of frames compared.
+        worst_mm: largest distance, in millimetres, between a mapped joint in the file and in the import posed
+            on the source's own bones.
         worst_joint: the body joint where that is.
-        worst_degrees: between a limb (upper arm, forearm, thigh, shin) in the file and on the body.
+        worst_degrees: largest angle between a limb (upper arm, forearm, thigh, shin) in the file and on the
+            body.
     """
 
     name: str
@@ -41,10 +43,20 @@ class Fidelity:
 
 
 def verify(path: Path, *, skeleton: str | None = None, body: str = "builtin", name: str = "") -> Fidelity:
-    """Import one file to an npz, read it back, and compare with the file's own kinematics.
+    """Import one file to an npz, read it back, and compare it with the file's own kinematics.
 
-    On the file's side only `Bvh.kinematics`, on the other only the npz and `geometry.forward_kinematics`.
-    A joint below an unmapped source joint that turns has no constant bone: the distance shows it.
+    The file's side uses `Bvh.kinematics` alone, the other side the npz and `geometry.forward_kinematics`
+    alone. A joint below an unmapped source joint that turns has no bone of constant length: the distance then
+    shows it.
+
+    Args:
+        path: the BVH file.
+        skeleton: a shipped map or the path of one; by default the file's joints decide.
+        body: "builtin", or an SMPL-H model.npz.
+        name: the name to report; by default the file's.
+
+    Raises:
+        InputError: if the file is damaged or fits no map.
     """
     bvh, rest = read_bvh(path), load_rest_joints(body)
     chosen = load_skeleton(skeleton) if skeleton else find_skeleton(bvh)
@@ -73,7 +85,11 @@ def verify(path: Path, *, skeleton: str | None = None, body: str = "builtin", na
 
 
 def verify_folder(source: Path, *, skeleton: str | None = None, body: str = "builtin") -> list[Fidelity]:
-    """`verify` for each BVH file of a folder (or one file). Raises InputError at the first bad file."""
+    """Verify each BVH file of a folder, or a single one.
+
+    Raises:
+        InputError: at the first bad file.
+    """
     files = find_bvh(source)
     return [
         verify(path, skeleton=skeleton, body=body, name=relative.as_posix())

@@ -14,7 +14,7 @@ from memmlp.motion.body import PARENTS
 
 
 def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
-    """(..., 3) -> (..., 3, 3), Rodrigues' formula; smooth through angle 0."""
+    """Convert axis-angle (..., 3) to matrices (..., 3, 3) by Rodrigues' formula; smooth through angle 0."""
     square = (axis_angle * axis_angle).sum(-1, keepdim=True)
     small = square < 1e-8
     angle = torch.where(small, torch.ones_like(square), square).sqrt()
@@ -28,7 +28,10 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
 
 
 def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
-    """(..., 3, 3) -> (..., 3) of norm at most pi; accurate at 0 and near pi (by quaternion)."""
+    """Convert matrices (..., 3, 3) to axis-angle (..., 3) of norm at most pi.
+
+    It goes by a quaternion, which is accurate at 0 and near pi.
+    """
     m = matrix
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
@@ -55,12 +58,12 @@ def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
 
 
 def matrix_to_sixd(matrix: Tensor) -> Tensor:
-    """(..., 3, 3) -> (..., 6): the first column, then the second."""
+    """Convert matrices (..., 3, 3) to 6D (..., 6): the first column, then the second."""
     return torch.cat([matrix[..., :, 0], matrix[..., :, 1]], -1)
 
 
 def sixd_to_matrix(sixd: Tensor) -> Tensor:
-    """(..., 6) -> (..., 3, 3) by Gram-Schmidt; any 6 numbers give a rotation."""
+    """Convert 6D (..., 6) to matrices (..., 3, 3) by Gram-Schmidt; any 6 numbers give a rotation."""
     first = F.normalize(sixd[..., :3], dim=-1)
     second = sixd[..., 3:]
     second = F.normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
@@ -68,7 +71,7 @@ def sixd_to_matrix(sixd: Tensor) -> Tensor:
 
 
 def geodesic_angle(a: Tensor, b: Tensor) -> Tensor:
-    """Angle (...) in [0, pi] between rotations (..., 3, 3); accurate at 0 and at pi."""
+    """Return the angle (...) in [0, pi] between rotations (..., 3, 3); accurate at 0 and at pi."""
     relative = a.transpose(-1, -2) @ b
     skew = torch.stack(
         [
@@ -83,7 +86,7 @@ def geodesic_angle(a: Tensor, b: Tensor) -> Tensor:
 
 
 def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
-    """Global rotations (..., 22, 3, 3) and positions (..., 22, 3) of the joints.
+    """Return the joints' global rotations (..., 22, 3, 3) and positions (..., 22, 3).
 
     Args:
         local: local rotations (..., 22, 3, 3), the root's global.

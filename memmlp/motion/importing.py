@@ -1,4 +1,4 @@
-"""Import of a folder of BVH files: AMASS npz beside a record of what came from what, or nothing at all."""
+"""Imports a folder of BVH files as AMASS npz, with a record of what came from what, or nothing at all."""
 
 from __future__ import annotations
 
@@ -27,7 +27,18 @@ HEADER = "the header's"
 
 @dataclass(frozen=True)
 class Imported:
-    """One imported clip: source and npz below their folders, what of it, at which rate, and why."""
+    """One imported clip.
+
+    Attributes:
+        source: the BVH file's path below its folder.
+        sha256: digest of that file.
+        clip: the npz file's path below its folder.
+        skeleton: name of the skeleton map.
+        frames: number of frames.
+        header_fps: frame rate that the file's header tells, Hz.
+        fps: frame rate of the clip, Hz.
+        fps_reason: where that rate is from.
+    """
 
     source: str
     sha256: str
@@ -41,7 +52,13 @@ class Imported:
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What an import wrote, the folders whose header rates it corrected, and what it skipped."""
+    """What an import did.
+
+    Attributes:
+        clips: the clips that it wrote.
+        notes: one line for each folder whose header rate it corrected.
+        skipped: the files that it skipped.
+    """
 
     clips: tuple[Imported, ...]
     notes: tuple[str, ...]
@@ -57,18 +74,21 @@ def import_folder(
     body: str = "builtin",
     strict: bool = False,
 ) -> ImportReport:
-    """Write each BVH file of a folder (or one file) as out/<its path>.npz, and out/import.json about it.
+    """Write each BVH file of a folder, or a single one, as out/<its path>.npz, and out/import.json about it.
 
     Args:
         source: folder or file.
-        out: folder; other clips than this import's must not be in it.
+        out: folder; it must hold no clips other than this import's.
         skeleton: a shipped map or the path of one; by default each file's joints decide.
-        fps: true frame rates, Hz, by folder below source ("" for all), over the map's and the header's.
+        fps: true frame rates, Hz, by folder below source ("" for all); they override the map's and the
+            header's.
         body: `builtin`, or an SMPL-H model.npz.
-        strict: raise for a bad file; otherwise it is skipped and reported.
+        strict: whether a bad file raises; otherwise it is skipped and reported.
 
-    Raises InputError, with nothing written, for no files, files of the same name, a rate that fits no folder,
-    and where no file at all could be imported.
+    Raises:
+        InputError: with nothing written, if there are no files, several of the same name, a rate that fits no
+            folder, clips of another import in `out`, or no file that could be imported; also if `out` cannot
+            be written.
     """
     files = find_bvh(source)
     _check_import(files, out, fps)
@@ -92,12 +112,12 @@ def import_folder(
 
 
 def _npz(relative: Path) -> Path:
-    """The clip's path below out of a source's path below its folder."""
+    """Return a clip's path below `out`, given its source's path below the source folder."""
     return relative.with_suffix(".npz")
 
 
 def _check_import(files: Mapping[Path, Path], out: Path, fps: Mapping[str, float]) -> None:
-    """Raise InputError for two sources of one clip, foreign clips in out, or rates for no folder."""
+    """Raise InputError for two sources of one clip, foreign clips in `out`, or rates for no folder."""
     npz, count = Counter(_npz(relative) for relative in files).most_common(1)[0]
     if count > 1:
         raise InputError(f"{npz.with_suffix('').as_posix()}: {count} BVH files of this name; allowed: one")
@@ -113,12 +133,12 @@ def _check_import(files: Mapping[Path, Path], out: Path, fps: Mapping[str, float
 
 
 def _key(folder: Path) -> str:
-    """A folder below source as `fps` names it."""
+    """Return a folder below source as `fps` names it."""
     return "" if folder == Path() else folder.as_posix()
 
 
 def _staging(out: Path) -> tempfile.TemporaryDirectory:
-    """A folder beside out, in which an import grows until it is whole."""
+    """Make a folder beside `out`, in which an import grows until it is complete."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         return tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-")
@@ -134,7 +154,7 @@ def _import_file(
     fps: Mapping[str, float],
     rest: np.ndarray,
 ) -> Imported:
-    """Write one clip below the folder."""
+    """Write one clip below the staging folder."""
     bvh = read_bvh(path)
     chosen = skeleton or find_skeleton(bvh)
     rate, reason = _rate(bvh, chosen, relative, fps)
@@ -154,7 +174,10 @@ def _import_file(
 
 
 def _rate(bvh: Bvh, skeleton: SkeletonMap, relative: Path, fps: Mapping[str, float]) -> tuple[float, str]:
-    """The true frame rate and where it is from: given (the nearest folder counts), known, or the header's."""
+    """Return the true frame rate and where it is from.
+
+    It is the one given for the nearest folder, or known from the map, or the header's.
+    """
     for folder in relative.parents:
         if _key(folder) in fps:
             return float(fps[_key(folder)]), f"given for {_key(folder) or 'all'}"
@@ -166,13 +189,13 @@ def _rate(bvh: Bvh, skeleton: SkeletonMap, relative: Path, fps: Mapping[str, flo
 
 
 def _note(clip: Imported) -> str:
-    """One line about a folder's corrected rate."""
+    """Describe a folder's corrected rate in one line."""
     folder = Path(clip.source).parent.as_posix()
     return f"{folder}: {clip.fps:g} Hz, {clip.fps_reason}; the header says {clip.header_fps:g} Hz"
 
 
 def _publish(staging: Path, out: Path, report: ImportReport, body: str) -> None:
-    """Move the clips from staging to out, with the record; drop what an earlier import had of the skipped."""
+    """Move clips and record from staging to `out`, and remove earlier clips of the files skipped now."""
     record = {"body": body, **asdict(report)}
     (staging / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     try:

@@ -1,4 +1,4 @@
-"""From the world to the network's space and back: coordinates and z-scores."""
+"""The conversion between the world and the network's space: coordinates and z-scores."""
 
 from __future__ import annotations
 
@@ -20,15 +20,16 @@ from memmlp.motion.geometry import forward_kinematics, sixd_to_matrix
 
 
 class Normalizer(nn.Module):
-    """World <-> network space: the choice of coordinates, and z-scores where statistics are given.
+    """Converts between the world and network space: the chosen coordinates, and z-scores.
 
     Args:
         coordinates: World(), HeadRelative() or Heading().
         rest: rest positions (22, 3), metres, for forward kinematics.
-        mean, std: statistics (252,) of frames [X | Theta] in the chosen coordinates.
+        mean: mean (252,) of frames [X | Theta] in the chosen coordinates.
+        std: their standard deviation (252,); values under 1e-3 are raised to that.
     """
 
-    MIN_STD = 1e-3  # a constant feature stays constant instead of becoming noise
+    MIN_STD = 1e-3  # keeps a constant feature constant, where a division by 0 would make noise of it
 
     rest: Tensor
     mean: Tensor
@@ -43,12 +44,12 @@ class Normalizer(nn.Module):
 
     @classmethod
     def raw(cls, coordinates: World, rest: Tensor) -> Normalizer:
-        """The frame without normalisation."""
+        """Make a normalizer that changes the coordinates alone, without z-scores."""
         return cls(coordinates, rest, torch.zeros(FRAME_DIM), torch.ones(FRAME_DIM))
 
     @classmethod
     def fit(cls, coordinates: World, rest: Tensor, frames: Tensor, chunk: int = 65536) -> Normalizer:
-        """The frame with the z-scores of training frames (F, 252), read chunk by chunk."""
+        """Make a normalizer with the z-scores of training frames (F, 252), which are read chunk by chunk."""
         plain = cls.raw(coordinates, rest).to(frames.device)
         count = len(frames)
         total = torch.zeros(FRAME_DIM, dtype=torch.float64, device=frames.device)
@@ -61,31 +62,32 @@ class Normalizer(nn.Module):
         return cls(coordinates, rest.cpu(), mean.cpu(), (square / count).sqrt().cpu())
 
     def origin(self, sparse: Tensor) -> Tensor:
-        """Where (..., 3 or 5) the local coordinates of inputs (..., 54) lie."""
+        """Return the origin (..., 3 or 5) of the local coordinates of inputs (..., 54)."""
         return self.coordinates.origin(sparse)
 
     def encode(self, frames: Tensor) -> Tensor:
-        """World frames [X | Theta] (..., 252) -> network space (..., 252)."""
+        """Convert world frames [X | Theta] (..., 252) to network space (..., 252)."""
         sparse, motion = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:]
         origin = self.origin(sparse)
         return torch.cat([self.encode_sparse(sparse, origin), self.encode_motion(motion, origin)], -1)
 
     def encode_sparse(self, sparse: Tensor, origin: Tensor) -> Tensor:
-        """World inputs (..., 54) -> network space (..., 54)."""
+        """Convert world inputs (..., 54) with the given origin to network space (..., 54)."""
         return (self.coordinates.sparse_in(sparse, origin) - self.mean[:SPARSE_DIM]) / self.std[:SPARSE_DIM]
 
     def encode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
-        """World motion (..., 198) -> network space (..., 198)."""
+        """Convert world motion (..., 198) with the given origin to network space (..., 198)."""
         return (self.coordinates.motion_in(motion, origin) - self.mean[SPARSE_DIM:]) / self.std[SPARSE_DIM:]
 
     def decode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
-        """Network space (..., 198) -> world motion (..., 198)."""
+        """Convert motion (..., 198) in network space with the given origin to the world (..., 198)."""
         return self.coordinates.motion_out(motion * self.std[SPARSE_DIM:] + self.mean[SPARSE_DIM:], origin)
 
     def pose(self, motion: Tensor, sparse: Tensor) -> Tensor:
-        """Joint positions (..., 22, 3), metres, world, from the rotations of world motion (..., 198).
+        """Return joint positions (..., 22, 3), metres, world, from the rotations of world motion (..., 198).
 
-        Forward kinematics, translated so that the head stands where its tracker says (reading 22).
+        They follow by forward kinematics, translated so that the head stands where its tracker says in the
+        world inputs (..., 54) (reading 22).
         """
         local = sixd_to_matrix(motion[..., ROTATION].unflatten(-1, (N_JOINTS, 6)))
         _, positions = forward_kinematics(local, torch.zeros_like(sparse[..., :3]), self.rest)
@@ -93,7 +95,7 @@ class Normalizer(nn.Module):
         return positions + (head - positions[..., HEAD, :]).unsqueeze(-2)
 
     def posed(self, rotation: Tensor, sparse: Tensor) -> Tensor:
-        """World motion (..., 198) of rotations (..., 132) in network space at world inputs (..., 54).
+        """Make world motion (..., 198) from rotations (..., 132) in network space at world inputs (..., 54).
 
         The positions follow from the rotations (`pose`), without gradient.
         """

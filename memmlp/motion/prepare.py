@@ -1,8 +1,8 @@
-"""A folder of AMASS npz -> a memory-mappable cache of 60 Hz frames and its manifest.
+"""Turns a folder of AMASS npz into a memory-mappable cache of 60 Hz frames with a manifest.
 
-The sources are read twice, a clip at a time: once to learn which are sound and how long they are, so that
-the split divides sound clips only and every array's size is known, and once to write the frames. The
-manifest is written last: a cache without one is none, and the next call makes it anew.
+The sources are read twice, a clip at a time: once to learn which are sound and how long they are, so that the
+split divides sound clips only and every array's size is known, and once to write the frames. The manifest is
+written last: a cache without one is unfinished, and the next call makes it again.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from memmlp.motion.clip import Clip, Skipped, read_clip, resample
 from memmlp.motion.splits import PARTS, Split, group_names
 from memmlp.runs.recipes import RECIPES
 
-FORMAT = 2  # of the cache; a new number makes every cache anew
-FRAMES = 1  # of what a frame holds; a new number changes every digest, and so makes every run anew
+FORMAT = 2  # number of the cache's format; a new one makes every cache again
+FRAMES = 1  # number of a frame's content; a new one changes every digest, and so makes every run again
 CHUNK = 4096  # frames turned into features at a time
 MANIFEST = "manifest.json"
 ITEM_BYTES = FRAME_DIM * 4
@@ -46,7 +46,7 @@ class ClipFolder:
         split: assigns clips to train, val, test.
         body: "builtin" or the path of an SMPL-H model.npz.
         min_frames: clips with fewer frames at 60 Hz are skipped (42 leave T = 41 frames of input).
-        strict: the first file that would be skipped raises InputError.
+        strict: whether the first file that would be skipped raises InputError instead.
     """
 
     root: Path
@@ -63,10 +63,11 @@ class ClipRecord:
     Attributes:
         name: path below the data root without suffix.
         split: "train", "val" or "test".
-        group: the clips that it belongs with (`splits.group_names`), its own name where it is alone.
-        start, length: its frames in that split's array.
+        group: name of the clip's group (`splits.group_names`); its own name where it belongs to none.
+        start: its first frame in that split's array.
+        length: its number of frames there.
         sha256: digest of the source file.
-        fps: frame rate found.
+        fps: frame rate of the source, Hz.
         resampling: how it was brought to 60 Hz.
     """
 
@@ -82,7 +83,13 @@ class ClipRecord:
 
 @dataclass(frozen=True)
 class Survey:
-    """What is in a folder: sound clips (without split and group yet), bad files, npz files without motion."""
+    """What a folder of npz files holds.
+
+    Attributes:
+        clips: sound clips, without split and group yet.
+        skipped: bad files.
+        ignored: number of npz files without motion.
+    """
 
     clips: tuple[ClipRecord, ...]
     skipped: tuple[Skipped, ...]
@@ -91,22 +98,24 @@ class Survey:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a cache holds; `manifest.json`.
+    """What a cache holds; the content of `manifest.json`.
 
     Attributes:
-        digest: sha256 over everything that determines the frames and their split. Groups, of which no
-            training knows, are not in it.
-        request: sha256 over the settings and each source's path, size and time, to find it again.
+        digest: sha256 over everything that determines the frames and their split. Groups are not in it, since
+            training does not know them.
+        request: sha256 over the settings and each source's path, size and time, by which a finished cache is
+            recognised.
         body: "builtin", or the model file's name and a digest of its rest pose: "model.npz 0a1b2c3d".
         rest_joints: rest positions (22, 3), metres.
         split: the split's settings.
-        min_frames: shortest clip taken, frames at 60 Hz.
-        clips: sorted by name.
+        min_frames: fewest frames at 60 Hz of a clip that is taken.
+        clips: the clips, sorted by name.
         skipped: bad files.
-        ignored: npz files without poses (shape.npz and the like).
-        left_out: sound clips that the split gave no part, counted by top-level folder.
-        missing: entries of the split that no file answers to.
+        ignored: number of npz files without poses (shape.npz and the like).
+        left_out: number of sound clips without a part in the split, by top-level folder.
+        missing: entries of the split for which there is no file.
         totals: part -> clips, frames, hours.
+        format: format number of the cache.
     """
 
     digest: str
@@ -125,7 +134,11 @@ class Manifest:
 
     @classmethod
     def load(cls, out: Path) -> Manifest:
-        """The manifest of a cache; raises InputError where there is no finished cache."""
+        """Load the manifest of a cache.
+
+        Raises:
+            InputError: if there is no finished cache of this format.
+        """
         path = out / MANIFEST
         try:
             data = json.loads(path.read_text())
@@ -147,19 +160,20 @@ class Manifest:
 
     @cached_property
     def groups(self) -> dict[str, str]:
-        """clip name -> its group: what statistics count as one."""
+        """clip name -> its group; statistics count a group once."""
         return {clip.name: clip.group for clip in self.clips}
 
     def part(self, split: str) -> list[ClipRecord]:
-        """The clips of a split, in the order of its array."""
+        """Return the clips of a split, in the order of its array."""
         return [clip for clip in self.clips if clip.split == split]
 
 
 def prepare(source: ClipFolder, out: Path) -> Manifest:
     """Make the cache in `out`, or find it there finished; concurrent callers wait for one another.
 
-    Raises InputError for a root without usable clips, an impossible split, a bad file under `strict`, a
-    folder that can't be written or too small a disk.
+    Raises:
+        InputError: for a root without usable clips, an impossible split, a bad file under `strict`, a folder
+            that cannot be written, or too small a disk.
     """
     source = ClipFolder(Path(source.root), source.split, str(source.body), source.min_frames, source.strict)
     if source.min_frames < 2:
@@ -180,7 +194,7 @@ def prepare(source: ClipFolder, out: Path) -> Manifest:
 
 
 def finished(source: ClipFolder, out: Path) -> Manifest | None:
-    """The manifest of a finished, up-to-date cache of the source in `out`, if there is one."""
+    """Return the manifest of a finished, up-to-date cache of the source in `out`, or None."""
     try:
         return _finished(out, _request(source, load_rest_joints(str(source.body))))
     except InputError:
@@ -188,7 +202,11 @@ def finished(source: ClipFolder, out: Path) -> Manifest | None:
 
 
 def survey(root: Path, min_frames: int = 2, strict: bool = False) -> Survey:
-    """Read every npz below a folder; raises InputError where there are none, or at a bad one if strict."""
+    """Read every npz below a folder.
+
+    Raises:
+        InputError: if there are none, or at the first bad one if `strict`.
+    """
     clips, skipped, ignored = [], [], 0
     for file in track(_sources(root), "reading"):
         path = root / file
@@ -205,7 +223,7 @@ def survey(root: Path, min_frames: int = 2, strict: bool = False) -> Survey:
 
 
 def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Manifest:
-    """Read, split, write."""
+    """Read the sources, split them, and write the cache."""
     found = survey(source.root, source.min_frames, source.strict)
     if not found.clips:
         raise InputError(_no_clips(source.root, found))
@@ -234,7 +252,7 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
 
 
 def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) -> None:
-    """The arrays under temporary names, then their names, then the manifest."""
+    """Write the arrays under temporary names, then rename them, then write the manifest."""
     (out / MANIFEST).unlink(missing_ok=True)
     frames = {part: int(manifest.totals[part]["frames"]) for part in PARTS}
     _check_space(out, sum(frames.values()) * ITEM_BYTES)
@@ -270,19 +288,19 @@ def _sync(file: BinaryIO) -> None:
 
 
 def _frames(clip: Clip, rest: np.ndarray) -> Iterator[np.ndarray]:
-    """The frames of a 60 Hz clip in blocks (<= CHUNK, 252), float32, computed in float64."""
-    import torch  # seconds to import, and not needed to find a finished cache
+    """Yield the frames of a 60 Hz clip in blocks (<= CHUNK, 252), float32, computed in float64."""
+    import torch  # takes seconds to import, and finding a finished cache does not need it
 
     from memmlp.motion.features import motion_frames
 
     poses, trans, joints = (torch.from_numpy(np.ascontiguousarray(x)) for x in (clip.poses, clip.trans, rest))
     for start in range(0, len(clip) - 1, CHUNK):
-        block = slice(start, start + CHUNK + 1)  # a frame more than comes out: the first has no velocity
+        block = slice(start, start + CHUNK + 1)  # one frame more than comes out, as the first has no velocity
         yield motion_frames(poses[block], trans[block], joints).numpy().astype("<f4")
 
 
 def _sources(root: Path) -> list[str]:
-    """The npz files below a folder, through links too: sorted paths relative to it."""
+    """Return the npz files below a folder, also through links: sorted paths relative to it."""
     if not root.is_dir():
         raise InputError(f"data.root: {root} is no folder; give it the folder with your npz clips")
     walk = os.walk(root, followlinks=True)
@@ -294,7 +312,7 @@ def _sources(root: Path) -> list[str]:
 
 
 def _has_no_poses(path: Path) -> bool:
-    """Whether a file is a sound npz of something else than motion; only its directory is read."""
+    """Return whether a file is a sound npz of something else than motion; only its directory is read."""
     try:
         with zipfile.ZipFile(path) as archive:
             return "poses.npy" not in archive.namelist()
@@ -303,7 +321,7 @@ def _has_no_poses(path: Path) -> bool:
 
 
 def _inspect(path: Path, file: str, min_frames: int) -> ClipRecord:
-    """The record of a sound clip, without split and start; raises InputError for any other."""
+    """Return the record of a sound clip, without split and start; raise InputError for any other file."""
     name = _name(file)
     clip, fps, how = _load(path, name)
     if len(clip) < min_frames:
@@ -314,7 +332,7 @@ def _inspect(path: Path, file: str, min_frames: int) -> ClipRecord:
 
 
 def _load(path: Path, name: str) -> tuple[Clip, float, str]:
-    """A clip at 60 Hz, the frame rate found and how it was brought there."""
+    """Read a clip, and return it at 60 Hz with its original frame rate and how it was resampled."""
     clip = read_clip(path, name)
     resampled, how = resample(clip)
     return resampled, clip.fps, how
@@ -325,14 +343,14 @@ def _name(file: str) -> str:
 
 
 def _body(body: str, rest: np.ndarray) -> str:
-    """The name of a body: model files of all bodies are called alike."""
+    """Name a body; a model's name includes a digest, since the model files of all bodies are named alike."""
     return "builtin" if body == "builtin" else f"{Path(body).name} {_hash(rest.tolist())[:8]}"
 
 
 def _place(
     clips: Sequence[ClipRecord], parts: Mapping[str, str | None], groups: Mapping[str, str]
 ) -> tuple[ClipRecord, ...]:
-    """The clips that have a part, each with its group and its place in that part's array."""
+    """Return the clips that have a part, each with its group and its position in that part's array."""
     ends = dict.fromkeys(PARTS, 0)
     placed = []
     for clip in clips:
@@ -344,7 +362,7 @@ def _place(
 
 
 def _left_out(parts: Mapping[str, str | None]) -> dict[str, int]:
-    """Clips without a part, counted by top-level folder."""
+    """Count the clips without a part by top-level folder."""
     return dict(Counter(name.split("/")[0] for name, part in sorted(parts.items()) if part is None))
 
 
@@ -359,14 +377,14 @@ def _digest(clips: Sequence[ClipRecord], rest: np.ndarray, min_frames: int) -> s
 
 
 def _request(source: ClipFolder, rest: np.ndarray) -> str:
-    """Digest of settings and sources by path, size and time: no source is opened."""
+    """Return a digest of the settings and of each source's path, size and time, without opening any."""
     files = [(file, *_stamp(source.root / file)) for file in _sources(source.root)]
     code = [FORMAT, FRAMES, RECIPES["features"]]
     return _hash([*code, source.min_frames, rest.tolist(), source.split.describe(), files])
 
 
 def _stamp(path: Path) -> tuple[int, int]:
-    """Size and time of a file; zeros for a dangling link, which reading will find and skip."""
+    """Return size and time of a file; zeros for a dangling link, which reading will find and skip."""
     try:
         stat = path.stat()
     except OSError:
@@ -379,7 +397,7 @@ def _hash(value: Any) -> str:
 
 
 def _finished(out: Path, request: str) -> Manifest | None:
-    """The manifest in `out` where it answers the request and its arrays are there whole."""
+    """Return the manifest in `out` if it answers the request and its arrays are complete, else None."""
     try:
         manifest = Manifest.load(out)
         whole = all(_array_frames(out, part) == manifest.totals[part]["frames"] for part in PARTS)
@@ -389,7 +407,7 @@ def _finished(out: Path, request: str) -> Manifest | None:
 
 
 def _array_frames(out: Path, part: str) -> int:
-    """Frames in a part's array; the file's size must agree with its header, or ValueError."""
+    """Return the frames in a part's array; raise ValueError if its size does not agree with its header."""
     return len(np.lib.format.open_memmap(out / f"{part}.npy", mode="r"))
 
 

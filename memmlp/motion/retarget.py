@@ -1,11 +1,11 @@
-"""BVH -> Clip on the 22-joint tree, by a skeleton's map.
+"""Retargets BVH motion to clips on the 22-joint tree, by a skeleton map.
 
 A source joint's global rotation, carried from the file's axes to the world (Z up), is the rotation of the
 body joint it is mapped to, up to a constant correction K on the right: the bone that points along t in the
 body's rest pose points along s = K t in the source's zero pose. Arms and legs get the least rotation from t
-to s, so that they point as in the source in every frame. Wrists, ankles and feet move on with the bone
-before them. The torso and the head stand upright in both poses and need no correction. A body joint without
-a counterpart takes its parent's rotation.
+to s, so that they point as in the source in every frame. Wrists, ankles and feet move on with the bone before
+them. The torso and the head stand upright in both poses and need no correction. A body joint without a
+counterpart takes its parent's rotation.
 """
 
 from __future__ import annotations
@@ -33,12 +33,13 @@ class Retargeting:
     """What is constant between one BVH hierarchy and one body, in Y-up axes and metres.
 
     Attributes:
-        nodes: the BVH node (22,) whose rotation each body joint takes; its parent's where it has none.
+        nodes: index (22,) of the BVH node whose rotation each body joint takes; a joint without a node takes
+            its parent's.
         corrections: K (22, 3, 3), on the right of the node's rotation.
         own_rest: rest positions (22, 3) of the source's own bones, in the corrected joint frames.
         scale: the body's leg length over the source's.
-        anchor: from the scaled source root to the body's root (3,), in the root's frame, so that the hips
-            of both have the same middle (a source's root may lie above or below SMPL's pelvis).
+        anchor: from the scaled source root to the body's root (3,), in the root's frame; it makes the middle
+            of the hips the same in both, since a source's root may lie above or below SMPL's pelvis.
     """
 
     nodes: np.ndarray
@@ -49,10 +50,11 @@ class Retargeting:
 
 
 def fit(bvh: Bvh, skeleton: SkeletonMap, rest: np.ndarray) -> Retargeting:
-    """Fit the hierarchy to a body's rest joints (22, 3), metres.
+    """Fit a BVH hierarchy to a body's rest joints (22, 3), metres.
 
-    Raises InputError where joints are missing or stand in another order than the body's, or where the zero
-    pose is no upright pose of a person with bones of some length.
+    Raises:
+        InputError: if joints are missing or stand in another order than the body's, or the zero pose is not
+            an upright pose of a person whose bones have a length.
     """
     nodes = _nodes(bvh, skeleton)
     zero = (bvh.zero_pose() @ skeleton.upright.T * skeleton.unit)[nodes]
@@ -66,10 +68,17 @@ def fit(bvh: Bvh, skeleton: SkeletonMap, rest: np.ndarray) -> Retargeting:
 def retarget(
     bvh: Bvh, skeleton: SkeletonMap, rest: np.ndarray, *, name: str = "bvh", fps: float | None = None
 ) -> Clip:
-    """The motion on a body with the rest joints (22, 3), metres, in the world (Z up).
+    """Retarget a BVH file's motion to a body, in the world (Z up).
 
-    The rate is `fps`, or the header's; a calibration frame is dropped. Raises InputError as `fit` does, and
-    where no frame is left or the person leaves the world.
+    Args:
+        bvh: the file; a calibration frame is dropped.
+        skeleton: its skeleton map.
+        rest: the body's rest joints (22, 3), metres.
+        name: the clip's name.
+        fps: the true frame rate, Hz; by default the header's.
+
+    Raises:
+        InputError: as `fit` does, and if no frame is left or the person is more than 10 km from the origin.
     """
     fitted = fit(bvh, skeleton, rest)
     world = Z_UP @ skeleton.upright
@@ -89,7 +98,7 @@ def retarget(
 
 
 def _nodes(bvh: Bvh, skeleton: SkeletonMap) -> np.ndarray:
-    """Each body joint's node (22,), its parent's where it has none."""
+    """Return the index (22,) of each body joint's node; its parent's where it has none."""
     missing = sorted(set(skeleton.joints.values()) - set(bvh.nodes))
     if missing:
         lacking = f"no {', '.join(missing)}, which skeleton {skeleton.name} names"
@@ -105,7 +114,7 @@ def _nodes(bvh: Bvh, skeleton: SkeletonMap) -> np.ndarray:
 
 
 def _line(bvh: Bvh, node: int) -> list[int]:
-    """The node and its ancestors."""
+    """Return the node and its ancestors."""
     line = [node]
     while bvh.node_parents[line[-1]] >= 0:
         line.append(bvh.node_parents[line[-1]])
@@ -124,7 +133,7 @@ def _check_zero_pose(path: Path, zero: np.ndarray, rest: np.ndarray) -> None:
 
 
 def _corrections(zero: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """K (22, 3, 3) from the positions (22, 3) in the source's zero pose and in the body's rest pose."""
+    """Return K (22, 3, 3) from positions (22, 3) in the source's zero pose and in the body's rest pose."""
     corrections = np.tile(np.eye(3), (len(JOINTS), 1, 1))
     for joint, child in LIMBS.items():
         corrections[joint] = _least_rotation(rest[child] - rest[joint], zero[child] - zero[joint])
@@ -134,7 +143,7 @@ def _corrections(zero: np.ndarray, rest: np.ndarray) -> np.ndarray:
 
 
 def _least_rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """The smallest rotation (3, 3) of one direction (3,) onto another that is not its opposite."""
+    """Return the smallest rotation (3, 3) of one direction (3,) onto another that is not its opposite."""
     axis = np.cross(source, target)
     norm = np.linalg.norm(axis)
     angle = math.atan2(norm, source @ target)
@@ -142,7 +151,7 @@ def _least_rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _own_rest(zero: np.ndarray, corrections: np.ndarray) -> np.ndarray:
-    """Rest positions (22, 3) by which corrected rotations put the source's joints where the source does."""
+    """Return rest positions (22, 3) on which corrected rotations put the joints where the source has them."""
     own = zero.copy()
     for joint, parent in enumerate(PARENTS[1:], start=1):
         own[joint] = own[parent] + corrections[parent].T @ (zero[joint] - zero[parent])
@@ -150,12 +159,12 @@ def _own_rest(zero: np.ndarray, corrections: np.ndarray) -> np.ndarray:
 
 
 def _leg_length(positions: np.ndarray) -> float:
-    """Thigh and shin of positions (22, 3), the mean of both sides."""
+    """Return the length of thigh and shin of positions (22, 3), the mean of both sides."""
     return (
         sum(float(np.linalg.norm(positions[child] - positions[joint])) for joint, child in LEGS.items()) / 2
     )
 
 
 def limb_angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angles (...), radians, between directions (..., 3); accurate at 0."""
+    """Return the angles (...), radians, between directions (..., 3); accurate at 0."""
     return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1))

@@ -1,4 +1,4 @@
-"""Skeleton families: which joint of a BVH file stands for which of the 22, by a YAML map."""
+"""Skeleton maps: which joint of a BVH file stands for which of the 22 body joints, as YAML."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from memmlp.motion.clip import FRAME_RATE_RANGE
 SKELETONS = Path(__file__).parent / "skeletons"
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # Y-up axes to the world's: y becomes z
 HIPS = (1, 2)
-LEGS = {1: 4, 2: 5, 4: 7, 5: 8}  # joint: the joint its bone points to
+LEGS = {1: 4, 2: 5, 4: 7, 5: 8}  # joint -> the joint at the other end of its bone
 LIMBS = LEGS | {16: 18, 17: 19, 18: 20, 19: 21}
 REQUIRED = ("pelvis", "head", *(JOINTS[joint] for joint in sorted({*LIMBS, *LIMBS.values()})))
 
 
 @dataclass(frozen=True)
 class SkeletonMap:
-    """A source skeleton's map.
+    """The map of a family of source skeletons.
 
     Attributes:
-        name: its name.
-        unit: metres in the file's unit.
+        name: the map's name.
+        unit: the file's unit in metres.
         up: the file's up axis, `y` (zero pose facing +Z) or `z` (facing -Y); left is +X in both.
         calibration_frame: whether frame 0 is a calibration pose, not motion.
+        joints: body joint -> the BVH node (a joint, or `<joint>.end`) that stands for it.
         rates: true frame rates, Hz, of folders whose headers are known to be wrong.
-        joints: the BVH node (a joint, or `<joint>.end`) of each body joint that has one.
     """
 
     name: str
@@ -49,12 +49,16 @@ class SkeletonMap:
 
 
 def shipped_skeletons() -> tuple[str, ...]:
-    """Names of the maps in the package."""
+    """Return the names of the maps in the package."""
     return tuple(sorted(path.stem for path in SKELETONS.glob("*.yaml")))
 
 
 def load_skeleton(which: str) -> SkeletonMap:
-    """A shipped map by name, or a user's by its path. Raises InputError for a file that is no map."""
+    """Load a shipped map by its name, or a user's by its path.
+
+    Raises:
+        InputError: if there is no such file or it is no map.
+    """
     path = SKELETONS / f"{which}.yaml" if which in shipped_skeletons() else Path(which)
     if not path.is_file():
         known = ", ".join(shipped_skeletons())
@@ -69,7 +73,11 @@ def load_skeleton(which: str) -> SkeletonMap:
 
 
 def find_skeleton(bvh: Bvh) -> SkeletonMap:
-    """The one shipped map whose nodes the file has all. Raises InputError where there is none, or several."""
+    """Find the one shipped map all of whose nodes the file has.
+
+    Raises:
+        InputError: if there is none, or more than one.
+    """
     maps = [load_skeleton(name) for name in shipped_skeletons()]
     fitting = [skeleton for skeleton in maps if set(skeleton.joints.values()) <= set(bvh.nodes)]
     if len(fitting) == 1:
@@ -81,7 +89,7 @@ def find_skeleton(bvh: Bvh) -> SkeletonMap:
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Plain YAML in which no key stands twice."""
+    """A YAML loader that raises ValueError for a key that stands twice."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
@@ -92,7 +100,7 @@ class _StrictLoader(yaml.SafeLoader):
 
 
 def _check_map(path: Path, content: object) -> None:
-    """Raise InputError unless the YAML has exactly what a Skeleton needs."""
+    """Raise InputError unless the YAML has exactly what a SkeletonMap needs."""
 
     def require(good: bool, key: str, allowed: str) -> None:
         if not good:

@@ -1,4 +1,4 @@
-"""Where the motion of an experiment comes from, and where its cache lies."""
+"""The source of an experiment's motion, and the folder of its cache."""
 
 from __future__ import annotations
 
@@ -17,7 +17,12 @@ if TYPE_CHECKING:
 
 
 class Prepared(NamedTuple):
-    """Prepared motion: the folder of its cache, and its manifest."""
+    """Prepared motion.
+
+    Attributes:
+        cache: the folder of the cache.
+        manifest: the cache's manifest.
+    """
 
     cache: Path
     manifest: Manifest
@@ -28,19 +33,20 @@ class Prepared(NamedTuple):
         return self.manifest.digest
 
     def open(self, split: str) -> MotionDataset:
-        """A split of the cache, memory-mapped (`MotionDataset.open`)."""
-        from memmlp.motion.dataset import MotionDataset  # with torch, which finding finished work needs not
+        """Open a split of the cache, memory-mapped (`MotionDataset.open`)."""
+        # Imported here, since it imports torch, which finding finished work does not need.
+        from memmlp.motion.dataset import MotionDataset
 
         return MotionDataset.open(self.cache, split)
 
 
 @dataclass(frozen=True)
 class MotionSource:
-    """A folder of clips with its split and body, generated where it is synthetic, and its cache.
+    """A folder of clips, which is generated if it is synthetic, and its cache.
 
     Attributes:
         source: the folder of clips, its split and body.
-        generate: makes the folder where it is synthetic; None for the user's own.
+        generate: makes a synthetic folder; None for the user's own.
         caches: folder of all caches.
     """
 
@@ -50,26 +56,26 @@ class MotionSource:
 
     @property
     def cache(self) -> Path:
-        """Where the cache lies: one folder for each source, split and body."""
+        """The folder of the cache, one for each source, split and body."""
         key = repr(replace(self.source, root=self.source.root.resolve()))
         return self.caches / f"{self.source.root.name}-{hashlib.sha256(key.encode()).hexdigest()[:8]}"
 
     def prepare(self) -> Prepared:
-        """The cache, made where it is missing or out of date, and its manifest."""
+        """Return the cache with its manifest; it is made if it is missing or out of date."""
         if self.generate is not None and not self.source.root.exists():
             self.source.root.parent.mkdir(parents=True, exist_ok=True)
             with FileLock(self.source.root.with_name(f".{self.source.root.name}.lock")):
-                if not self.source.root.exists():  # nobody else has made it while this process waited
+                if not self.source.root.exists():  # no other process made it while this one waited
                     self._generate(self.generate)
         return Prepared(self.cache, prepare(self.source, self.cache))
 
     def digest(self) -> str | None:
-        """The digest of the prepared data; None where the cache is missing or out of date."""
+        """Return the digest of the prepared data; None if the cache is missing or out of date."""
         manifest = finished(self.source, self.cache)
         return manifest.digest if manifest else None
 
     def _generate(self, generate: Callable[[Path], object]) -> None:
-        """Make the clips beside their place and move them there, so that a kill leaves no half folder."""
+        """Make the clips in a temporary folder and rename it, so that a kill leaves no incomplete folder."""
         root = self.source.root
         unfinished = root.with_name(root.name + ".unfinished")
         generate(unfinished)

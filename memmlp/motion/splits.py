@@ -1,10 +1,10 @@
-"""Which clip goes where: a split is an object that assigns clip names to train, val, test or nothing.
+"""Splits, which assign clip names to train, val, test or nothing.
 
-A clip's name is its path below the data root without suffix, `/`-separated. Clips that `groups` (a list
-of regular expressions) tie together are never divided: two clips that match the same pattern anywhere
-(`re.search`), with the same captured groups, stay on one side. Fractions count groups, and a clip that
-no pattern matches is a group of its own. Nothing depends on the order of the names: groups are ranked
-by a hash of seed and name, so a clip that is added later moves few others.
+A clip's name is its path below the data root without suffix, `/`-separated. Clips that `groups` (a list of
+regular expressions) tie together are never divided: two clips that match the same pattern anywhere
+(`re.search`), with the same captured groups, get the same part. Fractions count groups, and a clip that no
+pattern matches is a group of its own. Nothing depends on the order of the names: groups are ranked by a hash
+of seed and name, so a clip that is added later moves few others.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from typing import Any, Protocol
 from memmlp.common.errors import InputError
 
 PARTS = ("train", "val", "test")
-PHASES = ("train", "test")  # of a published list
+PHASES = ("train", "test")  # the parts for which there are published lists
 
 S2_TRAIN = (
     "CMU", "MPI_Limits", "TotalCapture", "Eyes_Japan_Dataset", "KIT", "BioMotionLab_NTroje", "BMLmovi",
     "EKUT", "ACCAD", "MPI_mosh", "SFU", "MPI_HDM05",
 )  # fmt: skip
 S2_TEST = ("HumanEva", "Transitions_mocap")
-# Later AMASS downloads renamed some subsets; lower case, new name -> the name of the protocols.
+# Later AMASS downloads renamed some subsets: new name -> the name that the protocols use, in lower case.
 RENAMED = {
     "bmlrub": "biomotionlab_ntroje",
     "eyesjapandataset": "eyes_japan_dataset",
@@ -44,7 +44,7 @@ class Assignment:
 
     Attributes:
         parts: clip name -> "train", "val", "test", or None for a clip that is left out.
-        missing: entries of the split (list entries, subsets) with no clip among the names.
+        missing: entries of the split (list entries, subsets) that no clip's name fits.
     """
 
     parts: Mapping[str, str | None]
@@ -52,14 +52,14 @@ class Assignment:
 
 
 class Split(Protocol):
-    """The slot."""
+    """The split slot's interface."""
 
     def assign(self, names: Sequence[str]) -> Assignment:
-        """The part of every name; raises InputError where the split is impossible."""
+        """Return the part of every name; raises InputError if the split is impossible."""
         ...
 
     def describe(self) -> dict[str, Any]:
-        """Everything that determines `assign`, ready for JSON, without a path of this machine."""
+        """Return everything that determines `assign`, ready for JSON, without a path of this machine."""
         ...
 
     @property
@@ -73,8 +73,9 @@ class SeededSplit:
     """A random split with a seed.
 
     Args:
-        test, val: fractions of the groups (of the clips, without `groups`); 0 leaves that part empty.
-        seed: another seed, another split.
+        test: fraction of the groups (of the clips, without `groups`) for test; 0 leaves it empty.
+        val: fraction of the groups for validation; 0 leaves it empty.
+        seed: seed of the order in which groups are taken.
         groups: patterns of clips that stay together.
     """
 
@@ -103,7 +104,8 @@ class ListSplit:
     Args:
         folder: where the user keeps the lists.
         val: fraction of train's groups that becomes the validation part.
-        seed, groups: of that validation part.
+        seed: seed of the validation part.
+        groups: patterns of clips that stay together in the validation part.
     """
 
     folder: Path
@@ -128,12 +130,16 @@ class ListSplit:
 
 @dataclass(frozen=True)
 class SubsetSplit:
-    """By top-level folder, whatever its case and under AMASS' old or new name; other folders are left out.
+    """A split by top-level folder, in any letter case and under AMASS' old or new name.
+
+    Clips in other folders are left out.
 
     Args:
-        train, test: names of the subsets.
+        train: names of the training subsets.
+        test: names of the test subsets.
         val: fraction of train's groups that becomes the validation part.
-        seed, groups: of that validation part.
+        seed: seed of the validation part.
+        groups: patterns of clips that stay together in the validation part.
     """
 
     train: Sequence[str]
@@ -160,16 +166,18 @@ class SubsetSplit:
 
 
 def group_names(names: Iterable[str], patterns: Sequence[str]) -> dict[str, str]:
-    """clip name -> the name of its group: that of the first of its clips, its own where it is alone.
+    """Map each clip's name to its group's: the first name in the group, its own for a clip alone.
 
-    Clips of one group are no replications of each other: two dancers of one recording, say. Raises
-    InputError for a pattern that is none.
+    Clips of one group are not replications of each other: two dancers of one recording, for example.
+
+    Raises:
+        InputError: if a pattern is no regular expression.
     """
     return {name: group[0] for group in _grouped(names, patterns) for name in group}
 
 
 def _carving(split: SeededSplit | ListSplit | SubsetSplit) -> dict[str, Any]:
-    """The settings that every split has."""
+    """Return the settings that every split has."""
     return {"val": split.val, "seed": split.seed, "groups": list(split.groups)}
 
 
@@ -184,7 +192,7 @@ def _check_fractions(**fractions: float) -> None:
 def _carve_val(
     parts: Mapping[str, str | None], val: float, seed: int, groups: Sequence[str]
 ) -> dict[str, str | None]:
-    """The parts, with some of train's groups moved to "val"."""
+    """Return the parts with some of train's groups moved to "val"."""
     train = [name for name, part in parts.items() if part == "train"]
     if not train:
         raise InputError("data.split: no clip of its train part is below data.root; is it the right root?")
@@ -194,7 +202,7 @@ def _carve_val(
 def _divide(
     names: Sequence[str], fractions: Mapping[str, float], seed: int, groups: Sequence[str]
 ) -> dict[str, str]:
-    """name -> part: the first groups in a seeded order fill the parts of `fractions`, the rest train."""
+    """Map names to parts: the first groups in a seeded order fill those of `fractions`, the rest train."""
     ranked = sorted(_grouped(names, groups), key=lambda group: _rank(group[0], seed))
     parts = {name: "train" for name in names}
     start = 0
@@ -206,7 +214,7 @@ def _divide(
 
 
 def _counts(total: int, fractions: Mapping[str, float]) -> dict[str, int]:
-    """How many groups each part gets: its rounded share, at least one, and one is left for train."""
+    """Return how many groups each part gets: its rounded share, at least one, leaving one for train."""
     counts = {part: max(1, round(share * total)) if share > 0 else 0 for part, share in fractions.items()}
     needed = 1 + sum(count > 0 for count in counts.values())
     if total < needed:
@@ -225,7 +233,7 @@ def _rank(name: str, seed: int) -> str:
 
 
 def _grouped(names: Iterable[str], patterns: Sequence[str]) -> list[list[str]]:
-    """The names in groups, each sorted; ties are transitive (union-find over names and ties)."""
+    """Return the names in groups, each sorted; ties are transitive (union-find over names and ties)."""
     try:
         compiled = [re.compile(pattern) for pattern in patterns]
     except re.error as error:
@@ -242,7 +250,7 @@ def _grouped(names: Iterable[str], patterns: Sequence[str]) -> list[list[str]]:
 
 
 def _find(parent: dict[object, object], node: object) -> object:
-    """The root of a node, halving the path on the way."""
+    """Return the root of a node, halving the path on the way."""
     while parent.setdefault(node, node) != node:
         parent[node] = parent[parent[node]]
         node = parent[node]
@@ -250,13 +258,13 @@ def _find(parent: dict[object, object], node: object) -> object:
 
 
 def _subset(name: str) -> str:
-    """The subset of a clip or a subset's name, in lower case and under its old name."""
+    """Return the subset of a clip's or a subset's name, in lower case and under its old name."""
     top = name.split("/")[0].lower()
     return RENAMED.get(top, top)
 
 
 def _read_lists(folder: Path) -> dict[str, str]:
-    """clip name -> "train" or "test" from all lists below a folder."""
+    """Map clip names to "train" or "test" by all lists below a folder."""
     files = {phase: sorted(folder.rglob(f"{phase}_split.txt")) for phase in PHASES}
     if not files["train"]:
         raise InputError(f"data.split: no SUBSET/train_split.txt below {folder}")
@@ -270,7 +278,7 @@ def _read_lists(folder: Path) -> dict[str, str]:
 
 
 def _read_list(file: Path) -> Iterator[str]:
-    """The clip names of one list; a path is taken from the folder that is called as the list's own."""
+    """Yield the clip names of one list; a path counts from the folder that is named like the list's own."""
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

@@ -1,4 +1,4 @@
-"""What builds a family's network from its config's parts."""
+"""Architectures: each builds the networks of one family with fresh weights, and loads trained ones."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ VQVAE_SETTINGS = ("codes", "width", "encoder_depth", "decoder_depth", "commitmen
 
 @dataclass(frozen=True)
 class Architecture:
-    """What builds a family's network: this, and `build`.
+    """How the networks of a family are built, and the VQ-VAE that some of them use; the base of all families.
 
     Attributes:
-        coordinates, normalize: of world <-> network space.
-        vqvae: makes a VQ-VAE.
+        coordinates: the coordinates in which the network sees the world.
+        normalize: whether features are normalised to z-scores.
+        vqvae: makes a VQ-VAE with fresh weights.
     """
 
     coordinates: World
@@ -38,33 +39,46 @@ class Architecture:
 
     @property
     def uses_codes(self) -> bool:
-        """Whether the network wants a frozen VQ-VAE."""
+        """Whether the network needs a frozen VQ-VAE."""
         return False
 
     @property
     def trains_codes(self) -> bool:
-        """Whether the network has a VQ-VAE of its own, trained with it."""
+        """Whether the network has a VQ-VAE of its own that is trained with it."""
         return False
 
     def build(self, normalizer: Normalizer, codes: VQVAE | None) -> WindowModel:
-        """The network with fresh weights."""
+        """Build the network with fresh weights.
+
+        Args:
+            normalizer: converts between the world and network space.
+            codes: the frozen VQ-VAE, where the network uses one.
+        """
         raise NotImplementedError
 
     def normalizer(self, manifest: Manifest, frames: Tensor) -> Normalizer:
-        """World <-> network space, with the statistics of the training frames (F, 252) where asked."""
+        """Make the normalizer, with the statistics of the training frames (F, 252) if `normalize` is set."""
         rest = torch.as_tensor(np.asarray(manifest.rest), dtype=torch.float32)
         if self.normalize:
             return Normalizer.fit(self.coordinates, rest, frames)
         return Normalizer.raw(self.coordinates, rest)
 
     def load_vqvae(self, weights: Path) -> VQVAE:
-        """The trained VQ-VAE of a file of weights."""
+        """Load a trained VQ-VAE from a file of weights.
+
+        Raises:
+            InputError: if the file is damaged.
+        """
         model = self.vqvae()
         checkpoint.load_module("model", model, checkpoint.read(weights)[0])
         return model.eval()
 
     def load(self, weights: Path) -> WindowModel:
-        """The trained network of a file of weights. Raises InputError where it is damaged."""
+        """Load a trained network from a file of weights.
+
+        Raises:
+            InputError: if the file is damaged.
+        """
         tensors, _ = checkpoint.read(weights)
         codes = self.vqvae() if self.uses_codes else None
         model = self.build(Normalizer.raw(self.coordinates, torch.zeros(22, 3)), codes)
@@ -74,7 +88,16 @@ class Architecture:
 
 @dataclass(frozen=True)
 class MemMLPArchitecture(Architecture):
-    """Mem-MLP: partial constructors for the slots, and its sizes."""
+    """How Mem-MLP is built.
+
+    Attributes:
+        frames: T, the window's length.
+        hidden: d, the width of the hidden state.
+        depth: L, the number of the backbone's blocks.
+        memory: makes the memory, given `codes`, `depth`, `hidden` and `frames`.
+        memory_kind: the class of that memory.
+        predictor: makes the predictor, given `memory_block`, `hidden` and `frames`.
+    """
 
     frames: int
     hidden: int
@@ -85,16 +108,16 @@ class MemMLPArchitecture(Architecture):
 
     @property
     def uses_codes(self) -> bool:
-        """Whether the memory wants a frozen VQ-VAE."""
+        """Whether the memory needs a frozen VQ-VAE."""
         return self.memory_kind.uses_codes
 
     @property
     def trains_codes(self) -> bool:
-        """Whether the memory has a VQ-VAE of its own."""
+        """Whether the memory has a VQ-VAE of its own that is trained with the network."""
         return self.memory_kind.trains_codes
 
     def build(self, normalizer: Normalizer, codes: VQVAE | None) -> MemMLP:
-        """The network with fresh weights."""
+        """Build the network with fresh weights."""
         sizes = {"hidden": self.hidden, "frames": self.frames}
         memory = self.memory(codes=codes, depth=self.depth, **sizes)
         predictor = self.predictor(memory_block=memory.memory_block, **sizes)
@@ -103,10 +126,14 @@ class MemMLPArchitecture(Architecture):
 
 @dataclass(frozen=True)
 class BaselineArchitecture(Architecture):
-    """A network without slots: its constructor, all but world <-> network space given."""
+    """How a baseline, which has neither memory nor predictor slot, is built.
+
+    Attributes:
+        network: makes the network from its normalizer; all other arguments are bound already.
+    """
 
     network: Callable[[Normalizer], WindowModel]
 
     def build(self, normalizer: Normalizer, codes: VQVAE | None) -> WindowModel:
-        """The network with fresh weights."""
+        """Build the network with fresh weights; `codes` is not used."""
         return self.network(normalizer)

@@ -1,4 +1,4 @@
-"""Tensors and plain values in one safetensors file, written atomically, read without pickle."""
+"""Tensors and JSON values in one safetensors file, written atomically and read without pickle."""
 
 from __future__ import annotations
 
@@ -24,7 +24,11 @@ def write(path: Path, tensors: dict[str, Tensor], values: dict[str, Any]) -> Non
 
 
 def read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """What `write` wrote. Raises InputError, naming the file, where it is damaged."""
+    """Read the tensors and values that `write` wrote.
+
+    Raises:
+        InputError: if the file is missing or damaged; the message names it.
+    """
     try:
         with safe_open(os.fspath(path), framework="pt") as file:
             values = json.loads(file.metadata()["memmlp"])
@@ -34,29 +38,29 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def module_tensors(prefix: str, module: nn.Module) -> dict[str, Tensor]:
-    """Parameters and buffers of a module, by name below the prefix."""
+    """Return the parameters and buffers of a module, their names preceded by "PREFIX."."""
     return {f"{prefix}.{name}": tensor for name, tensor in module.state_dict().items()}
 
 
 def load_module(prefix: str, module: nn.Module, tensors: dict[str, Tensor]) -> None:
-    """Put tensors that `module_tensors` named back."""
+    """Load those tensors into a module that `module_tensors` named with this prefix."""
     own = {name.removeprefix(f"{prefix}."): t for name, t in tensors.items() if name.startswith(f"{prefix}.")}
     module.load_state_dict({_current(name): tensor for name, tensor in own.items()})
 
 
 def _current(name: str) -> str:
-    """The name that a tensor has in this version; version 0.1 called a normalizer a frame."""
+    """Return the name that a tensor has in this version; version 0.1 called the normalizer `frame`."""
     return re.sub(r"(^|\.)frame\.(rest|mean|std)$", r"\1normalizer.\2", name)
 
 
 def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """The optimiser's state by parameter number and name."""
+    """Return the optimiser's state as tensors named "optimiser.PARAMETER_NUMBER.ENTRY"."""
     state = optimiser.state_dict()["state"]
     return {f"optimiser.{i}.{name}": tensor for i, entry in state.items() for name, tensor in entry.items()}
 
 
 def load_optimiser(optimiser: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """Put the optimiser's state back; its groups (learning rates) stay as they are."""
+    """Load the optimiser's state; its parameter groups, and so their learning rates, stay as they are."""
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
         if name.startswith("optimiser."):

@@ -12,12 +12,15 @@ from memmlp.networks.window_model import WindowModel
 
 
 class MemMLP(WindowModel):
-    """The network of Sec. 3.2: stem, backbone of MLP and memory blocks, predictor.
+    """The network of Sec. 3.2: a linear stem, a backbone of MLP and memory blocks, and a predictor.
 
     Args:
-        normalizer: world <-> network space.
-        memory, predictor: what stands in the two slots.
-        frames: T, the window's length. hidden: d. depth: L, blocks of the backbone.
+        normalizer: converts between the world and network space.
+        memory: what fills the memory slot.
+        predictor: what fills the predictor slot.
+        frames: T, the window's length.
+        hidden: d, the width of the hidden state.
+        depth: L, the number of the backbone's blocks.
     """
 
     def __init__(
@@ -40,32 +43,39 @@ class MemMLP(WindowModel):
 
     @property
     def shift(self) -> int:
-        """Frames by which what the memory recalls ends before the newest; 0 without a memory."""
+        """By how many frames what the memory recalls ends before the newest frame; 0 without a memory."""
         return self.memory.shift
 
     @property
     def settled(self) -> bool:
-        """Whether the memory's estimates of past frames stay as they were first made."""
+        """Whether the memory never changes an estimate of a past frame once it is made."""
         return self.memory.settled
 
     @property
     def length(self) -> int:
-        """Frames of inputs that the memory wants kept."""
+        """How many past frames of inputs the memory needs in the buffer."""
         return self.memory.length
 
     def initial_state(self, batch: int = 1) -> State:
-        """A fresh start: zeros. At the first call the first frame stands for all before it."""
+        """Return the state of a fresh start, all zeros.
+
+        At the first call the first frame's inputs stand for those of all frames before it.
+        """
         kept = self.memory.initial_state(batch)
         return super().initial_state(batch) | {name: t.to(self.normalizer.mean) for name, t in kept.items()}
 
     def true_state(self, frames: Tensor) -> State:
-        """The state after world frames [X | Theta] (B, length, 252), with the truth as history."""
+        """Return the state after world frames [X | Theta] (B, length, 252), the truth being its history."""
         encoded = self.normalizer.encode(frames)
         true = self.memory.true_state(encoded[..., :SPARSE_DIM], encoded[..., SPARSE_DIM:])
         return super().true_state(frames) | true
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """See WindowModel; all T frames by default, and those that are not wanted cost no work."""
+        """Take in the newest frames; see WindowModel.
+
+        By default all T frames are returned; frames that are not wanted are not computed in the predictor's
+        last blocks.
+        """
         new = sparse.shape[1]
         inputs, kept = self.taken_in(sparse, state)
         origin = self.normalizer.origin(inputs)
@@ -81,5 +91,5 @@ class MemMLP(WindowModel):
         return self.normalizer.decode_motion(motion[:, -wanted:], origin[:, -wanted:]), kept
 
     def auxiliary_losses(self, truth: Tensor) -> dict[str, Tensor]:
-        """The losses of the memory itself (a VQ-VAE that is trained with the network has some)."""
+        """Return the memory's own losses; only a VQ-VAE that is trained with the network has any."""
         return self.memory.auxiliary_losses(truth, self.normalizer)

@@ -1,4 +1,4 @@
-"""The predictor slot: from the backbone's hidden state to motion (Sec. 3.2.2)."""
+"""The predictor slot: maps the backbone's hidden state to motion (Sec. 3.2.2)."""
 
 from __future__ import annotations
 
@@ -16,10 +16,14 @@ MakeBlock = Callable[[], nn.Module]
 
 
 class Branch(nn.Module):
-    """`depth` MLP blocks and one linear layer to `size` outputs.
+    """A branch of the predictor: `depth` MLP blocks and one linear layer.
 
     Args:
-        hidden, frames: the backbone's d and T. memory_block: makes a memory block.
+        size: number of outputs.
+        depth: number of blocks.
+        hidden: the backbone's d.
+        frames: the backbone's T.
+        memory_block: makes a memory block; not used here.
     """
 
     def __init__(self, size: int, depth: int, hidden: int, frames: int, memory_block: MakeBlock | None):
@@ -28,11 +32,11 @@ class Branch(nn.Module):
         self.linear = nn.Linear(hidden, size)
 
     def block(self, hidden: int, frames: int, memory_block: MakeBlock | None) -> nn.Module:
-        """A block of the branch."""
+        """Make one of the branch's blocks."""
         return MLPBlock(hidden, frames)
 
     def forward(self, h: Tensor, past: object, newest: int) -> Tensor:
-        """Hidden state (B, T, d), what the memory recalls -> the newest frames (B, newest, size)."""
+        """Map the hidden state (B, T, d) to the newest frames' (B, newest, size); `past` is ignored."""
         for block in self.blocks[:-1]:
             h = block(h)
         for block in self.blocks[-1:]:
@@ -42,25 +46,27 @@ class Branch(nn.Module):
 
 
 class MemoryBranch(Branch):
-    """Its blocks take memory features in, as the backbone's do (Table 8)."""
+    """A branch whose blocks take in memory features, as those of the backbone do (Table 8)."""
 
     def block(self, hidden: int, frames: int, memory_block: MakeBlock | None) -> nn.Module:
-        """A block of the branch."""
+        """Make one of the branch's blocks, which is a memory block."""
         assert memory_block is not None
         return memory_block()
 
     def forward(self, h: Tensor, past: object, newest: int) -> Tensor:
-        """Hidden state (B, T, d), what the memory recalls -> the newest frames (B, newest, size)."""
+        """Map the hidden state (B, T, d) and the recalled past to the newest frames' (B, newest, size)."""
         for block in self.blocks:
             h = block(h, past)
         return self.linear(h[..., -newest:, :])
 
 
 class TwoBranch(nn.Module):
-    """One branch for rotations, one for positions.
+    """One branch for the rotations and one for the positions.
 
     Args:
-        depth: blocks a branch. hidden, frames: the backbone's d and T.
+        depth: number of blocks in each branch.
+        hidden: the backbone's d.
+        frames: the backbone's T.
         memory_block: makes a memory block; not used here.
     """
 
@@ -73,21 +79,35 @@ class TwoBranch(nn.Module):
         self.position = self.kind(MOTION_DIM - ROTATION.stop, depth, hidden, frames, memory_block)
 
     def forward(self, h: Tensor, past: object, sparse: Tensor, normalizer: Normalizer, newest: int) -> Tensor:
-        """Hidden state (B, T, d), what the memory recalls -> motion (B, newest, 198) in network space."""
+        """Predict the newest frames' motion.
+
+        Args:
+            h: hidden state (B, T, d).
+            past: what the memory recalls.
+            sparse: not used here.
+            normalizer: not used here.
+            newest: how many of the newest frames are wanted.
+
+        Returns:
+            Motion (B, newest, 198) in network space.
+        """
         return torch.cat([self.rotation(h, past, newest), self.position(h, past, newest)], -1)
 
 
 class TwoBranchMemory(TwoBranch):
-    """Memory blocks in both branches (Table 8, "MHP w/ MB")."""
+    """Two branches, both of memory blocks (Table 8, "MHP w/ MB")."""
 
     kind = MemoryBranch
 
 
 class RotationOnly(nn.Module):
-    """Rotations alone; the positions follow from them by forward kinematics, without gradient.
+    """One branch for the rotations; positions follow by forward kinematics, without gradient.
 
     Args:
-        depth, hidden, frames, memory_block: as for TwoBranch.
+        depth: number of blocks.
+        hidden: the backbone's d.
+        frames: the backbone's T.
+        memory_block: makes a memory block; not used here.
     """
 
     branches: ClassVar[frozenset[str]] = frozenset({"rotation"})
@@ -98,7 +118,18 @@ class RotationOnly(nn.Module):
         self.rotation = self.kind(ROTATION.stop, depth, hidden, frames, memory_block)
 
     def forward(self, h: Tensor, past: object, sparse: Tensor, normalizer: Normalizer, newest: int) -> Tensor:
-        """As TwoBranch's; world inputs (B, T, 54) place the body."""
+        """Predict the newest frames' motion.
+
+        Args:
+            h: hidden state (B, T, d).
+            past: what the memory recalls.
+            sparse: world inputs (B, T, 54), whose head position says where the body is.
+            normalizer: converts between the world and network space.
+            newest: how many of the newest frames are wanted.
+
+        Returns:
+            Motion (B, newest, 198) in network space.
+        """
         rotation, sparse = self.rotation(h, past, newest), sparse[..., -newest:, :]
         with torch.no_grad():
             motion = normalizer.encode_motion(normalizer.posed(rotation, sparse), normalizer.origin(sparse))
@@ -107,7 +138,7 @@ class RotationOnly(nn.Module):
 
 
 class RotationOnlyMemory(RotationOnly):
-    """Memory blocks in the one branch: Table 8's question where there is no position branch."""
+    """One rotation branch of memory blocks: Table 8's question asked without a position branch."""
 
     kind = MemoryBranch
 

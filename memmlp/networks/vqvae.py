@@ -1,7 +1,7 @@
 """The VQ-VAE whose frozen encoder and codebook give the memory its code-vectors (App. A, reading 5).
 
-It works frame by frame in network space: a frame [X | Theta] (252) is encoded, quantised, and decoded
-to the 132 rotations.
+It works frame by frame in network space: a frame [X | Theta] (252) is encoded, quantised, and decoded to the
+132 rotation components.
 """
 
 from __future__ import annotations
@@ -17,7 +17,13 @@ from memmlp.motion.normalizer import Normalizer
 
 
 class Quantised(NamedTuple):
-    """Code-vectors (..., width), their indices (...), and the loss that ties encoder and codebook."""
+    """What a codebook makes of latents in training.
+
+    Attributes:
+        codes: code-vectors (..., width).
+        indices: their indices (...).
+        loss: the loss that ties encoder and codebook, a scalar.
+    """
 
     codes: Tensor
     indices: Tensor
@@ -25,36 +31,40 @@ class Quantised(NamedTuple):
 
 
 def straight_through(latent: Tensor, codes: Tensor) -> Tensor:
-    """The codes (..., width), their gradient that of the latents (..., width)."""
+    """Return the codes (..., width), through which gradients reach the latents (..., width) unchanged."""
     return latent + (codes - latent).detach()
 
 
 class Codebook(nn.Module):
-    """K code-vectors; the nearest one stands for a latent. How they are learned is the subclass' matter."""
+    """K code-vectors, of which the nearest stands for a latent; subclasses say how they are learned."""
 
     vectors: Tensor
 
     def indices(self, latent: Tensor) -> Tensor:
-        """Index (...) of the code-vector nearest to a latent (..., width), in the Euclidean norm."""
+        """Return the index (...) of the code-vector nearest to each latent (..., width), Euclidean."""
         distance = self.vectors.square().sum(-1) - 2 * latent @ self.vectors.T
         return distance.argmin(-1)
 
     def forward(self, latent: Tensor) -> tuple[Tensor, Tensor]:
-        """Code-vectors (..., width) and indices (...) of latents (..., width)."""
+        """Return the code-vectors (..., width) and indices (...) of latents (..., width)."""
         index = self.indices(latent)
         return F.embedding(index, self.vectors), index
 
 
 class EMACodebook(Codebook):
-    """Code-vectors as running means of the latents assigned to them; starts on data, restarts dead codes.
+    """Code-vectors that are running means of the latents assigned to them.
+
+    The first batch initialises them. A code to which almost no latents are assigned any more is dead, and
+    starts again on a random latent of the batch.
 
     Args:
-        codes, width: K and the dimension of a code-vector.
+        codes: K, the number of code-vectors.
+        width: dimension of a code-vector.
         commitment: weight of the commitment loss.
-        decay: of the running means, per step.
+        decay: decay of the running means, per step.
     """
 
-    DEAD = 1e-2  # a code that stands for fewer latents a step (running mean) is dead
+    DEAD = 1e-2  # a code is dead if fewer latents a step are assigned to it (running mean)
 
     counts: Tensor
     sums: Tensor
@@ -75,7 +85,7 @@ class EMACodebook(Codebook):
         return Quantised(codes, index, self.commitment * F.mse_loss(latent, codes))
 
     def _follow(self, latent: Tensor) -> tuple[Tensor, Tensor]:
-        """Codes and indices of latents, after which the code-vectors move."""
+        """Return the codes and indices of latents (B, width), then update the code-vectors."""
         if not self.started:
             self._restart(torch.ones_like(self.counts, dtype=torch.bool), latent)
             self.started.fill_(True)
@@ -88,7 +98,7 @@ class EMACodebook(Codebook):
         return codes, index
 
     def _restart(self, dead: Tensor, latent: Tensor) -> None:
-        """Put dead codes onto random latents of the batch."""
+        """Put the codes that are `dead` (K,) onto random latents of the batch (B, width)."""
         pick = torch.randint(len(latent), (len(dead),), device=latent.device)
         self.sums.copy_(torch.where(dead[:, None], latent[pick], self.sums))
         self.counts.copy_(torch.where(dead, torch.ones_like(self.counts), self.counts))
@@ -96,7 +106,14 @@ class EMACodebook(Codebook):
 
 
 class GradientCodebook(Codebook):
-    """Code-vectors as parameters, pulled to the latents by the codebook loss of van den Oord et al. 2017."""
+    """Code-vectors that are parameters, learned by the codebook loss of van den Oord et al. 2017.
+
+    Args:
+        codes: K, the number of code-vectors.
+        width: dimension of a code-vector.
+        commitment: weight of the commitment loss.
+        decay: not used here.
+    """
 
     def __init__(self, codes: int, width: int, commitment: float, decay: float):
         super().__init__()
@@ -115,12 +132,16 @@ CODEBOOKS: dict[str, type[LearnedCodebook]] = {"ema": EMACodebook, "gradient": G
 
 
 class VQVAE(nn.Module):
-    """Encoder, codebook and decoder on single frames.
+    """Encoder, codebook and decoder, which work on single frames.
 
     Args:
-        codes: K. width: dimension of latents and code-vectors.
-        encoder_depth, decoder_depth: number of blocks (LayerNorm, Linear, SiLU).
-        commitment, decay: see the codebooks. codebook: "ema" or "gradient".
+        codes: K, the number of code-vectors.
+        width: dimension of latents and code-vectors.
+        encoder_depth: number of the encoder's blocks (LayerNorm, Linear, SiLU).
+        decoder_depth: number of the decoder's blocks.
+        commitment: weight of the commitment loss.
+        decay: decay of an EMA codebook's running means.
+        codebook: "ema" or "gradient".
     """
 
     def __init__(
@@ -140,20 +161,26 @@ class VQVAE(nn.Module):
         self.decoder = nn.Sequential(*_blocks(width, decoder_depth), nn.Linear(width, ROTATION.stop))
 
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
-        """Code-vectors (..., width) of frames in network space: inputs (..., 54), motion (..., 198)."""
+        """Return the code-vectors (..., width) of inputs (..., 54) and motion (..., 198) in network space."""
         return self.codebook(self.encoder(torch.cat([sparse, motion], -1)))[0]
 
     def reconstruct(self, frames: Tensor) -> tuple[Tensor, Quantised]:
-        """Rotations (B, 132) of frames (B, 252), with the straight-through gradient; the codebook learns."""
+        """Reconstruct the rotations (B, 132) of frames (B, 252), with the straight-through gradient.
+
+        An EMA codebook learns from this call.
+        """
         latent = self.encoder(frames)
         quantised: Quantised = self.codebook.learn(latent)
         return self.decoder(straight_through(latent, quantised.codes)), quantised
 
     def loss_terms(self, frames: Tensor, normalizer: Normalizer) -> tuple[dict[str, Tensor], Tensor]:
-        """Eq. 1 of the reconstruction and the codebook's loss, and the chosen indices (B,); it learns.
+        """Return the losses by name (Eq. 1 and the codebook's), and the chosen indices (B,).
+
+        An EMA codebook learns from this call.
 
         Args:
             frames: (B, 252) in the network space of `normalizer`.
+            normalizer: converts between the world and network space.
         """
         rotations, quantised = self.reconstruct(frames)
         terms = {"rotation": rotation_error(rotations, frames, normalizer), "codebook": quantised.loss}
@@ -161,11 +188,11 @@ class VQVAE(nn.Module):
 
 
 def rotation_error(rotations: Tensor, frames: Tensor, normalizer: Normalizer) -> Tensor:
-    """Eq. 1 in the world's units, for rotations (B, 132) and frames (B, 252) of network space."""
+    """Return Eq. 1 in the world's units, for rotations (B, 132) and frames (B, 252) in network space."""
     error = (rotations - frames[:, SPARSE_DIM:][:, ROTATION]) * normalizer.std[SPARSE_DIM:][ROTATION]
     return error.abs().sum(-1).mean()
 
 
 def _blocks(width: int, depth: int) -> list[nn.Module]:
-    """`depth` blocks of LayerNorm, Linear, SiLU (App. A)."""
+    """Make `depth` blocks of LayerNorm, Linear and SiLU (App. A)."""
     return [nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width), nn.SiLU()) for _ in range(depth)]

@@ -1,4 +1,4 @@
-"""What an experiment is: its data, its network, how each stage is done, and who each of them is."""
+"""The experiment: its data, its network, how each stage is done, and the identities of all of them."""
 
 from __future__ import annotations
 
@@ -20,14 +20,20 @@ from memmlp.training.vqvae import VQVAETraining
 
 @dataclass(frozen=True)
 class Experiment:
-    """All that a run needs, as built objects; `config` is the record of where they came from.
+    """All that a run needs, as built objects.
 
     Attributes:
-        outputs: folder of runs and caches. device: of training and evaluation.
-        force: whether a run that was made is made again.
-        data: the motion. architecture: builds the networks.
-        vqvae, training, evaluation, deployment: how the stages are done.
-        predictions: folder for the test clips' predictions, where they are wanted.
+        config: the resolved config that the objects were built from.
+        outputs: folder of runs and caches.
+        device: device of training and evaluation.
+        force: whether a finished run is made again.
+        data: the motion.
+        architecture: builds the networks.
+        vqvae: how a frozen VQ-VAE is trained.
+        training: how the network is trained.
+        evaluation: how it is evaluated.
+        deployment: how it is shipped.
+        predictions: folder for predictions of the test clips; None for no such files.
         tracking: shows finished runs elsewhere.
     """
 
@@ -46,7 +52,7 @@ class Experiment:
 
     @property
     def evaluations(self) -> dict[str, str]:
-        """The identity of the evaluation in each of the modes."""
+        """The identity of the evaluation in each mode."""
         return {mode: evaluation_id(self.config, mode) for mode in self.evaluation.modes}
 
     @property
@@ -56,16 +62,17 @@ class Experiment:
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """The identities of all that is made of the trained network."""
+        """The identities of the evaluations and the deployment."""
         return (*self.evaluations.values(), self.deployed)
 
     def vqvae_identity(self, data: str) -> Identity | None:
-        """The identity of the VQ-VAE's run on data of that digest, where the network uses a frozen one."""
+        """Return the identity of the VQ-VAE's run on data of that digest; None if the network uses none."""
         return Identity("vqvae", self.vqvae.config, data) if self.architecture.uses_codes else None
 
     def identity(self, data: str) -> Identity:
-        """The identity of the network's run on data of that digest."""
-        # A frozen VQ-VAE's own identity stands for its config; of a joint one some keys act nowhere.
+        """Return the identity of the network's run on data of that digest."""
+        # The identity of a frozen VQ-VAE's run covers its config. A joint VQ-VAE is trained with the network,
+        # so only the keys of its architecture act.
         own = {key: value for key, value in self.config.items() if key != "vqvae"}
         if self.architecture.trains_codes:
             own["vqvae"] = {key: self.config["vqvae"][key] for key in VQVAE_SETTINGS}

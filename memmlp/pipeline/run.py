@@ -1,7 +1,6 @@
-"""An experiment brought to its end: data, VQ-VAE's run, network's run, its evaluations, its deployment.
+"""Brings an experiment to its end: data, VQ-VAE's run, network's run, its evaluations, its deployment.
 
-Each stage has an identity (memmlp.runs.identity), is found where it was made before, and is made where it was
-not.
+Each stage has an identity (memmlp.runs.identity): it is found if it was made before, and made if not.
 """
 
 from __future__ import annotations
@@ -28,10 +27,11 @@ from memmlp.training.loop import Watch, unwatched
 
 @dataclass(frozen=True)
 class Outcome:
-    """A run as an experiment asks for it.
+    """The run that an experiment ends in.
 
     Attributes:
-        made: the stages that were made just now: "training", "evaluation", "deployment".
+        run: the network's run.
+        made: the stages that were made just now, of "training", "evaluation" and "deployment".
         results: mode -> branch -> metric, and "latency".
     """
 
@@ -43,7 +43,9 @@ class Outcome:
 def run(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     """Bring the experiment's run to its end, doing only what is missing.
 
-    `watch` is called after each validation with the step and its values, and may raise to stop the run.
+    Args:
+        experiment: what to run.
+        watch: called after each validation with the step and its values; it may raise to stop the run.
     """
     data = experiment.data.prepare()
     codes = vqvae_run(experiment, data) if experiment.architecture.uses_codes else None
@@ -68,9 +70,16 @@ def run(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
 def finished(
     experiment: Experiment, run: Run, data: Prepared, again: bool = False
 ) -> tuple[dict[str, Any], list[str]]:
-    """What was measured of a trained run as the experiment asks for it, and the stages that were made for it.
+    """Make what is missing of a trained run's evaluations and deployment, and return its results.
 
-    again: evaluate anew what was evaluated before.
+    Args:
+        experiment: says which evaluations and deployment.
+        run: the trained run.
+        data: the prepared motion.
+        again: whether to repeat evaluations that were made before.
+
+    Returns:
+        The results, and the names of the stages that were made.
     """
     with run.lock():
         if again:
@@ -82,7 +91,11 @@ def finished(
 
 
 def finish(experiment: Experiment, run: Run, data: Prepared) -> list[str]:
-    """Make what is missing of a trained run's evaluations and deployment; the names of the stages made."""
+    """Make what is missing of a trained run's evaluations and deployment.
+
+    Returns:
+        The names of the stages that were made.
+    """
     made = []
     missing = [mode for mode, identity in experiment.evaluations.items() if not run.has(identity)]
     if missing:
@@ -95,7 +108,7 @@ def finish(experiment: Experiment, run: Run, data: Prepared) -> list[str]:
 
 
 def results_of(experiment: Experiment, run: Run) -> dict[str, Any]:
-    """What was measured of a run as the experiment asks for it: mode -> branch -> metric, and "latency"."""
+    """Return the results that the experiment asks for: mode -> branch -> metric, and "latency"."""
     files = {mode: run.evaluation(name) for mode, name in experiment.evaluations.items() if run.has(name)}
     latency = run.deployment(experiment.deployed).record
     means = {mode: read_json(path)["mean"] for mode, path in files.items()}
@@ -103,7 +116,7 @@ def results_of(experiment: Experiment, run: Run) -> dict[str, Any]:
 
 
 def clip_rows(experiment: Experiment, run: Run) -> list[dict[str, Any]]:
-    """Each test clip's name, frames, and metrics by mode and branch, as the experiment asks for them."""
+    """Return for each test clip its name, frames, and the metrics by mode and branch that are asked for."""
     rows: dict[str, dict[str, Any]] = {}
     for mode, name in experiment.evaluations.items():
         for clip in read_json(run.evaluation(name))["clips"]:
@@ -114,7 +127,7 @@ def clip_rows(experiment: Experiment, run: Run) -> list[dict[str, Any]]:
 
 
 def vqvae_run(experiment: Experiment, data: Prepared) -> Run:
-    """The finished run of the VQ-VAE that the network uses, trained where it is missing."""
+    """Return the finished run of the VQ-VAE that the network uses, training it if necessary."""
     identity = experiment.vqvae_identity(data.digest)
     assert identity is not None
     run = Run.of(experiment.outputs, identity.id)
@@ -133,7 +146,7 @@ def vqvae_run(experiment: Experiment, data: Prepared) -> Run:
 def train_run(
     experiment: Experiment, run: Run, data: Prepared, codes: Run | None, watch: Watch = unwatched
 ) -> None:
-    """Train one network, and mark its run as done."""
+    """Train the network of a run, and mark the run as done."""
     begin(experiment, run, experiment.identity(data.digest), experiment.config)
     run.write_manifest({"body": data.manifest.body})
     run.clear_stages()
@@ -144,7 +157,10 @@ def train_run(
 
 
 def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequence[str]) -> None:
-    """Evaluate a trained run in some modes, each a file that is there whole or not at all."""
+    """Evaluate a trained run in the given modes.
+
+    Each evaluation is a file that is there whole or not at all.
+    """
     run.attempt("evaluation")
     with timed(run, "evaluate"):
         model = experiment.architecture.load(run.weights()).to(experiment.device)
@@ -159,7 +175,7 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
 
 
 def deploy_run(experiment: Experiment, run: Run, data: Prepared) -> None:
-    """Export a trained run, prove the file, and time it."""
+    """Export a trained run, check the file against the network, and time it."""
     run.attempt("deployment")
     with timed(run, "export"):
         model = experiment.architecture.load(run.weights())
@@ -173,14 +189,14 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared) -> None:
 
 
 def begin(experiment: Experiment, run: Run, identity: Identity, config: dict[str, Any]) -> None:
-    """Begin a training: its config, and in its manifest what it is and what it runs on."""
+    """Begin a training: write its config, and into its manifest its identity and what it runs on."""
     above = identity.upstream.id if identity.upstream else None
     facts = {"recipes": identity.recipes, "what": identity.what, **machine(experiment)}
     run.begin(identity.kind, config, data=identity.data, upstream=above, **facts)
 
 
 def machine(experiment: Experiment) -> dict[str, Any]:
-    """What can change the last digits of a result: device, graphics processor, threads, precision."""
+    """Return what can change the last digits of a result: device, GPU, threads, precision."""
     cuda = experiment.device.type == "cuda"
     return {
         "device": str(experiment.device),
@@ -192,7 +208,7 @@ def machine(experiment: Experiment) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def timed(run: Run, stage: str) -> Iterator[None]:
-    """Add to the manifest how long a stage took."""
+    """Add the seconds that a stage takes to the run's manifest."""
     started = time.monotonic()
     yield
     seconds = run.manifest.get("seconds") or {}

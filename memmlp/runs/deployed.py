@@ -1,4 +1,4 @@
-"""What a run was shipped as: the folder of a deployment."""
+"""The folder of a deployment: what a run was shipped as."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ from memmlp.runs.identity import belongs, deployment_name
 
 
 class Deployed:
-    """What a run was shipped as: a folder runs/<id>/deployments/<identity>/.
+    """A deployment of a run: the folder runs/<id>/deployments/<identity>/.
 
     Attributes:
-        onnx, int8, latency: its files; the last one is written last, and says what was measured.
+        folder: the folder.
+        onnx: the float32 ONNX file.
+        int8: the int8 ONNX file, where there is one.
+        latency: the record of what was measured; it is written last.
     """
 
     def __init__(self, folder: Path):
@@ -27,41 +30,41 @@ class Deployed:
 
     @property
     def done(self) -> bool:
-        """Whether all of it is there, and of the run below which it lies."""
+        """Whether the deployment is complete, and belongs to the run in whose folder it lies."""
         record = self.record
         whole = all((self.folder / name).is_file() for name in record.get("artifacts", {}))
         return bool(record) and whole and belongs(record.get("run"), self.folder.parent.parent)
 
     @property
     def current(self) -> bool:
-        """Whether it was made by today's recipes."""
+        """Whether the deployment was made by the present recipes."""
         return self.folder.name == deployment_name(self.settings)
 
     def finish(self, record: Mapping[str, Any]) -> None:
-        """Write what was measured, with the digests of the files: the sign that all of it is there."""
+        """Write what was measured, with the files' digests; this marks the deployment as complete."""
         artifacts = {path.name: file_digest(path) for path in (self.onnx, self.int8) if path.exists()}
         made = {"made": now(), "made_by": environment(), "artifacts": artifacts}
         write_json(self.latency, {**record, **made})
 
     @property
     def record(self) -> dict[str, Any]:
-        """What was measured: sizes, times, int8's accuracy; empty where it was not shipped."""
-        # Version 0.1 called the yardstick of times a reference.
+        """What was measured: sizes, times, int8's accuracy; empty if the run was not shipped."""
+        # Version 0.1 called the timing yardstick "reference" in its keys.
         return {
             re.sub(r"(^|_)reference(_|$)", r"\1yardstick\2", k): v for k, v in read_json(self.latency).items()
         }
 
     @property
     def made(self) -> str:
-        """When."""
+        """When the deployment was made, UTC in ISO 8601; empty if it was not."""
         return str(self.record.get("made", ""))
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What was asked for."""
+        """The settings of the deployment, as they were asked for."""
         return dict(self.record.get("settings", {}))
 
     @property
     def prefers_int8(self) -> bool:
-        """Whether its int8 file is as accurate as the other one."""
+        """Whether the int8 file is accurate enough to be used instead of the float32 one."""
         return self.int8.exists() and bool(self.record.get("int8", {}).get("default"))

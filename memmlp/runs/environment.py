@@ -1,4 +1,4 @@
-"""What a run ran on and with."""
+"""The environment of a run: code version, packages and hardware."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ import memmlp
 PACKAGE = Path(memmlp.__file__).parent
 NOT_NUMBERS = ("cli", "config", "live", "render", "report", "search", "statistics", "sweep", "tables")
 """Folders of the package whose code no result of a run comes from."""
-PATCH = 1_000_000  # characters of changes that are kept with a run, at most
+PATCH = 1_000_000  # at most so many characters of changes are kept with a run
 
 
 def environment() -> dict[str, Any]:
-    """What a run ran on and with; the machine's name only as a digest."""
+    """Describe the code, packages and hardware; the machine's name appears only as a digest."""
     packages = ("torch", "numpy", "onnxruntime")
     return {
         "version": memmlp.__version__,
@@ -38,7 +38,7 @@ def environment() -> dict[str, Any]:
 
 
 def host() -> str:
-    """The machine, by a digest of its name."""
+    """Return a digest of the machine's name, 12 hex digits."""
     return hashlib.sha256(platform.node().encode()).hexdigest()[:12]
 
 
@@ -51,7 +51,7 @@ def _version(package: str) -> str | None:
 
 @functools.cache
 def _git() -> dict[str, Any] | None:
-    """Commit of the checkout that the package lies in and whether it was changed; None when installed."""
+    """Return the commit of the package's checkout, and whether its files are changed; None outside of one."""
     try:
         _in_git("ls-files", "--error-unmatch", "__init__.py")
         commit = _in_git("rev-parse", "HEAD")
@@ -61,13 +61,16 @@ def _git() -> dict[str, Any] | None:
 
 
 def _in_git(*args: str) -> str:
-    """What git says in the package's folder."""
+    """Run git in the package's folder and return its output."""
     command = ["git", "-C", str(PACKAGE), *args]
     return subprocess.run(command, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
 
 
 def changes() -> str:
-    """A patch from the package's commit to its code as it is, with the names of new files; or nothing."""
+    """Return a patch from the package's commit to its present code, with the names of new files.
+
+    It is empty if nothing is changed or the package is not in a checkout.
+    """
     git = _git()
     if not git or not git["dirty"]:
         return ""
@@ -80,18 +83,25 @@ def changes() -> str:
 
 @functools.cache
 def sources() -> dict[str, str]:
-    """A digest of the code, without comments and docstrings, of each file that a run's numbers come from."""
+    """Return a digest of the code of each file that a run's numbers come from.
+
+    Comments and docstrings do not count.
+    """
     files = [path for path in sorted(PACKAGE.rglob("*.py")) if _counts(path.relative_to(PACKAGE))]
     return {path.relative_to(PACKAGE).as_posix(): code_digest(path.read_text("utf-8")) for path in files}
 
 
 def _counts(path: Path) -> bool:
-    wiring = path.as_posix() in ("config/build.py", "config/components.py")  # what reaches the constructors
+    """Return whether a run's numbers come from the file at this path below the package."""
+    wiring = path.as_posix() in (
+        "config/build.py",
+        "config/components.py",
+    )  # they decide what reaches the constructors
     return wiring or (not path.parts[0].startswith("_") and path.parts[0] not in NOT_NUMBERS)
 
 
 def code_digest(text: str) -> str:
-    """12 hex digits of Python code, whatever its layout, comments and docstrings."""
+    """Return 12 hex digits that stand for Python code, whatever its layout, comments and docstrings."""
     tree = ast.parse(text)
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
@@ -100,7 +110,7 @@ def code_digest(text: str) -> str:
 
 
 def _cpu() -> str:
-    """The processor's model name."""
+    """Return the processor's model name."""
     with contextlib.suppress(OSError):
         match = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
         if match:

@@ -1,4 +1,4 @@
-"""The files of evaluations, each with its digest."""
+"""The files of evaluations, each of which holds a digest of itself."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from memmlp.runs.identity import belongs, evaluation_name
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:
-    """Write the file of an evaluation: what was measured, when, by what, and its digest."""
+    """Write the file of an evaluation: what was measured, when, with what environment, and a digest."""
     path.parent.mkdir(parents=True, exist_ok=True)
     content = plain({**report, "made": now(), "made_by": environment()})
     write_json(path, content | {"digest": _content_digest(content)})
 
 
 def intact(path: Path) -> bool:
-    """Whether the file of an evaluation is as it was written, and where."""
+    """Return whether the file of an evaluation is as it was written, and lies where it was written."""
     content = read_json(path)
     same = content.pop("digest", None) == _content_digest(content)
     named = content.get("name", path.stem) == path.stem
@@ -29,7 +29,7 @@ def intact(path: Path) -> bool:
 
 
 def current(path: Path, report: Mapping[str, Any]) -> bool:
-    """Whether an evaluation was made by today's recipes."""
+    """Return whether an evaluation was made by the present recipes."""
     settings = report.get("settings") or {}
     return {"mode", "ik"} <= settings.keys() and path.stem == evaluation_name(settings)
 

@@ -2,9 +2,10 @@
 
 A **run** is a training (of a VQ-VAE or of a network): its identity is its config, its data, the run that it
 builds upon, and the recipe numbers of the components it uses. An **evaluation** of it (one mode, with or
-without inverse kinematics) and a **deployment** (ONNX, int8, latency) have identities of their own, of what
-can change their result alone. So a new mode, inverse kinematics or precision on a finished run is that
-stage's work and no training. A component is known by its name in the config, never by where its class lies.
+without inverse kinematics) and a **deployment** (ONNX, int8, latency) have identities of their own, made only
+of what can change their own result. So a new mode, inverse kinematics or precision on a finished run takes
+that stage's work and no training. A component is known by its name in the config, never by where its class
+lies.
 """
 
 from __future__ import annotations
@@ -55,12 +56,13 @@ SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand")
 
 @dataclass(frozen=True)
 class Identity:
-    """What a run is.
+    """The identity of a run.
 
     Attributes:
         kind: "vqvae" or "memmlp".
-        config: the resolved config; only the keys that change a training's result count.
-        data: digest of the prepared data. upstream: the run whose artifact this one uses.
+        config: the resolved config; only the keys that can change a training's result count.
+        data: digest of the prepared data.
+        upstream: the identity of the run whose artifact this one uses.
     """
 
     kind: str
@@ -75,49 +77,54 @@ class Identity:
 
     @property
     def id(self) -> str:
-        """16 hex digits over all that can change the result."""
+        """A digest of all that can change the result, 16 hex digits."""
         above = self.upstream.id if self.upstream else None
         return run_id(self.kind, self.config, data=self.data, upstream=above)
 
     @property
     def what(self) -> str:
-        """The same less the recipe numbers: equal in runs that differ in the age of their code alone."""
+        """Everything that `id` is a digest of but the recipe numbers.
+
+        It is equal in runs that differ by the age of their code alone.
+        """
         above = self.upstream.what if self.upstream else None
         return _digest(_training(self.kind, self.config, self.data, above))
 
 
 def run_id(kind: str, config: Mapping[str, Any], *, data: str, upstream: str | None) -> str:
-    """The identity of a training: 16 hex digits over all that can change its result.
+    """Return the identity of a training: 16 hex digits over all that can change its result.
 
     Args:
         kind: "vqvae" or "memmlp".
-        config: resolved config; what is neutral or of a later stage does not count, nor does 1 against 1.0.
-        data: digest of the prepared data. upstream: id of the run whose artifact this one uses.
+        config: the resolved config; keys that are neutral or of a later stage do not count, and 1 counts as
+            1.0.
+        data: digest of the prepared data.
+        upstream: id of the run whose artifact this one uses.
     """
     what = _training(kind, config, data, upstream)
     return _digest(what | {"recipes": recipes(list(trained_components(kind, config)))})
 
 
 def evaluation_id(config: Mapping[str, Any], mode: str) -> str:
-    """The identity of a run's evaluation in a mode: a word and 16 hex digits."""
+    """Return the identity of a run's evaluation in a mode: a word and 16 hex digits."""
     return evaluation_name(evaluation_settings(config, mode))
 
 
 def evaluation_name(settings: Mapping[str, Any]) -> str:
-    """The identity that an evaluation with these settings has today."""
+    """Return the identity that an evaluation with these settings has by the present recipes."""
     mode, ik = settings["mode"], settings["ik"]
     name = mode if ik == "off" else f"{mode}-{ik}"
     return f"{name}-{_digest({'settings': settings, 'recipes': evaluation_recipes(settings)})}"
 
 
 def evaluation_recipes(settings: Mapping[str, Any]) -> dict[str, int]:
-    """The recipe numbers of the components that an evaluation uses."""
+    """Return the recipe numbers of the components that an evaluation uses."""
     solver = [f"ik.{settings['ik']}"] if settings["ik"] != "off" else []
     return recipes(["metrics", f"mode.{settings['mode']}", *solver])
 
 
 def evaluation_settings(config: Mapping[str, Any], mode: str) -> dict[str, Any]:
-    """What an evaluation's result follows from, beside the run and its data."""
+    """Return the settings that an evaluation's result follows from, beside the run and its data."""
     group = config.get("evaluation", {})
     ik = group.get("ik", "off")
     solver = {"ik": ik} | ({"ik_iterations": group.get("ik_iterations")} if ik != "off" else {})
@@ -129,12 +136,12 @@ def evaluation_settings(config: Mapping[str, Any], mode: str) -> dict[str, Any]:
 
 
 def deployment_id(config: Mapping[str, Any]) -> str:
-    """The identity of what a run is shipped as: a word and 16 hex digits."""
+    """Return the identity of a run's deployment: a word and 16 hex digits."""
     return deployment_name(deployment_settings(config))
 
 
 def deployment_name(settings: Mapping[str, Any]) -> str:
-    """The identity that a deployment with these settings has today."""
+    """Return the identity that a deployment with these settings has by the present recipes."""
     graph = settings.get("graph", "auto")
     used = [
         "export",
@@ -147,12 +154,12 @@ def deployment_name(settings: Mapping[str, Any]) -> str:
 
 
 def deployment_settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What a deployment's result follows from, beside the run and its data."""
+    """Return the settings that a deployment's result follows from, beside the run and its data."""
     return {key: _canonical(value) for key, value in config.get("export", {}).items()} | inference(config)
 
 
 def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
-    """The components that a training's numbers come from."""
+    """Yield the names of the components that a training's numbers come from."""
     yield from ("features", "sampler", "training")
     if coordinates := config.get("frame", {}).get("coordinates"):
         yield f"coordinates.{coordinates}"
@@ -167,7 +174,7 @@ def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
 
 
 def trained_by(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The dotted keys of a config that can change the result of a training; null is no key."""
+    """Return, by dotted key, the config values that can change a training's result; null counts as no key."""
     later = (*EVALUATION, *DEPLOYMENT, *(() if _rolls_out(config) else INFERENCE))
     out = (*NEUTRAL, *FORMER, *later, *_unused(config))
     flat = {key: _canonical(value) for key, value in flatten(config).items() if value is not None}
@@ -176,7 +183,7 @@ def trained_by(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _draws(config: Mapping[str, Any]) -> dict[str, Any]:
-    """How windows are drawn, the one key of the data that is not in its digest."""
+    """Return how windows are drawn, the one key of the data that its digest does not cover."""
     return {"data.weighting": config["data"].get("weighting", "frames")} if config.get("data") else {}
 
 
@@ -185,33 +192,36 @@ def _training(kind: str, config: Mapping[str, Any], data: str, upstream: str | N
 
 
 def trained_with(key: str, config: Mapping[str, Any]) -> bool:
-    """Whether a dotted key can change the training of this config, or the data that it is of."""
+    """Return whether a dotted key can change the training of this config, or its data."""
     return key.startswith("data.") or any(_below(name, [key]) for name in trained_by(config))
 
 
 def belongs(run_id: str | None, folder: Path) -> bool:
-    """Whether what was made of a run of that id lies in its folder. A folder of another name is a copy."""
+    """Return whether what was made of the run with that id lies in that run's folder.
+
+    A folder whose name is no id is a copy, to which everything in it belongs.
+    """
     return run_id in (None, folder.name) or not ID.fullmatch(folder.name)
 
 
 def used_as_configured(settings: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
-    """Whether a stage's settings use the network as the run's own config does."""
+    """Return whether a stage's settings use the network as the run's own config does."""
     return all(settings.get(key) == value for key, value in inference(config).items())
 
 
 def inference(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The keys that act when the network is used, where the network has them."""
+    """Return the keys that act when the network is used, as far as the config has them."""
     flat = flatten(config)
     return {key: _canonical(flat[key]) for key in INFERENCE if key in flat}
 
 
 def _rolls_out(config: Mapping[str, Any]) -> bool:
-    """Whether the training uses the network as it is used live, so that what acts then acts here too."""
+    """Return whether training runs the network as live use does, so that inference keys act in it too."""
     return (config.get("rollout") or {}).get("name", "teacher_forcing") != "teacher_forcing"
 
 
 def _unused(config: Mapping[str, Any]) -> Iterable[str]:
-    """Keys that nothing reads, given the others."""
+    """Yield the keys that nothing reads, given the others."""
     if config.get("optim", {}).get("schedule", "step") != "step":
         yield "optim.drop_at"
     if config.get("vqvae", {}).get("codebook", "ema") != "ema":
@@ -219,12 +229,12 @@ def _unused(config: Mapping[str, Any]) -> Iterable[str]:
 
 
 def _below(key: str, names: Iterable[str]) -> bool:
-    """Whether a dotted key is one of some, or below one."""
+    """Return whether a dotted key is one of the names, or below one."""
     return any(key == name or key.startswith(f"{name}.") for name in names)
 
 
 def _is_path(key: str, value: Any) -> bool:
-    """Whether a key says where a class of this package lies. A foreign one is known by its path alone."""
+    """Return whether a key says where a class of this package lies; a foreign class has no other name."""
     return key.rsplit(".", 1)[-1] in PATHS and (value is True or str(value).startswith("memmlp."))
 
 
@@ -234,7 +244,7 @@ def _digest(what: Mapping[str, Any]) -> str:
 
 
 def _canonical(value: Any) -> Any:
-    """The same value for the same number, however it was typed."""
+    """Return a value that is the same for the same number, however it was typed (1 or 1.0)."""
     if isinstance(value, list | tuple):
         return [_canonical(item) for item in value]
     if isinstance(value, float) and value.is_integer():
@@ -243,7 +253,7 @@ def _canonical(value: Any) -> Any:
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """A nested mapping with dotted keys; lists stay values."""
+    """Return a nested mapping as a flat one with dotted keys; lists stay values."""
     flat: dict[str, Any] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping) and value:

@@ -1,4 +1,4 @@
-"""Who is at a run: the kernel's lock, and for people a file with a sign of life."""
+"""The lock of a run's folder: one by the kernel, and for people a file that says who holds it."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ STALE = 60.0  # seconds without one after which a process on another machine cou
 
 
 class Lock:
-    """The lock of a folder, which a process may hold several times; a killed process loses it at once.
+    """The lock of a folder; a process may hold it several times, and loses it at once when it is killed.
 
     Attributes:
-        holder: the file that tells people who holds it, touched while they do.
+        folder: the folder.
+        holder: the file that tells people who holds the lock; it is touched while they do.
     """
 
     def __init__(self, folder: Path):
@@ -32,9 +33,11 @@ class Lock:
 
     @contextlib.contextmanager
     def hold(self, say: Callable[[str], None] | None = None, wait: bool = True) -> Iterator[bool]:
-        """Hold the lock; yields whether this process has it.
+        """Hold the lock, and yield whether this process has it.
 
-        While another process has it: wait and say so once (on stderr), or yield False without `wait`.
+        Args:
+            say: told in one line whom this process waits for; by default the line goes to stderr.
+            wait: whether to wait while another process has the lock; otherwise False is yielded.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         lock = FileLock(self.folder / ".lock", is_singleton=True)
@@ -54,7 +57,7 @@ class Lock:
 
     @property
     def held(self) -> bool | None:
-        """Whether the process that holds it lives; None where nobody left word of holding it."""
+        """Whether the process that holds the lock is alive; None if no process claims to hold it."""
         holder = read_json(self.holder)
         return _lives(holder, self.holder) if holder else None
 
@@ -64,7 +67,7 @@ class Lock:
 
     @contextlib.contextmanager
     def _heartbeat(self) -> Iterator[None]:
-        """Leave word of who holds it, and a sign of life every few seconds."""
+        """Write the holder's file, and touch it every few seconds while the lock is held."""
         ended = threading.Event()
         write_json(self.holder, {"pid": os.getpid(), "host": host(), "since": now()})
         thread = threading.Thread(target=_beat, args=(self.holder, ended), daemon=True)
@@ -78,14 +81,14 @@ class Lock:
 
 
 def _beat(holder: Path, ended: threading.Event) -> None:
-    """Touch the holder's file until the end."""
+    """Touch the holder's file until `ended` is set."""
     while not ended.wait(HEARTBEAT):
         with contextlib.suppress(OSError):
             os.utime(holder)
 
 
 def _lives(holder: Mapping[str, object], path: Path) -> bool:
-    """Whether a holder's process lives: on this machine by its number, elsewhere by its heartbeat."""
+    """Return whether a holder's process is alive: on this machine by its id, elsewhere by its heartbeat."""
     if holder.get("host") == host():
         return _runs(int(str(holder["pid"])))
     try:

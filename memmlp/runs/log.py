@@ -1,4 +1,4 @@
-"""A run's log of metrics: one JSON line a record, only ever appended to."""
+"""A run's log of metrics: one JSON line for each record, only ever appended to."""
 
 from __future__ import annotations
 
@@ -14,7 +14,14 @@ from memmlp.common.files import plain
 
 
 class Metrics(NamedTuple):
-    """One line of the log: values at a step of a phase ("train", "val"), unix time in seconds."""
+    """One record of the log.
+
+    Attributes:
+        step: the number of finished training steps.
+        phase: "train" or "val".
+        values: values by name.
+        time: seconds since 1970, UTC.
+    """
 
     step: int
     phase: str
@@ -30,7 +37,7 @@ class MetricsLog:
         self._whole = False
 
     def append(self, step: int, values: Mapping[str, float], phase: str) -> None:
-        """Append one line, in one write: a kill tears at most that line."""
+        """Append one line, in one write: a kill damages at most that line."""
         if not self._whole:
             self.repair()
             self._whole = True
@@ -39,7 +46,7 @@ class MetricsLog:
             file.write(json.dumps(plain(entry), allow_nan=False).encode() + b"\n")
 
     def repair(self) -> None:
-        """Cut a torn last line off."""
+        """Cut off a last line that was not written whole."""
         if self.path.exists():
             content = self.path.read_bytes()
             whole = content.rfind(b"\n") + 1
@@ -47,9 +54,12 @@ class MetricsLog:
                 os.truncate(self.path, whole)
 
     def read(self) -> list[Metrics]:
-        """All records: a torn last line left out, of a step that a resumed run repeated the last one.
+        """Read all records, leaving out a last line that was not written whole.
 
-        Raises InputError, naming file and line, where one is damaged.
+        Of a step that a resumed run repeated, the last record counts.
+
+        Raises:
+            InputError: if a line is damaged; the message names file and line.
         """
         if not self.path.exists():
             return []

@@ -1,4 +1,4 @@
-"""Finding runs below an outputs folder, and comparing two."""
+"""Finding runs below an outputs folder, and comparing two of them."""
 
 from __future__ import annotations
 
@@ -12,21 +12,30 @@ from memmlp.runs.run import Run
 
 
 class Diff(NamedTuple):
-    """Dotted keys whose values differ between two runs, with both values ("-" where a run has none)."""
+    """What differs between two runs: by dotted key both values, "-" where a run has none.
+
+    Attributes:
+        config: differences of the configs.
+        results: differences of the results.
+    """
 
     config: dict[str, tuple[Any, Any]]
     results: dict[str, tuple[Any, Any]]
 
 
 def list_runs(outputs: Path | str) -> list[Run]:
-    """The runs below an outputs folder, the newest first."""
+    """Return the runs below an outputs folder, the newest first."""
     folders = sorted((Path(outputs) / "runs").glob("*/"))
     runs = [Run(folder) for folder in folders if ID.fullmatch(folder.name)]
     return sorted(runs, key=lambda run: str(run.manifest.get("started", "")), reverse=True)
 
 
 def find_run(outputs: Path | str, name: str) -> Run:
-    """The run of an id, of the beginning of one, or of a folder."""
+    """Find a run by its id, the beginning of its id, or its folder.
+
+    Raises:
+        InputError: if no run or more than one fits.
+    """
     if name and ("/" in name or not ID.fullmatch(name)) and (Path(name) / "manifest.json").is_file():
         return Run(Path(name).resolve())
     known = list_runs(outputs)
@@ -43,13 +52,13 @@ def find_run(outputs: Path | str, name: str) -> Run:
 
 
 def _enumerate(names: Iterable[str], most: int = 8) -> str:
-    """Names with commas, the first few of many."""
+    """Join names with commas; of more than `most` only the first are shown."""
     every = list(names)
     return ", ".join(every[:most]) + (", ..." if len(every) > most else "")
 
 
 def diff(a: Run, b: Run) -> Diff:
-    """What two runs differ in."""
+    """Compare the configs and results of two runs."""
     return Diff(_differences(a.config, b.config), _differences(a.results, b.results))
 
 

@@ -1,4 +1,4 @@
-"""What a training was made on and by."""
+"""The origin of a training: the machine and code that made it."""
 
 from __future__ import annotations
 
@@ -9,9 +9,13 @@ MACHINE = ("device", "gpu", "threads", "precision", "cpu")  # what can change a 
 
 
 def joined(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
-    """What a training was made on and by that was resumed: where the two differ, both.
+    """Join the origins of a training before and after it was resumed: where they differ, both are kept.
 
-    A file whose code changed in between has no digest that any code has.
+    A file whose code changed in between gets the digest "mixed", which no code has.
+
+    Args:
+        before: the manifest so far, empty for a training from the start.
+        after: what the training goes on with.
     """
     found = dict(after)
     for key in MACHINE:

@@ -1,7 +1,7 @@
-"""The recipe number of every component that numbers come from.
+"""Recipe numbers: one for every component that numbers come from.
 
 A run's identity holds the numbers of the components that it uses. Whoever changes what a component computes
-raises its number in the same commit: the runs that used it are then of an older recipe and are made again,
+raises its number in the same commit: the runs that used it then have an outdated recipe and are made again,
 and no others. `tests/test_golden.py` computes a few steps of every component and fails until that is done.
 Moving or renaming code changes no number.
 """
@@ -65,11 +65,11 @@ RECIPES: dict[str, int] = {
 
 
 def outdated(known: Mapping[str, int]) -> list[str]:
-    """The components among some, by name and number, whose numbers are others now, as words."""
+    """Return in words which of the known numbers, by component, are different now: "name old -> new"."""
     now = recipes(list(known))
     return [f"{name} {number} -> {now[name]}" for name, number in known.items() if now[name] != number]
 
 
 def recipes(components: list[str]) -> dict[str, int]:
-    """The numbers of some components, by name; 0 for one that is not of this package."""
+    """Return the numbers of the components by name; 0 for one that is not of this package."""
     return {name: RECIPES.get(name, 0) for name in sorted(components)}

@@ -1,7 +1,7 @@
-"""Run folders: lock, manifest, metrics log, completion. The folder is the truth; nothing else is.
+"""Run folders: lock, manifest, metrics log, completion. The folder is the only record of a run.
 
-A run is done when it is trained. What was evaluated and shipped of it lies below its folder, a file or folder
-for each evaluation and deployment, named by its identity, there whole or not at all.
+A run is done when it is trained. Its evaluations and deployments lie below its folder, each in a file or
+folder that is named by its identity and is there whole or not at all.
 """
 
 from __future__ import annotations
@@ -27,13 +27,21 @@ from memmlp.runs.origin import joined
 
 
 class Run:
-    """A folder outputs/runs/<id>/.
+    """A run: the folder outputs/runs/<id>/.
 
     Attributes:
-        folder: the folder; `id` is its name.
-        config_path, manifest_path, metrics_path, results_path, picture, checkpoint, model, marker: its files;
-            `config`, `manifest` and `metrics()` are what the first three hold.
-        evaluations, deployments: the folders of what was made of the trained network.
+        folder: the folder; its name is the run's `id`.
+        id: 16 hex digits.
+        config_path: the resolved config; `config` is its content.
+        manifest_path: what is known of the run; `manifest` is its content.
+        metrics_path: the metrics log; `metrics()` is its content.
+        checkpoint: the last checkpoint.
+        model: the trained weights.
+        picture: the picture of truth and prediction.
+        results_path: results of a VQ-VAE's run.
+        evaluations: the folder of evaluations.
+        deployments: the folder of deployments.
+        marker: the file that marks the run as done.
     """
 
     FILES = (
@@ -71,25 +79,27 @@ class Run:
 
     @classmethod
     def of(cls, outputs: Path | str, run_id: str) -> Run:
-        """The run of that id below an outputs folder, whether it exists or not."""
+        """Return the run of that id below an outputs folder, whether it exists or not."""
         return cls(Path(outputs) / "runs" / run_id)
 
     def evaluation(self, identity: str) -> Path:
-        """The file of an evaluation, whether it was made or not."""
+        """Return the file of an evaluation, whether it was made or not."""
         return self.evaluations / f"{identity}.json"
 
     def deployment(self, identity: str) -> Deployed:
-        """The folder of a deployment, whether it was made or not."""
+        """Return the folder of a deployment, whether it was made or not."""
         return Deployed(self.deployments / identity)
 
     def has(self, stage: str) -> bool:
-        """Whether the evaluation or deployment of that identity was made."""
+        """Return whether the evaluation or deployment of that identity was made."""
         return self.evaluation(stage).is_file() or self.deployment(stage).done
 
     @property
     def shipped(self) -> Deployed:
-        """The deployment to use, of those with the run's own settings: of today's recipes where there is one,
-        one whose int8 is as accurate, or the last one.
+        """The deployment to use, among those with the run's own settings.
+
+        One of the present recipes comes first, then one whose int8 file is accurate enough, then the last one
+        made.
         """
         made = [Deployed(path.parent) for path in self.deployments.glob("*/latency.json")]
         own = [one for one in made if one.done and used_as_configured(one.settings, self.config)]
@@ -98,7 +108,7 @@ class Run:
 
     @property
     def deployed(self) -> Path:
-        """The ONNX file to use: in int8 where the run has one that is as accurate (`export.precision`)."""
+        """The ONNX file to use: int8 where there is one that is accurate enough (`export.precision`)."""
         return self.shipped.int8 if self.shipped.prefers_int8 else self.shipped.onnx
 
     @property
@@ -112,7 +122,12 @@ class Run:
     def lock(
         self, say: Callable[[str], None] | None = None, wait: bool = True
     ) -> AbstractContextManager[bool]:
-        """Hold the run for this process, which may hold it already; yields whether it does (`Lock.hold`)."""
+        """Hold the run for this process, which may hold it already; yields whether it does.
+
+        Args:
+            say: told in one line whom this process waits for; by default the line goes to stderr.
+            wait: whether to wait while another process holds the run; otherwise False is yielded.
+        """
         return self._lock.hold(say, wait)
 
     @property
@@ -121,7 +136,7 @@ class Run:
         return self.state(self.done)
 
     def state(self, complete: bool) -> str:
-        """The status of work on the run that is complete or not."""
+        """Return the status of work on the run, given whether that work is complete."""
         if complete:
             return "done"
         if (held := self._lock.held) is not None:
@@ -132,11 +147,11 @@ class Run:
 
     @property
     def failure(self) -> str | None:
-        """Why the run failed, in a line; None where it didn't."""
+        """Why the run failed, in one line; None if it did not."""
         return read_json(self.folder / "FAILED").get("reason")
 
     def fail(self, reason: str, details: str = "") -> None:
-        """Leave word of why the run ended before it was done."""
+        """Record why the run ended before it was done."""
         write_json(
             self.folder / "FAILED", {"reason": " ".join(reason.split()), "when": now(), "details": details}
         )
@@ -153,10 +168,14 @@ class Run:
     ) -> None:
         """Write config.yaml and the manifest of a run that starts or resumes.
 
-        The patch of code that was changed since its commit is kept beside them.
+        If the code was changed since its commit, the patch is written beside them.
 
         Args:
-            facts: further entries of the manifest: recipes, device, threads, ...
+            kind: "vqvae" or "memmlp".
+            config: the resolved config.
+            data: digest of the prepared data.
+            upstream: id of the run whose artifact this one uses.
+            facts: further entries of the manifest, such as recipes, device and threads.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         atomic_write(self.config_path, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
@@ -170,7 +189,7 @@ class Run:
         self.write_manifest(identity | times | made)
 
     def attempt(self, stage: str) -> None:
-        """Note that a process is at a stage of the run."""
+        """Record that a process begins to work on a stage of the run."""
         self.retry()
         begun = {"started": now(), "pid": os.getpid(), "host": host(), "step": self.step, "stage": stage}
         self.write_manifest({"attempts": [*self.manifest.get("attempts", []), begun]})
@@ -186,7 +205,11 @@ class Run:
 
     @property
     def config(self) -> dict[str, Any]:
-        """The resolved config; empty before the run began. Raises InputError where it is damaged."""
+        """The resolved config; empty before the run began.
+
+        Raises:
+            InputError: if the file is damaged.
+        """
         try:
             found = yaml.safe_load(self.config_path.read_text()) if self.config_path.exists() else {}
         except (yaml.YAMLError, UnicodeDecodeError):
@@ -197,11 +220,10 @@ class Run:
 
     @property
     def results(self) -> dict[str, Any]:
-        """What was measured with the run's own settings: mode -> branch -> metric, "latency"; of a VQ-VAE its
-        own results.
+        """What was measured with the run's own settings: mode -> branch -> metric, and "latency".
 
-        Where a branch was evaluated by inverse kinematics of several lengths, the last one counts; tables ask
-        for theirs by its identity.
+        A VQ-VAE's run has its own results instead. Where a branch was evaluated by inverse kinematics with
+        several numbers of iterations, the last evaluation counts; tables ask for theirs by its identity.
         """
         found = read_json(self.results_path)
         for report in map(read_json, self.own_evaluations):
@@ -211,7 +233,9 @@ class Run:
 
     @property
     def own_evaluations(self) -> list[Path]:
-        """The evaluations using the network as the run's config does: older recipes first, then by time."""
+        """The evaluations that use the network as the run's config does: older recipes first, then by
+        time.
+        """
         config, paths = self.config, sorted(self.evaluations.glob("*.json"))
         every = {path: read_json(path) for path in paths}
         own = [path for path, made in every.items() if used_as_configured(made.get("settings", {}), config)]
@@ -219,25 +243,25 @@ class Run:
 
     @property
     def changed_sources(self) -> list[str]:
-        """The package's files whose code is not what the run was made by; none if that is unknown."""
+        """The package's files whose code differs from what made the run; empty if that is not known."""
         before = self.manifest.get("sources", {})
         return sorted(name for name, digest in sources().items() if before and before.get(name) != digest)
 
     def log(self, step: int, values: Mapping[str, float], phase: str = "train") -> None:
-        """Append one line to the metrics, in one write: a kill tears at most that line."""
+        """Append one line to the metrics log, in one write: a kill damages at most that line."""
         self._log.append(step, values, phase)
 
     @property
     def step(self) -> int:
-        """The last step of training that is logged; 0 before the first."""
+        """The last training step that is logged; 0 before the first."""
         return max((entry.step for entry in self.metrics()), default=0)
 
     def metrics(self) -> list[Metrics]:
-        """The log (`MetricsLog.read`)."""
+        """Read the metrics log (see `MetricsLog.read`)."""
         return self._log.read()
 
     def finish(self, artifacts: Sequence[str]) -> None:
-        """Mark the run as done: the marker with the digests of its artifacts, last and atomically."""
+        """Mark the run as done: write the marker with the artifacts' digests, last and atomically."""
         finished = now()
         self.write_manifest({"finished": finished})
         digests = {name: file_digest(self.folder / name) for name in artifacts}
@@ -245,12 +269,16 @@ class Run:
 
     @property
     def done(self) -> bool:
-        """Whether the run was finished, and is no other's folder under its id."""
+        """Whether the run was finished, and the folder is not another run's under this id."""
         marker = read_json(self.marker)
         return "artifacts" in marker and belongs(marker.get("id"), self.folder)
 
     def weights(self) -> Path:
-        """The trained weights. Raises InputError where they are others than were trained."""
+        """Return the file of the trained weights.
+
+        Raises:
+            InputError: if the file is not the one that was trained.
+        """
         digest = read_json(self.marker).get("artifacts", {}).get(self.model.name)
         if digest and not self._same(self.model.name, digest):
             raise InputError(
@@ -259,7 +287,7 @@ class Run:
         return self.model
 
     def verify(self) -> list[str]:
-        """The artifacts of a finished run that are missing or changed since."""
+        """Return the artifacts of a finished run that are missing or were changed since."""
         artifacts = dict(read_json(self.marker).get("artifacts", {}))
         for latency in sorted(self.deployments.glob("*/latency.json")):
             where = latency.parent.relative_to(self.folder)
@@ -282,7 +310,7 @@ class Run:
         self._remove((*self.FILES, self.marker.name))
 
     def clear_stages(self) -> None:
-        """Remove what was made of earlier weights."""
+        """Remove the evaluations and deployments, which were made from earlier weights."""
         self._remove(self.STAGES)
 
     def _remove(self, names: Iterable[str]) -> None:
@@ -291,6 +319,6 @@ class Run:
             for path in (*self.folder.glob(name), *self.folder.glob(temporary)):
                 path.unlink(missing_ok=True)
         for folder in (*self.deployments.glob("*/"), self.evaluations, self.deployments):
-            with contextlib.suppress(OSError):  # there is none, or there are files of the user's
+            with contextlib.suppress(OSError):  # it does not exist, or holds files of the user's
                 folder.rmdir()
         sync_folder(self.folder)

@@ -1,4 +1,4 @@
-"""The tracking slot: MLflow as a projection of run folders, which can be made again at any time."""
+"""The tracking slot: shows run folders in MLflow, from which they can be shown again at any time."""
 
 from __future__ import annotations
 
@@ -25,38 +25,38 @@ QUIET = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "DO_NOT_TRACK": "true",
     "GIT_PYTHON_REFRESH": "quiet",
-    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",  # a server that is away must not hold a run up
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",  # an unreachable server must not hold up a run
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
 }
 CHATTY = ("mlflow", "alembic", "urllib3")
 
 
 class Tracking(Protocol):
-    """What shows runs elsewhere."""
+    """The slot's interface: shows runs elsewhere."""
 
     def project(self, run: Run) -> None:
-        """Show the run as its folder is now; a second call changes nothing more."""
+        """Show the run as its folder is now; a second call changes nothing."""
 
     def group(self, sweep: str, labels: Mapping[str, str]) -> None:
-        """Show the runs of these ids as a sweep's, each with its arm's label."""
+        """Show runs as those of a sweep; `labels` maps their ids to their arms' labels."""
 
 
 class NoTracking:
-    """Shows nothing."""
+    """Tracking that shows nothing."""
 
     def project(self, run: Run) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def group(self, sweep: str, labels: Mapping[str, str]) -> None:
-        """Nothing."""
+        """Do nothing."""
 
 
 class MLflowTracking:
-    """One MLflow run a run folder, found again by its tag `memmlp.run_id`.
+    """Tracking by MLflow: one MLflow run for each run folder, found again by its tag `memmlp.run_id`.
 
     Args:
-        uri: of the tracking store; None for MLFLOW_TRACKING_URI, or else sqlite in the outputs folder.
-        outputs: the folder of the runs' folder.
+        uri: the tracking store; None for MLFLOW_TRACKING_URI, or else a sqlite file in the outputs folder.
+        outputs: the outputs folder.
     """
 
     EXPERIMENT = "memmlp"
@@ -70,7 +70,8 @@ class MLflowTracking:
     def project(self, run: Run) -> None:
         """Create the MLflow run, or bring it up to date."""
         self.outputs.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(self.outputs / ".mlflow.lock")  # two first starts at once ruin a sqlite store
+        # Two processes that create a sqlite store at the same time ruin it.
+        lock = FileLock(self.outputs / ".mlflow.lock")
         with _quiet(), lock:
             from mlflow import MlflowClient
 
@@ -87,10 +88,12 @@ class MLflowTracking:
     def group(self, sweep: str, labels: Mapping[str, str]) -> None:
         """Make a sweep the parent of its runs.
 
-        A run that several sweeps share stays the first one's child; a tag for each sweep has its label there.
+        A run that several sweeps share stays a child of the first one; a tag for each sweep holds its label
+        there.
 
         Args:
-            sweep: its name. labels: run id -> the arm's label, of projected runs.
+            sweep: the sweep's name.
+            labels: run id -> the arm's label, of runs that were projected.
         """
         with _quiet(), FileLock(self.outputs / ".mlflow.lock"):
             from mlflow import MlflowClient
@@ -109,11 +112,11 @@ class MLflowTracking:
             client.set_terminated(parent.info.run_id, "FINISHED")
 
     def store(self) -> str:
-        """Where MLflow keeps its runs."""
+        """Return the URI of the store in which MLflow keeps its runs."""
         return self.uri or os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{self.outputs / 'mlflow.db'}"
 
     def _experiment(self, client: MlflowClient) -> str:
-        """The id of the experiment, which is made where it is missing."""
+        """Return the id of MLflow's experiment, which is created if it is missing."""
         experiment = client.get_experiment_by_name(self.EXPERIMENT)
         if experiment is not None:
             return experiment.experiment_id
@@ -122,7 +125,7 @@ class MLflowTracking:
         return client.create_experiment(self.EXPERIMENT, artifact_location=place)
 
     def _mlflow_run(self, client: MlflowClient, experiment: str, run: Run) -> str:
-        """The id of the MLflow run; that of a run since done again from the start is replaced."""
+        """Return the id of the MLflow run; one of an earlier start of the same run is replaced."""
         tags = _tags(run)
         for old in client.search_runs([experiment], f"tags.`memmlp.run_id` = '{run.id}'"):
             if old.data.tags.get("memmlp.started") == tags["memmlp.started"]:
@@ -132,7 +135,7 @@ class MLflowTracking:
         return client.create_run(experiment, start, tags, run_name=run.id).info.run_id
 
     def _params(self, client: MlflowClient, name: str, run: Run) -> None:
-        """The flattened config, as far as MLflow does not have it (it takes no changes)."""
+        """Log the flattened config, except what MLflow has already, since it allows no changes."""
         from mlflow.entities import Param
 
         known = client.get_run(name).data.params
@@ -142,7 +145,7 @@ class MLflowTracking:
             client.log_batch(name, params=part)
 
     def _metrics(self, client: MlflowClient, name: str, run: Run) -> None:
-        """The values that MLflow does not have, in batches."""
+        """Log the values that MLflow does not have yet, in batches."""
         known: set[tuple[str, int]] = set()
         for key in client.get_run(name).data.metrics:
             known |= {(key, metric.step) for metric in client.get_metric_history(name, key)}
@@ -152,14 +155,14 @@ class MLflowTracking:
 
 
 def project_safely(tracking: Tracking, run: Run) -> None:
-    """Project a run; a failure is one line on stderr and nothing more, for the folder has it all."""
+    """Project a run; a failure is only a line on stderr, since the run's folder has everything."""
     with harmless(f"run {run.id}"):
         tracking.project(run)
 
 
 @contextlib.contextmanager
 def harmless(what: str) -> Iterator[None]:
-    """Turn tracking's failure into a warning of one line."""
+    """Turn a failure of the tracking into a warning of one line."""
     try:
         yield
     except Exception as error:
@@ -176,7 +179,7 @@ def _tags(run: Run) -> dict[str, str]:
 
 
 def _all_metrics(run: Run) -> list[Metric]:
-    """The log's values as `phase/name`, and the results as they are nested, at the last step."""
+    """Return the log's values as `phase/name`, and the results by their nested names at the last step."""
     from mlflow.entities import Metric
 
     log = run.metrics()
@@ -204,7 +207,7 @@ def _milliseconds(moment: str) -> int:
 
 @contextlib.contextmanager
 def _quiet(loggers: Sequence[str] = CHATTY) -> Iterator[None]:
-    """Keep MLflow and what it calls from talking."""
+    """Keep MLflow and the packages that it uses from printing."""
     for key, value in QUIET.items():
         os.environ.setdefault(key, value)
     before = {name: logging.getLogger(name).level for name in loggers}

@@ -1,4 +1,4 @@
-"""The training loop, for VQ-VAE and motion networks alike: steps, checkpoints, validation, records.
+"""The training loop of VQ-VAEs and motion networks: steps, checkpoints, validation, log.
 
 A step's randomness comes from (seed, step) alone, so a run that was killed and resumed ends in the same
 weights, bit for bit on a CPU, as one that was not.
@@ -26,7 +26,13 @@ from memmlp.training.optim import Optim
 
 @dataclass(frozen=True)
 class StepResult:
-    """The loss of a step, its terms by name, and the clips (B,) that its batch came from."""
+    """What a training step computes.
+
+    Attributes:
+        loss: the loss, a scalar.
+        terms: its unweighted terms by name.
+        clips: indices of the clips (B,) that the batch came from.
+    """
 
     loss: Tensor
     terms: dict[str, Tensor]
@@ -34,31 +40,31 @@ class StepResult:
 
 
 class TrainingTask(Protocol):
-    """What is trained."""
+    """What the loop trains: a module with its loss and data."""
 
     @property
     def module(self) -> nn.Module:
-        """All that a checkpoint must carry."""
+        """All parameters and buffers that a checkpoint must hold."""
 
     @property
     def frames(self) -> MotionDataset:
         """The training split."""
 
     def parameter_groups(self) -> list[dict]:
-        """For the optimiser."""
+        """Return the optimiser's parameter groups."""
 
     def step(self, step: int) -> StepResult:
-        """The loss of a training step."""
+        """Compute the loss of a training step."""
 
     def report(self) -> dict[str, float]:
-        """Values worth logging beside the loss terms."""
+        """Return values to log beside the loss terms."""
 
     def validate(self) -> dict[str, float]:
-        """Metrics on the validation split."""
+        """Compute the metrics on the validation split."""
 
 
 def seed_step(seed: int, step: int) -> None:
-    """Seed torch for one step."""
+    """Seed torch's generators for one step."""
     torch.manual_seed(int(np.random.SeedSequence([seed, step]).generate_state(1, np.uint64)[0] >> 1))
 
 
@@ -66,16 +72,26 @@ Watch = Callable[[int, dict[str, float]], None]
 
 
 def unwatched(step: int, values: dict[str, float]) -> None:
-    """Lets every run go on."""
+    """Do nothing, so that the training runs to its end."""
 
 
 def train(
     task: TrainingTask, optim: Optim, run: Run, seed: int, description: str, watch: Watch = unwatched
 ) -> None:
-    """Train to `optim.steps`, from the run's checkpoint where there is one, and leave the last checkpoint.
+    """Train to `optim.steps`, starting from the run's checkpoint if there is one.
 
-    `watch` is called after each validation with the step and its values, and may raise to stop.
-    Raises TrainingDiverged, naming step, term and clips, where a term is NaN or Inf.
+    The last checkpoint stays in the run's folder.
+
+    Args:
+        task: what to train.
+        optim: steps, learning rates and intervals.
+        run: the run whose folder takes checkpoints and the metrics log.
+        seed: the seed of all steps.
+        description: label of the progress bar.
+        watch: called after each validation with the step and its values; it may raise to stop the training.
+
+    Raises:
+        TrainingDiverged: if the loss is NaN or infinite.
     """
     optimiser = optim.build(task.parameter_groups())
     start = resume(task, optimiser, run) if run.checkpoint.exists() else 0
@@ -92,7 +108,7 @@ def train(
 
 
 def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimizer, step: int) -> StepResult:
-    """One step of the optimiser."""
+    """Take one step of the optimiser."""
     task.module.train()
     for group in optimiser.param_groups:
         group.setdefault("initial_lr", group["lr"])
@@ -111,7 +127,7 @@ def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimize
 
 
 def check_finite(task: TrainingTask, result: StepResult, step: int) -> None:
-    """Stop where the loss is no number."""
+    """Raise TrainingDiverged, naming step, terms and clips, if the loss is NaN or infinite."""
     if torch.isfinite(result.loss):
         return
     bad = [name for name, term in result.terms.items() if not torch.isfinite(term)] or ["weighted sum"]
@@ -125,7 +141,16 @@ def check_finite(task: TrainingTask, result: StepResult, step: int) -> None:
 def record(
     task: TrainingTask, optim: Optim, run: Run, step: int, result: StepResult, bar: Progress, row: TaskID
 ) -> dict[str, float]:
-    """Log and show a finished step, and validate where it is time; the validation's values, or none."""
+    """Log and show a finished step, and validate if it is time.
+
+    Args:
+        step: how many steps are finished.
+        bar: the progress display.
+        row: the training's row in it.
+
+    Returns:
+        The validation's values, empty where there was none.
+    """
     last = step == optim.steps
     bar.advance(row)
     if step % optim.log_every == 0 or last:
@@ -142,7 +167,7 @@ def record(
 
 
 def save(task: TrainingTask, optimiser: torch.optim.Optimizer, run: Run, step: int) -> None:
-    """Write all that a later process needs to go on after `step` steps."""
+    """Write a checkpoint with all that a later process needs to go on after `step` steps."""
     rates = [group["initial_lr"] for group in optimiser.param_groups]
     tensors = checkpoint.module_tensors("module", task.module) | checkpoint.optimiser_tensors(optimiser)
     tensors["rng.torch"] = torch.get_rng_state()
@@ -150,7 +175,7 @@ def save(task: TrainingTask, optimiser: torch.optim.Optimizer, run: Run, step: i
 
 
 def resume(task: TrainingTask, optimiser: torch.optim.Optimizer, run: Run) -> int:
-    """Put the run's checkpoint back; the number of steps done."""
+    """Load the run's checkpoint and return the number of finished steps."""
     tensors, values = checkpoint.read(run.checkpoint)
     checkpoint.load_module("module", task.module, tensors)
     checkpoint.load_optimiser(optimiser, tensors)

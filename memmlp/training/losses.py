@@ -1,7 +1,7 @@
-"""The training loss: the terms of Eqs. 1-4, the hand term, and how they are weighted (Eq. 5).
+"""The training losses: Eqs. 1-4 and the hand term, their weighting (Eq. 5), and the baselines' losses.
 
-As printed: L1, summed over joints and components, mean over time and batch (reading 10). Everything is
-in the world: 6D components, metres, per frame.
+The paper's terms are taken as printed: L1, summed over joints and components, mean over time and batch
+(reading 10). Everything is in the world: 6D components, metres, and both per frame for velocities.
 """
 
 from __future__ import annotations
@@ -19,43 +19,46 @@ Terms = dict[str, Tensor]
 
 
 def l1(error: Tensor) -> Tensor:
-    """Sum over components, mean over batch and time, of an error (B, T, ...)."""
+    """Return the sum over components of an error's (B, T, ...) absolute values, mean over batch and time."""
     return error.abs().flatten(2).sum(-1).mean()
 
 
 def joints(motion: Tensor) -> Tensor:
-    """Positions (B, T, 22, 3) of motion (B, T, 198)."""
+    """Return the joint positions (B, T, 22, 3) of motion (B, T, 198)."""
     return motion[..., POSITION].unflatten(-1, (N_JOINTS, 3))
 
 
 class NoHand:
-    """No hand term."""
+    """The choice of no hand term."""
 
     branch = "position"
 
     def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """No term."""
+        """Return no term."""
         return {}
 
 
 class HandPosition:
-    """L1 on both wrists' positions of the position branch (reading 9)."""
+    """The hand term as L1 on both wrists' positions in the position branch (reading 9)."""
 
     branch = "position"
 
     def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """The term, from motion and truth (B, T, 198)."""
+        """Return the term for motion and truth (B, T, 198)."""
         hands = list(HANDS)
         return {"hand": l1((joints(motion) - joints(truth))[:, :, hands])}
 
 
 class HandFK:
-    """L1 on both wrists' positions by forward kinematics of the rotation branch, head on its tracker."""
+    """The hand term as L1 on both wrists' positions by forward kinematics of the rotation branch.
+
+    The head of the predicted body stands where its tracker says.
+    """
 
     branch = "rotation"
 
     def __call__(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """The term, from motion and truth (B, T, 198) and inputs (B, T, 54)."""
+        """Return the term for motion and truth (B, T, 198) and inputs (B, T, 54), all in the world."""
         hands = list(HANDS)
         return {"hand": l1(normalizer.pose(motion, sparse)[:, :, hands] - joints(truth)[:, :, hands])}
 
@@ -64,42 +67,42 @@ Hand = NoHand | HandPosition | HandFK
 
 
 def rotation_terms(motion: Tensor, truth: Tensor) -> Terms:
-    """Eqs. 1 and 2 for motion and truth (B, T, 198)."""
+    """Return Eqs. 1 and 2 for motion and truth (B, T, 198)."""
     error = (motion - truth)[..., ROTATION]
     return {"rotation": l1(error), "rotation_velocity": l1(error.diff(dim=1))}
 
 
 def position_terms(motion: Tensor, truth: Tensor) -> Terms:
-    """Eqs. 3 and 4 (the latter on the lower body alone) for motion and truth (B, T, 198)."""
+    """Return Eqs. 3 and 4 (the latter on the lower body alone) for motion and truth (B, T, 198)."""
     error = joints(motion) - joints(truth)
     return {"position": l1(error), "velocity": l1(error[:, :, list(LOWER)].diff(dim=1))}
 
 
 class Fixed(nn.Module):
-    """Fixed weights by the names of the terms."""
+    """Fixed weights of the loss terms, by name."""
 
     def __init__(self, values: Mapping[str, float]):
         super().__init__()
         self.values = values
 
     def build(self, names: list[str]) -> None:
-        """Nothing to learn."""
+        """Do nothing, since there is nothing to learn."""
 
     def parameter_groups(self) -> list[dict]:
-        """Nothing to learn."""
+        """Return no parameters, since there is nothing to learn."""
         return []
 
     def forward(self, terms: Terms) -> Tensor:
-        """The weighted sum."""
+        """Return the weighted sum of the terms."""
         return torch.stack([self.values[name] * term for name, term in terms.items()]).sum()
 
     def weights(self) -> Mapping[str, float]:
-        """The weight of each term."""
+        """Return the weight of each term."""
         return self.values
 
 
 class Manual(Fixed):
-    """Fixed weights; the defaults are the paper's grid search (Sec. 4.4)."""
+    """Fixed weights of the paper's terms (reading 8); the defaults are from its grid search (Sec. 4.4)."""
 
     def __init__(
         self,
@@ -121,10 +124,10 @@ class Manual(Fixed):
 
 
 class Uncertainty(nn.Module):
-    """Homoscedastic uncertainty (Kendall et al. 2018): e^-s L + s, one learned s a term (reading 8).
+    """Weights by homoscedastic uncertainty (Kendall et al. 2018, reading 8): e^-s L + s with one s a term.
 
     Args:
-        lr: learning rate of the s; the model's own is too small for them to settle.
+        lr: learning rate of the s; with the model's own they would be too slow to settle.
     """
 
     def __init__(self, lr: float = 1e-2):
@@ -133,21 +136,21 @@ class Uncertainty(nn.Module):
         self.s = nn.ParameterDict()
 
     def build(self, names: list[str]) -> None:
-        """One s, from 0, for each term."""
+        """Make a parameter s, starting at 0, for each term."""
         self.s = nn.ParameterDict({name: nn.Parameter(torch.zeros(())) for name in names})
 
     def parameter_groups(self) -> list[dict]:
-        """The s, with their own learning rate and no decay."""
+        """Return the parameters s, with their own learning rate and without weight decay."""
         return [{"params": list(self.s.values()), "lr": self.lr, "weight_decay": 0.0}]
 
     def forward(self, terms: Terms) -> Tensor:
-        """The weighted sum."""
+        """Return the weighted sum of the terms."""
         return torch.stack(
             [(-self.s[name]).exp() * term + self.s[name] for name, term in terms.items()]
         ).sum()
 
     def weights(self) -> Mapping[str, float]:
-        """The weight of each term now."""
+        """Return the present weight e^-s of each term."""
         return {name: float((-s.detach()).exp()) for name, s in self.s.items()}
 
 
@@ -155,39 +158,49 @@ Weighting = Fixed | Uncertainty
 
 
 class Loss(nn.Module):
-    """The slot's interface: terms by name, and their weighted sum."""
+    """The interface of losses: terms by name, and their weighted sum."""
 
     weighting: Weighting
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
+        """Return each term by name.
+
+        Args:
+            motion: predicted motion (B, T, 198), world.
+            truth: true motion (B, T, 198), world.
+            sparse: inputs (B, T, 54), world.
+            normalizer: converts between the world and network space.
+        """
         raise NotImplementedError
 
     def forward(
         self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer
     ) -> tuple[Tensor, Terms]:
-        """The loss and its unweighted terms."""
+        """Return the loss and its unweighted terms; the arguments are those of `terms`."""
         terms = self.terms(motion, truth, sparse, normalizer)
         return self.weighting(terms), terms
 
 
 class MotionLoss(Loss):
-    """The loss of Eq. 5 over the branches that the predictor has.
+    """Mem-MLP's loss (Eq. 5), of the terms of the branches that the predictor has.
 
     Args:
-        weighting: Manual or Uncertainty. hand: the hand term. branches: the predictor's.
+        weighting: Manual or Uncertainty.
+        hand: the hand term.
+        branches: the predictor's branches.
     """
 
     def __init__(self, weighting: Weighting, hand: Hand, branches: frozenset[str]):
         super().__init__()
         self.weighting, self.hand, self.branches = weighting, hand, branches
+        # The terms of two frames of zeros tell the weighting which names there are.
         probe = torch.zeros(1, 2, FRAME_DIM)
         normalizer = Normalizer.raw(World(), torch.zeros(N_JOINTS, 3))
         motion = probe[..., SPARSE_DIM:]
         weighting.build(list(self.terms(motion, motion, probe[..., :SPARSE_DIM], normalizer)))
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
+        """Return each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
         terms: Terms = {}
         if "rotation" in self.branches:
             terms |= rotation_terms(motion, truth)
@@ -199,12 +212,12 @@ class MotionLoss(Loss):
 
 
 def joint_norms(error: Tensor) -> Tensor:
-    """Mean over frames and joints of the L2 norm of each joint's 6D error, of errors (..., 132)."""
+    """Return the L2 norm of each joint's 6D error, mean over frames and joints, for errors (..., 132)."""
     return error.unflatten(-1, (N_JOINTS, 6)).norm(dim=-1).mean()
 
 
 def mean_square(error: Tensor) -> Tensor:
-    """Mean of the squared components of errors (..., 132)."""
+    """Return the mean of the squared components of errors (..., 132)."""
     return error.square().mean()
 
 
@@ -215,8 +228,8 @@ class AGRoLLoss(Loss):
     """AGRoL's error of the 6D rotations, in network space, where the diffusion model's noise lies too.
 
     Args:
-        error: "norm", as its released code trains both of its networks (`joint_norms`), or "square", the
-            mean squared error that its paper can be read as (Du et al. 2023, L2).
+        error: "norm" as its released code trains both networks (`joint_norms`), or "square" for the mean
+            squared error that its paper can be read as (Du et al. 2023, L2).
     """
 
     def __init__(self, error: str = "norm"):
@@ -225,19 +238,19 @@ class AGRoLLoss(Loss):
         self.weighting = Fixed({"rotation": 1.0})
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """The one term, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
+        """Return the one term, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
         origin = normalizer.origin(sparse)
         error = normalizer.encode_motion(motion, origin) - normalizer.encode_motion(truth, origin)
         return {"rotation": self.error(error[..., ROTATION])}
 
 
 def from_pelvis(positions: Tensor) -> Tensor:
-    """Joint positions (..., 22, 3) less the pelvis' own."""
+    """Return joint positions (..., 22, 3) relative to the pelvis."""
     return positions - positions[..., ROOT : ROOT + 1, :]
 
 
 def from_origin(positions: Tensor) -> Tensor:
-    """Joint positions (..., 22, 3) in the world."""
+    """Return joint positions (..., 22, 3) as they are, in the world."""
     return positions
 
 
@@ -247,14 +260,15 @@ ANCHORS: dict[str, Callable[[Tensor], Tensor]] = {"pelvis": from_pelvis, "head":
 class AvatarPoserLoss(Loss):
     """Mean absolute errors of root orientation, local rotations and joint positions (Jiang et al. 2022).
 
-    The positions are by forward kinematics, over the 22 joints (its authors' mean is over the fingers too,
-    which move with the wrists).
+    The positions follow by forward kinematics. The mean is over the 22 joints; its authors' is over the
+    fingers too, which move with the wrists.
 
     Args:
-        orientation, rotation, position: weights of the three terms. The first is 0.02 in the released code
-            and 0.05 in the paper.
-        anchor: where the compared bodies meet: "pelvis", as in the released code, which knows no
-            translation, or "head", the predicted body's put on its tracker.
+        orientation: weight of the root orientation's error; 0.02 in the released code, 0.05 in the paper.
+        rotation: weight of the local rotations' error.
+        position: weight of the positions' error.
+        anchor: the point at which predicted and true body are brought together: "pelvis" as in the released
+            code, which knows no translation, or "head", where the predicted head is put on its tracker.
     """
 
     def __init__(
@@ -265,7 +279,7 @@ class AvatarPoserLoss(Loss):
         self.weighting, self.anchored = Fixed(weights), ANCHORS[anchor]
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        """Each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54), in the world."""
+        """Return each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
         error = (motion - truth)[..., ROTATION].abs()
         position = self.anchored(normalizer.pose(motion, sparse)) - self.anchored(joints(truth))
         return {

@@ -22,7 +22,7 @@ from memmlp.training.losses import Loss
 from memmlp.training.optim import Optim
 from memmlp.training.rollout import Rollout
 
-VALIDATION_PIECE = 240  # frames: validation streams through pieces of clips of 4 s
+VALIDATION_PIECE = 240  # frames, 4 s: validation streams through pieces of clips of this length
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,11 @@ class NetworkTraining:
     """How a motion network is trained.
 
     Attributes:
-        seed: of its weights, batches and rollouts.
-        loss: makes the loss over a network's branches. rollout: makes the history that it is trained on.
-        optim: steps and learning rates. weighting: of the windows' draws, "frames" or "clips".
+        seed: seed of its weights, batches and rollouts.
+        loss: makes the loss, given the network's branches.
+        rollout: makes the history that the network is trained on.
+        optim: steps, learning rates and intervals.
+        weighting: how training windows are drawn, "frames" or "clips" (see WindowSampler).
     """
 
     seed: int
@@ -50,11 +52,18 @@ class NetworkTraining:
         device: torch.device,
         watch: Watch = unwatched,
     ) -> WindowModel:
-        """The network after its training, which goes on from the run's checkpoint; its weights are written.
+        """Train a network, from the run's checkpoint if there is one, and write its weights.
 
         Args:
+            architecture: builds the network.
+            data: the prepared motion.
             codes: weights of the frozen VQ-VAE, where the architecture uses one.
-            watch: see `memmlp.training.loop.train`.
+            run: the run whose folder takes checkpoints, log and weights.
+            device: the device to train on.
+            watch: called after each validation; see `memmlp.training.loop.train`.
+
+        Returns:
+            The trained network in evaluation mode.
         """
         frames = data.open("train").to(device)
         torch.manual_seed(self.seed)
@@ -78,7 +87,7 @@ class NetworkTraining:
 
 
 class MotionTask:
-    """A motion network under its loss, its history made by the rollout."""
+    """The training task of a motion network: its loss, over a history that the rollout makes."""
 
     def __init__(
         self,
@@ -98,12 +107,12 @@ class MotionTask:
         self._validate = validate
 
     def parameter_groups(self) -> list[dict]:
-        """The model's trainable parameters, and the loss' own."""
+        """Return the model's trainable parameters and the loss weighting's own."""
         trained = [p for p in self.model.parameters() if p.requires_grad]
         return [{"params": trained}, *self.loss.weighting.parameter_groups()]
 
     def step(self, step: int) -> StepResult:
-        """The loss of one training call."""
+        """Compute the loss of one training call."""
         call = self.rollout.draw(self.model, self.frames, self.sampler, step)
         motion, state = self.learn(call.sparse, call.state, call.truth)
         self.rollout.keep(state)
@@ -113,9 +122,9 @@ class MotionTask:
         return StepResult(sum(own.values(), loss), terms | own, call.clips)
 
     def report(self) -> dict[str, float]:
-        """The weights of the loss terms."""
+        """Return the weights of the loss terms."""
         return {f"weight_{name}": value for name, value in self.loss.weighting.weights().items()}
 
     def validate(self) -> dict[str, float]:
-        """Stream-mode metrics on the validation split."""
+        """Compute the stream-mode metrics on the validation split."""
         return self._validate(self.model)

@@ -1,4 +1,4 @@
-"""How a module is trained: steps, batches, learning rates."""
+"""How a module is optimised: steps, batches, learning rates, precision."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 
 SCHEDULES: dict[str, Callable[[float, float, float], float]] = {
-    # (progress in [0, 1), final rate / first rate, where the step falls) -> factor
+    # Each maps the progress in [0, 1), final rate / first rate and `drop_at` to the factor on the first rate.
     "step": lambda done, final, drop_at: 1.0 if done < drop_at else final,
     "cosine": lambda done, final, drop_at: final + (1 - final) * 0.5 * (1 + math.cos(math.pi * done)),
     "milestones": lambda done, final, drop_at: 0.2 ** sum(done >= at for at in (0.2, 0.5, 0.7)),
@@ -18,15 +18,25 @@ SCHEDULES: dict[str, Callable[[float, float, float], float]] = {
 
 @dataclass(frozen=True)
 class Optim:
-    """How a module is trained.
+    """How a module is optimised.
 
     Attributes:
-        steps, batch: length and windows (or frames) a step.
-        lr, final_lr: learning rate at the start and at the end of the schedule.
-        schedule: "step" (falls to final_lr at the fraction drop_at), "cosine", or "milestones" (App. A).
-        decoupled: AdamW's weight decay; else Adam's.
-        clip_norm: largest norm of the gradient, 0 for none.
-        precision: "fp32" or "bf16" (autocast). compile: torch.compile the model's call.
+        steps: number of training steps.
+        batch: windows (of a VQ-VAE: frames) a step.
+        lr: learning rate at the start.
+        final_lr: learning rate at the end of the schedules "step" and "cosine".
+        schedule: "step" (falls to `final_lr` at the fraction `drop_at` of the steps), "cosine", or
+            "milestones" (times 0.2 at 20, 50 and 70 % of the steps, App. A).
+        drop_at: see `schedule`.
+        weight_decay: weight decay.
+        betas: Adam's two decay rates.
+        decoupled: whether weight decay is AdamW's; otherwise it is Adam's.
+        clip_norm: largest norm of the gradient, 0 for no limit.
+        precision: "fp32" or "bf16" (autocast).
+        compile: whether the model's training call is compiled by torch.compile.
+        checkpoint_every: steps between checkpoints.
+        validate_every: steps between validations.
+        log_every: steps between entries of the log.
     """
 
     steps: int
@@ -46,11 +56,11 @@ class Optim:
     log_every: int = 50
 
     def factor(self, step: int) -> float:
-        """The learning rate at a step over the first one."""
+        """Return the learning rate at a step as a fraction of the first one."""
         return SCHEDULES[self.schedule](step / self.steps, self.final_lr / self.lr, self.drop_at)
 
     def build(self, groups: list[dict]) -> torch.optim.Optimizer:
-        """The optimiser over parameter groups; a group's own `lr` and `weight_decay` win."""
+        """Make the optimiser over parameter groups; a group's own `lr` and `weight_decay` take precedence."""
         kind = torch.optim.AdamW if self.decoupled else torch.optim.Adam
         return kind(groups, lr=self.lr, weight_decay=self.weight_decay, betas=self.betas)
 
@@ -63,7 +73,10 @@ def vqvae_optim(
     checkpoint_every: int = Optim.checkpoint_every,
     log_every: int = Optim.log_every,
 ) -> Optim:
-    """How a VQ-VAE is trained: Adam, its rate times 0.2 at 20, 50 and 70 % of the steps (App. A)."""
+    """Return how a VQ-VAE is optimised: Adam, its rate times 0.2 at 20, 50 and 70 % of the steps (App. A).
+
+    Validation is done once, at the end.
+    """
     return Optim(
         steps=steps,
         batch=batch,

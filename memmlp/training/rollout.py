@@ -1,6 +1,6 @@
-"""The rollout slot: how the history that a training step sees comes about.
+"""The rollout slot: how the history that a training step sees is made.
 
-A network trained on true history alone leans on what is not there at run time (exposure bias), so the
+A network trained on true history alone relies on what is not there at run time (exposure bias), so the
 history may be made by the network itself, as it will be live.
 """
 
@@ -18,9 +18,13 @@ from memmlp.networks.window_model import WindowModel
 
 
 class Call(NamedTuple):
-    """One training call: `model.learn(sparse, state, truth)` should give the truth.
+    """The arguments of a training call: `model.learn(sparse, state, truth)` should return the true motion.
 
-    sparse (B, n, 54) and truth (B, T, 252) are world frames; clips (B,) says where they are from.
+    Attributes:
+        sparse: world inputs (B, n, 54) of the new frames.
+        state: the state before them.
+        truth: world frames [X | Theta] (B, T, 252) of the window.
+        clips: indices of the clips (B,) that they are from.
     """
 
     sparse: Tensor
@@ -30,24 +34,24 @@ class Call(NamedTuple):
 
 
 class Rollout(nn.Module):
-    """The rollout slot."""
+    """The rollout slot's interface."""
 
     def begin(self, model: WindowModel) -> None:
-        """Make room for what is kept between steps of that network's training; here nothing is."""
+        """Make room for what is kept between the training steps of a network; here nothing is kept."""
 
     def draw(self, model: WindowModel, frames: MotionDataset, sampler: WindowSampler, step: int) -> Call:
-        """The call of a training step."""
+        """Draw the call of a training step."""
         raise NotImplementedError
 
     def keep(self, state: State) -> None:
-        """Keep what the trained call left; here nothing is kept."""
+        """Keep what is needed of the state after the trained call; here nothing is kept."""
 
 
 class TeacherForcing(Rollout):
-    """The true history: the paper's training (Sec. 3.2.1)."""
+    """The true motion as history: the paper's training (Sec. 3.2.1)."""
 
     def draw(self, model: WindowModel, frames: MotionDataset, sampler: WindowSampler, step: int) -> Call:
-        """The call of a training step."""
+        """Draw the call of a training step."""
         clips, end = sampler.draw(step)
         past, stride = model.length, model.stride
         segment = frames.segments(clips, end, past + stride)
@@ -56,9 +60,9 @@ class TeacherForcing(Rollout):
 
 
 class OwnPredictions(Rollout):
-    """The network's own history, made by 0 to `max_passes` untrained calls before the trained one.
+    """The network's own history, made by 0 to `max_passes` calls without gradient before the trained one.
 
-    The first of them sees an empty history. All samples of a step take the same number of calls.
+    The first of these calls sees an empty history. All samples of a step take the same number of calls.
     """
 
     def __init__(self, max_passes: int):
@@ -66,7 +70,7 @@ class OwnPredictions(Rollout):
         self.max_passes = max_passes
 
     def draw(self, model: WindowModel, frames: MotionDataset, sampler: WindowSampler, step: int) -> Call:
-        """The call of a training step."""
+        """Draw the call of a training step, after the calls that make its history."""
         clips, end = sampler.draw(step)
         past, stride = model.length, model.stride
         passes = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
@@ -83,10 +87,18 @@ class OwnPredictions(Rollout):
 
 
 class PersistentStreams(Rollout):
-    """Many streams that run through the clips for the whole training, each fed with its own history.
+    """Many streams that run through the clips during the whole training, each on its own history.
 
-    Every step takes the next `batch` of them one stride further; at its clip's end a stream starts
-    afresh in a clip drawn anew. Their state is part of the checkpoint.
+    Every step takes the next `batch` of the streams one stride further. A stream that reaches its clip's end
+    starts afresh in a clip drawn anew. The streams' states are part of the checkpoint.
+
+    Args:
+        streams: number of streams.
+
+    Attributes:
+        clip: index of each stream's clip (streams,).
+        end: its newest frame in that clip (streams,).
+        lives: whether it has started (streams,).
     """
 
     clip: Tensor
@@ -101,12 +113,13 @@ class PersistentStreams(Rollout):
         self.register_buffer("lives", torch.zeros(streams, dtype=torch.bool))
 
     def begin(self, model: WindowModel) -> None:
-        """Room for the streams' states."""
+        """Make room for the streams' states."""
         for name, tensor in model.initial_state(1).items():
             self.register_buffer(f"state_{name}", tensor.repeat(self.streams, *[1] * (tensor.dim() - 1)))
 
     def draw(self, model: WindowModel, frames: MotionDataset, sampler: WindowSampler, step: int) -> Call:
-        """The call of a training step: the next streams, each one stride further."""
+        """Draw the call of a training step: the next streams, each one stride further."""
+        # The drawn clips and frames are where streams that have ended, or not begun, start afresh.
         clips, end = sampler.draw(step)
         who = (step * len(clips) + torch.arange(len(clips), device=clips.device)) % self.streams
         going = self.lives[who] & (self.end[who] + model.stride < frames.lengths[self.clip[who]])
@@ -124,6 +137,6 @@ class PersistentStreams(Rollout):
         return Call(segment[:, past:, :SPARSE_DIM], state, segment[:, -model.frames :], self.clip[who])
 
     def keep(self, state: State) -> None:
-        """The states of the streams after the trained call."""
+        """Keep the streams' states after the trained call."""
         for name, tensor in state.items():
             self.get_buffer(f"state_{name}")[self.who] = tensor.detach()

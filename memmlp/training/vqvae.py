@@ -25,8 +25,9 @@ class VQVAETraining:
     """How a VQ-VAE is trained.
 
     Attributes:
-        config: the part of the resolved config that its result follows from.
-        seed: of its weights and batches. optim: by the number of training frames.
+        config: the part of the resolved config that determines the result.
+        seed: seed of its weights and batches.
+        optim: returns the optimisation, given the number of training frames.
     """
 
     config: dict[str, Any]
@@ -36,7 +37,7 @@ class VQVAETraining:
     def train(
         self, architecture: Architecture, data: Prepared, run: Run, device: torch.device
     ) -> dict[str, float]:
-        """Train the architecture's VQ-VAE from the run's checkpoint on, and write its weights.
+        """Train the architecture's VQ-VAE, from the run's checkpoint if there is one, and write its weights.
 
         Returns:
             Its errors on the validation frames.
@@ -53,7 +54,9 @@ class VQVAETraining:
 
 
 class VQVAETask:
-    """Eq. 1 on the reconstructed rotations plus the codebook's loss (App. A)."""
+    """The training task of a VQ-VAE (App. A): Eq. 1 on the reconstructed rotations plus the codebook's
+    loss.
+    """
 
     def __init__(
         self,
@@ -70,11 +73,11 @@ class VQVAETask:
         self.used = torch.zeros(len(model.codebook.vectors))
 
     def parameter_groups(self) -> list[dict]:
-        """All parameters."""
+        """Return all trainable parameters."""
         return [{"params": [p for p in self.model.parameters() if p.requires_grad]}]
 
     def step(self, step: int) -> StepResult:
-        """The loss on a batch of single frames."""
+        """Compute the loss on a batch of single frames."""
         clips, end = self.sampler.draw(step)
         frames = self.normalizer.encode(self.frames.segments(clips, end, 1))[:, 0]
         terms, indices = self.model.loss_terms(frames, self.normalizer)
@@ -82,12 +85,12 @@ class VQVAETask:
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)
 
     def report(self) -> dict[str, float]:
-        """How many codes are used, as the exponential of their entropy."""
+        """Return the perplexity of the step's codes: how many are in use, by the entropy of their counts."""
         return {"perplexity": perplexity(self.used)}
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
-        """Eq. 1 and the perplexity on validation frames."""
+        """Compute Eq. 1 and the perplexity on the validation frames."""
         frames = self.normalizer.encode(self.validation.frames)
         vectors, index = self.model.codebook(self.model.encoder(frames))
         used = torch.bincount(index, minlength=len(self.used)).float()
@@ -96,6 +99,6 @@ class VQVAETask:
 
 
 def perplexity(counts: Tensor) -> float:
-    """Exponential of the entropy of counts (K,): K where all are used alike, 1 where one is."""
+    """Return the exponential of the entropy of counts (K,): K if all are equal, 1 if only one is not 0."""
     share = counts / counts.sum().clamp_min(1)
     return float(torch.special.entr(share).sum().exp())

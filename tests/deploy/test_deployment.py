@@ -1,4 +1,4 @@
-"""What a network is shipped as: its graph, int8 and what that costs, and what a run records of it."""
+"""Deployments: the exported graph, int8 and its cost, and what a run records of them."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_auto_is_the_stream_where_there_is_one():
 
 
 def weights(graph: onnx.ModelProto) -> dict[str, int]:
-    """The number type of each layer's weight that a product takes in, directly or dequantised."""
+    """Return the number type of each layer's weight in a product, taken directly or dequantised."""
     types = {tensor.name: tensor.data_type for tensor in graph.graph.initializer}
     sources = {
         node.output[0]: node.input[0] for node in graph.graph.node if node.op_type == "DequantizeLinear"
@@ -153,7 +153,7 @@ def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
 
 
 def test_the_naive_graph_by_switch(tmp_path):
-    """No run: what a config's deployment writes."""
+    """The deployment of a config is checked by itself, without a run."""
     shipped = {}
     for graph in ("naive", "auto"):
         place = Deployed(tmp_path / graph)

@@ -48,7 +48,7 @@ def test_parity_sees_a_difference(exported):
 
 
 def test_almost_parallel_columns_are_no_failure(tmp_path):
-    """As an untrained network makes them: the joints of rotations that agree may be far apart."""
+    """An untrained network makes such 6D columns: rotations that agree may then have joints far apart."""
     model, path = tiny.baseline("agrol_mlp"), tmp_path / "step.onnx"
     mean, std = (t[SPARSE_DIM:][ROTATION].view(22, 6) for t in (model.normalizer.mean, model.normalizer.std))
     mean[9, 3:], std[9] = mean[9, :3], 4e-3
@@ -100,7 +100,9 @@ def test_latency_and_size(exported):
 
 
 def test_macs_are_counted_by_hand():
-    """Stem, 4 blocks of time and channel mixing, two branches of one block and a linear."""
+    """The network has a stem, 4 blocks of time and channel mixing, and two branches of a block and a
+    linear.
+    """
     model = tiny.model(NoMemory)
     frames, hidden = model.frames, model.hidden
     block = frames * frames * hidden + frames * hidden * hidden

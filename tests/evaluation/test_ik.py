@@ -20,7 +20,7 @@ LEAVES = [10, 11, 15, 20, 21]
 
 
 def perturbed(size: float, seed: int = 0) -> Tensor:
-    """The true motion (40, 198) with every rotation turned by some `size` radians; true positions."""
+    """Return the motion (40, 198) with every rotation turned by some `size` radians and true positions."""
     draw = torch.Generator().manual_seed(seed)
     turn = size * torch.randn(len(MOTION), N_JOINTS, 3, generator=draw)
     local = local_rotations(MOTION) @ axis_angle_to_matrix(turn)
@@ -28,13 +28,13 @@ def perturbed(size: float, seed: int = 0) -> Tensor:
 
 
 def distance(motion: Tensor) -> Tensor:
-    """Largest distance (N,) of a joint of the rotations' pose to the motion's own positions, cm."""
+    """Return the largest distance (N,) of a joint by the rotations from that by the positions, cm."""
     target = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
     return 100 * (FRAME.pose(motion, SPARSE[: len(motion)]) - target).norm(dim=-1).amax(-1)
 
 
 def objective(motion: Tensor) -> JointDistance:
-    """The objective of a motion, in float64."""
+    """Return the objective of a motion, in float64."""
     head = SPARSE[: len(motion), 36:39].double()
     target = motion[:, POSITION].double().unflatten(-1, (N_JOINTS, 3)) - head[:, None]
     return JointDistance(local_rotations(motion.double()), target, FRAME.rest.double())
@@ -75,7 +75,7 @@ def test_the_objective_falls_with_every_iteration_in_every_frame():
 
 
 def test_the_objective_is_the_distance_that_is_measured():
-    """Sum of squares over joints, head on its tracker: `Frame.pose` says the same."""
+    """It is the sum of squares over joints, the head on its tracker, as by `Normalizer.pose`."""
     motion = perturbed(0.3)
     target = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
     expected = (FRAME.pose(motion, SPARSE) - target).square().sum((1, 2))
@@ -94,7 +94,7 @@ def test_the_gradient_is_that_of_finite_differences(size):
 
 @pytest.mark.parametrize("angle", [0.0, torch.pi - 1e-4, torch.pi])
 def test_identity_and_half_turns_give_no_nan(angle):
-    """Starts at the identity and at half turns, of the root and of all joints, towards an ordinary pose."""
+    """The start is the identity or half turns, of the root or all joints; the target is an ordinary pose."""
     for joints in ([0], range(N_JOINTS)):
         turn = torch.zeros(3, N_JOINTS, 3)
         turn[:, list(joints), 1] = angle

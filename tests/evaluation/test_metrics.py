@@ -63,7 +63,7 @@ def test_position_metrics_are_numpys(seed):
 
 
 class Copy:
-    """Knows the truth: what it is given as input it looks up."""
+    """A network that knows the truth and looks it up by its inputs."""
 
     shift = 0
 
@@ -84,7 +84,7 @@ class Copy:
 
 
 class Still(Copy):
-    """Always the first pose of its first clip."""
+    """A network that always returns the first pose of its first clip."""
 
     def advance(self, sparse, state, newest=None):
         pose = next(iter(self.table.values()))

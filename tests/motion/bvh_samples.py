@@ -1,4 +1,4 @@
-"""Small BVH files of both shipped skeletons, damage to them, and how their refusals are expected."""
+"""Small BVH files of both shipped skeletons, damaged ones, and the refusals that are expected of them."""
 
 from __future__ import annotations
 
@@ -87,7 +87,10 @@ class Sample:
 
 
 def person(skeleton: str, frames: int, seed: int, folded: bool = False) -> Sample:
-    """Frame 0 the zero pose, then random rotations; those between mapped joints only if `folded`."""
+    """Make a file of random rotations, frame 0 being the zero pose.
+
+    Joints that lie between mapped ones turn only if `folded`.
+    """
     random = np.random.default_rng(seed)
     names, parents, offsets, ends = [], [], [], []
     for entry in TREES[skeleton].replace("\n", " ").split(";"):
@@ -109,7 +112,7 @@ def person(skeleton: str, frames: int, seed: int, folded: bool = False) -> Sampl
 
 
 def mutate(data: bytes, seed: int) -> bytes:
-    """One piece of damage, drawn by the seed."""
+    """Damage a file in one way, drawn by the seed."""
     random = np.random.default_rng(seed)
     lines, at = data.splitlines(keepends=True), int(random.integers(1, len(data) - 1))
     line = int(random.integers(len(lines)))
@@ -166,7 +169,7 @@ def read(folder: Path, skeleton: str, frames: int = 5, **options: int) -> Bvh:
 
 @contextmanager
 def refuse(start: Path | str, *said: str) -> Iterator[None]:
-    """Expect an InputError of one line that begins with `start` and has what is said."""
+    """Expect an InputError of one line that begins with `start` and contains what is said."""
     with pytest.raises(InputError) as error:
         yield
     message = str(error.value)
@@ -177,10 +180,10 @@ def refuse(start: Path | str, *said: str) -> Iterator[None]:
 
 
 def performed(skeleton: str, clip: Clip, seed: int = 3) -> Sample:
-    """A clip on the built-in body as a BVH file of a shipped skeleton, behind the zero pose.
+    """Write a clip on the built-in body as a BVH file of a shipped skeleton, behind the zero pose.
 
-    What `retarget` makes of it is the clip, but for body joints without a joint in the file, which keep to
-    their parents.
+    `retarget` returns the same clip, except that body joints without a joint in the file keep to their
+    parents.
     """
     sample, chosen, rest = (
         person(skeleton, len(clip) + 1, seed),
@@ -204,7 +207,7 @@ def performed(skeleton: str, clip: Clip, seed: int = 3) -> Sample:
 
 
 def body_rotations(clip: Clip) -> np.ndarray:
-    """Global rotations (N, 22, 3, 3)."""
+    """Return global rotations (N, 22, 3, 3)."""
     local = Rotation.from_rotvec(clip.poses.reshape(-1, 3)).as_matrix().reshape(len(clip), -1, 3, 3)
     for joint, parent in enumerate(PARENTS[1:], start=1):
         local[:, joint] = local[:, parent] @ local[:, joint]

@@ -71,7 +71,7 @@ def turn(axis: str, degrees: float) -> np.ndarray:
 
 
 def naive_kinematics(sample: Sample) -> tuple[np.ndarray, np.ndarray]:
-    """One frame and one joint at a time, by 4 x 4 matrices."""
+    """Compute the kinematics one frame and one joint at a time, by 4 x 4 matrices."""
     frames = []
     for row in sample.values:
         numbers, world = iter(row), []

@@ -145,7 +145,7 @@ def test_every_clip_knows_its_group(root, tmp_path):
 
 
 def test_other_groups_make_the_cache_anew_and_no_run(root, tmp_path):
-    """Where the split is the same, the digest that runs are known by is."""
+    """Where the split stays the same, so does the digest that is part of a run's identity."""
     tied = SeededSplit(0, 0, groups=["a/[12]$"])
     first, second = (
         prepare(source(root, split=split), tmp_path / "cache") for split in (SeededSplit(0, 0), tied)
@@ -169,7 +169,7 @@ def test_a_cache_from_before_there_were_groups_is_made_anew(root, tmp_path):
 
 
 def test_the_manifest_names_the_body(root, tmp_path):
-    """Model files of all bodies have one name: a digest of the rest pose tells them apart."""
+    """Model files of all bodies have the same name, so a digest of the rest pose tells them apart."""
     names = [prepare(source(root), tmp_path / "builtin").body]
     parents = np.array([[-1, *module.load_rest_joints.__globals__["PARENTS"][1:]], range(22)])
     for size in (0.9, 1.1):
@@ -220,7 +220,7 @@ def test_the_sampler_draws_every_window_alike_and_the_step_is_its_position(frame
 
 
 def test_frames_of_an_older_recipe_are_made_again(root, tmp_path, monkeypatch):
-    """A run of a new recipe of the features is trained on what the new code makes."""
+    """Otherwise a run with a new recipe of the features would be trained on frames that old code made."""
     first = prepare(source(root), tmp_path / "cache")
     made = (tmp_path / "cache" / "train.npy").stat().st_mtime_ns
     prepare(source(root), tmp_path / "cache")

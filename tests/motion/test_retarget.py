@@ -57,7 +57,7 @@ def test_imports_keep_joints_and_limbs(tmp_path: Path, skeleton: str) -> None:
 
 @pytest.mark.parametrize("skeleton", TREES)
 def test_limbs_point_as_in_the_file(tmp_path: Path, skeleton: str) -> None:
-    """Independent of `verify`, and with the unmapped joints between mapped ones turning too."""
+    """This check is independent of `verify`, and the unmapped joints between mapped ones turn too."""
     bvh, chosen = read(tmp_path, skeleton, folded=True), load_skeleton(skeleton)
     positions = to_z_up(bvh.kinematics()[1])[1:]
     body = on_body(retarget(bvh, chosen, REST))[1]
@@ -81,7 +81,7 @@ def test_unmapped_rotations_are_folded_in(tmp_path: Path, skeleton: str) -> None
 
 
 def test_a_turning_joint_without_counterpart_shows(tmp_path: Path) -> None:
-    """The check is no tautology: a buttock that turns moves the thigh on a bone the import has not."""
+    """`verify` can fail: a buttock that turns moves the thigh on a bone that the import lacks."""
     assert verify(write(tmp_path, person("cmu_daz", 10, 5, folded=True).text())).worst_mm > 1
 
 
@@ -205,7 +205,7 @@ def test_translation_is_scaled_by_the_legs(tmp_path: Path) -> None:
 
 
 def test_hip_joints_lie_where_the_scaled_source_has_them(tmp_path: Path) -> None:
-    """So legs of the same direction end where the source's do, though DAZ' hip is below the hip joints."""
+    """So legs of the same direction end where the source's do, although DAZ' hip lies lower."""
     bvh, chosen = read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz")
     hips = [bvh.nodes.index("lThigh"), bvh.nodes.index("rThigh")]
     source = to_z_up(bvh.kinematics()[1][1:, hips].mean(1)) * 0.01 * fit(bvh, chosen, REST).scale

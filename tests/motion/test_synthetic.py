@@ -27,7 +27,7 @@ LIMITS = {
 
 @cache
 def performed(activity: str, seed: int) -> tuple[Clip, torch.Tensor, torch.Tensor, np.ndarray]:
-    """A clip, its local and global rotations and its joints' positions."""
+    """Make a clip; return it with its local and global rotations and its joints' positions."""
     clip = synthesize_clip(activity, seed, seconds=12.0, fps=FPS)
     local = axis_angle_to_matrix(torch.from_numpy(clip.poses).double())
     rest = torch.from_numpy(builtin_rest_joints())
@@ -40,13 +40,16 @@ def joint(positions: np.ndarray, name: str) -> np.ndarray:
 
 
 def contact(positions: np.ndarray, side: str) -> np.ndarray:
-    """Ball or heel on the floor, by height."""
+    """Return whether ball or heel are on the floor, by their height."""
     ball, ankle = joint(positions, f"{side}_foot")[:, 2], joint(positions, f"{side}_ankle")[:, 2]
     return (ball < 0.03) | (ankle < 0.085)
 
 
 def stances(positions: np.ndarray, side: str, part: str) -> list[np.ndarray]:
-    """Ball or ankle (n, 3) through each stretch of 5 frames or more with the ball down, or the foot flat."""
+    """Return the path (n, 3) of a foot's part in each stretch of 5 frames or more in which the foot stands.
+
+    For the ball, standing means that the ball is down; for the ankle, that the foot is flat.
+    """
     heights = {"foot": 0.02, "ankle": 0.075}
     down = {name: np.abs(joint(positions, f"{side}_{name}")[:, 2] - z) < 1e-4 for name, z in heights.items()}
     standing = down["foot"] if part == "foot" else down["foot"] & down["ankle"]
@@ -92,7 +95,7 @@ def test_files_are_in_amass_layout_and_last_as_long_as_asked(tmp_path):
 
 @pytest.mark.parametrize("seconds", [0.01, 1.0])
 def test_a_little_is_three_short_clips(tmp_path, seconds):
-    """One for each side of a split."""
+    """There is one clip for each part of a split."""
     lengths = [len(read_clip(path, path.stem)) for path in synthesize(tmp_path, minutes=seconds / 60)]
     assert len(lengths) == 3
     assert sum(lengths) == max(6, seconds * 60)

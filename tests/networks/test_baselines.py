@@ -111,7 +111,7 @@ def test_side_by_side_is_one_by_one_and_short_clips_count(name, mode):
 
 @torch.no_grad()
 def test_avatar_poser_is_the_same_in_both_modes():
-    """Of a clip of whole windows; every frame has its own window."""
+    """Every frame has its own window, so a clip of whole windows is the same in both."""
     model = tiny.baseline("avatar_poser")
     clip = CLIP[: 5 * model.frames]
     torch.testing.assert_close(evaluation.window(model, [clip])[0], evaluation.stream(model, [clip])[0])
@@ -152,7 +152,7 @@ def test_cosine_schedule_is_the_papers():
 
 @pytest.mark.parametrize("steps", [1, 3, 5])
 def test_ddim_is_an_independent_numpy_computation(steps):
-    """With a denoiser that is an affine map of noisy signal and time."""
+    """The denoiser is an affine map of the noisy signal and the time."""
     diffusion = Diffusion(20, steps).double()
     noise = np.random.default_rng(0).normal(size=(2, 4, 3))
     found = diffusion.sample(lambda x, t: 0.7 * x + 0.1 + 0.01 * t[:, None, None], torch.tensor(noise))
@@ -306,7 +306,7 @@ def test_avatar_posers_loss_compares_bodies_at_the_pelvis_or_at_the_tracker(anch
 
 
 def posed(rotation: np.ndarray) -> np.ndarray:
-    """Joints (22, 3) of local 6D rotations (132,), the pelvis at the origin."""
+    """Return the joints (22, 3) of local 6D rotations (132,), the pelvis at the origin."""
     turns, places = [], []
     for joint, sixd in enumerate(rotation.reshape(22, 2, 3).astype(np.float64)):
         x = sixd[0] / np.linalg.norm(sixd[0])

@@ -74,7 +74,7 @@ def test_side_by_side_is_one_by_one(kind, changes):
 @pytest.mark.parametrize("shift", ["frame", "window"])
 @torch.no_grad()
 def test_memory_sees_the_shifted_past(shift):
-    """An independent re-derivation: the past of frame t is inputs and own first estimates, `shift` back."""
+    """Derived independently: the past of frame t is the inputs and own first estimates `shift` earlier."""
     model = tiny.model(CodeMemory, shift=shift)
     seen = []
     model.blocks[1].register_forward_hook(lambda module, args, output: seen.append(args[1]))
@@ -92,7 +92,7 @@ def test_memory_sees_the_shifted_past(shift):
 @pytest.mark.parametrize("shift", ["frame", "window"])
 @torch.no_grad()
 def test_the_past_of_a_call_of_a_window_is_the_window_before(shift):
-    """Inputs and output of the call before, whatever the shift."""
+    """Whatever the shift, the past is the inputs and the output of the call before."""
     model = tiny.model(CodeMemory, shift=shift)
     seen = []
     model.blocks[1].register_forward_hook(lambda module, args, output: seen.append(args[1]))
@@ -109,7 +109,7 @@ def test_the_past_of_a_call_of_a_window_is_the_window_before(shift):
 @pytest.mark.parametrize(("shift", "back"), [("frame", 1), ("window", 7)])
 @torch.no_grad()
 def test_in_window_mode_a_memory_recalls_what_it_was_trained_on(shift, back):
-    """The window that ends `shift` before the newest frame of each one, as teacher forcing had it."""
+    """That is the window that ends `shift` before the newest frame of each one, as in teacher forcing."""
     model, clip, seen = tiny.model(CodeMemory, shift=shift), tiny.clip(24), []
     model.blocks[1].register_forward_hook(lambda module, args, output: seen.append(args[1].sparse))
     found, size = window(model, [clip])[0], model.frames
@@ -127,7 +127,7 @@ def test_in_window_mode_a_memory_recalls_what_it_was_trained_on(shift, back):
 
 @torch.no_grad()
 def test_in_window_mode_a_frame_by_frame_network_shows_each_windows_last_call():
-    """Windows of 7, and of what is left; each clip side by side as alone."""
+    """Windows have 7 frames or what is left, and clips side by side give the same as each one alone."""
     model, clips = tiny.model(CodeMemory, shift="frame"), [tiny.clip(24), tiny.clip(9, seed=1)]
     outputs = run(model, clips[0][None, :, :SPARSE_DIM])
     expected = torch.cat([outputs[6][0], outputs[13][0], outputs[20][0], outputs[23][0, -3:]])
@@ -164,7 +164,7 @@ def test_the_stream_is_causal_and_remembers():
 
 
 def _name(value: object) -> str:
-    """A value without its address."""
+    """Return a value as text without its address."""
     return str(value).split(" object at ")[0]
 
 

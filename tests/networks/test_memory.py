@@ -1,4 +1,4 @@
-"""Memories in place of the paper's: recurrent layers, a VQ-VAE trained jointly, blocks in the predictor."""
+"""Memories other than the paper's: recurrent, with a VQ-VAE trained jointly, or in the predictor's blocks."""
 
 from functools import partial
 
@@ -27,7 +27,7 @@ SPLIT = tiny.frames((60, 90))
 
 
 def outputs(model: MemMLP, sparse: torch.Tensor, new: int) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """The last window's motion and the state after taking the frames in `new` at a time."""
+    """Return the last window's motion and the state after taking in the frames `new` at a time."""
     state = model.initial_state(len(sparse))
     for part in sparse.split(new, 1):
         motion, state = model.advance(part, state)
@@ -39,7 +39,7 @@ def outputs(model: MemMLP, sparse: torch.Tensor, new: int) -> tuple[torch.Tensor
 @pytest.mark.parametrize("kind", RECURRENT)
 @torch.no_grad()
 def test_a_recurrent_stream_is_the_same_however_it_is_cut(kind, new, predictor):
-    """Frame by frame, by a few and by whole windows: the recurrence runs once over each frame."""
+    """Frames are taken in one by one, by a few, or by windows; the recurrence runs once over each of them."""
     model = tiny.model(kind, **{"predictor": predictor} if predictor else {})
     one, state = outputs(model, SPARSE, 1)
     some, after = outputs(model, SPARSE, new)
@@ -206,7 +206,7 @@ def test_parameters_count_a_joint_vqvae_and_not_a_frozen_one():
 @pytest.mark.parametrize("kind", [NoCodesMemory, CodeMemory, JointCodeMemory, LSTMMemory, GRUMemory])
 @torch.no_grad()
 def test_the_branches_look_at_the_memory(kind, predictor):
-    """With the backbone's own memory blocks out of the way: the past changes the output all the same."""
+    """The backbone has no memory blocks, yet the past changes the output."""
     model = tiny.model(kind, predictor, layers=())
     _, state = outputs(model, SPARSE[:, :20], 7)
     blank = {

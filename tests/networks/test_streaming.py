@@ -34,7 +34,7 @@ CLIP = tiny.clip(40)[None, :, :SPARSE_DIM]
 
 
 def largest_difference(model, sparse: torch.Tensor) -> float:
-    """Over a stream of (1, N, 54), each with its own history."""
+    """Return the largest difference over a stream (1, N, 54), graph and network each on its own history."""
     live = streaming(model)
     whole, carried, worst = model.initial_state(1), live.initial_state(), 0.0
     for normalizer in sparse.split(1, 1):

@@ -28,7 +28,7 @@ from memmlp.tables.measured import load
 
 
 def motion_run(folder: Path) -> Run:
-    """The run that was there at first."""
+    """Return the run that was there at first."""
     return [run for run in list_runs(folder / "outputs") if run.manifest["kind"] == "memmlp"][-1]
 
 
@@ -89,7 +89,7 @@ def test_eval_repeats_the_runs_numbers_and_saves_predictions(home):
 
 
 def test_a_mode_a_solver_or_a_precision_is_that_stages_work_alone(home):
-    """On a run that is trained: not one step more, and the run's own results stay what they were."""
+    """A trained run takes not one step more, and its own results stay what they were."""
     run = motion_run(home)
     weights, log, results = run.model.read_bytes(), run.metrics_path.read_bytes(), run.results
     stages = [path.name for path in (*run.evaluations.iterdir(), *run.deployments.iterdir())]
@@ -111,7 +111,7 @@ def test_a_mode_a_solver_or_a_precision_is_that_stages_work_alone(home):
 
 
 def seed_of(run: Run) -> list[str]:
-    """What makes the run's command line."""
+    """Return the overrides that give a command line this run's seeds."""
     return [f"seed={run.config['seed']}", f"vqvae.seed={run.config['vqvae']['seed']}"]
 
 
@@ -149,7 +149,7 @@ def test_export_again_and_bad_names(home, memmlp, monkeypatch):
 
 
 def test_a_nan_on_a_later_clip_is_not_exported(home, memmlp, monkeypatch):
-    """Which Python's max would pass over."""
+    """Python's max would pass over it."""
     monkeypatch.chdir(home)
     found = iter([1e-6, float("nan")])
     monkeypatch.setattr("memmlp.deploy.parity.parity", lambda *_: next(found))

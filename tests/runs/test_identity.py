@@ -1,4 +1,4 @@
-"""Every key of the config changed once: an identity moves exactly where a result moves, stage by stage."""
+"""Every key of the config is changed once: an identity changes exactly where a stage's result does."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ LAST_DIGITS = {
 
 
 class Outcome(NamedTuple):
-    """Identities and digests of results, of the training, each mode's evaluation and the deployment."""
+    """Identities and digests of the results of the training, each mode's evaluation and the deployment."""
 
     identities: dict[str, str]
     results: dict[str, str]
@@ -112,7 +112,7 @@ def base(home: Path) -> Outcome:
 
 
 def outcome(folder: Path, overrides: list[str]) -> Outcome:
-    """Everything made anew in an empty folder, but for the data: no run is found by an identity that lies."""
+    """Make everything but the data in an empty folder, so that no run can be found by a wrong identity."""
     experiment = replace(build_experiment(composed([*BASE, *overrides])), outputs=folder)
     data = experiment.data.prepare()
     identity = experiment.identity(data.digest)
@@ -147,7 +147,7 @@ class Silent:
 
 
 def shipped(experiment: Experiment, model: Any, clip: MotionDataset) -> list[Any]:
-    """What a deployment shows: the graph's kind and numbers, its files, how often it is timed."""
+    """Return what a deployment has: the graph's kind and numbers, its files, how often it is timed."""
     network = GRAPHS[experiment.deployment.graph](model)
     state, motions = network.initial_state(1), []
     with torch.no_grad():
@@ -163,7 +163,7 @@ def digest(value: Any) -> str:
 
 
 def test_every_key_is_changed_or_said_not_to_be():
-    """Sizes of the profile are read by the groups whose keys are changed here."""
+    """The profile's sizes are not changed here, since they act through the groups' keys, which are."""
     config = flatten(OmegaConf.to_container(composed(BASE), resolve=True))  # type: ignore[arg-type]
     own = {key for key in config if key.rsplit(".", 1)[-1] not in ("name", "_target_", "_partial_")}
     own |= {"data.name"}  # a slot's own name is fixed
@@ -212,7 +212,7 @@ def test_other_synthetic_motion_is_another_identity():
 
 
 def test_a_compiled_training_is_another():
-    """Of which no result is made here: compiling takes half a minute."""
+    """No result is made here, since compiling takes half a minute."""
 
     def identity(*overrides: str) -> str:
         return build_experiment(composed([*BASE, *overrides])).identity("data").id
@@ -221,7 +221,7 @@ def test_a_compiled_training_is_another():
 
 
 def test_a_class_that_moves_changes_no_identity_and_is_found_where_it_is_now():
-    """Of every slot: the record of a run names the class where it lay when the run was made."""
+    """For every slot, the run's record names the class where it lay when the run was made."""
 
     def moved(tree: dict[str, Any]) -> dict[str, Any]:
         found = {key: moved(value) if isinstance(value, dict) else value for key, value in tree.items()}

@@ -333,7 +333,7 @@ def test_reset_removes_the_runs_files_and_no_others(tmp_path: Path):
 
 
 def test_a_training_that_is_resumed_elsewhere_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Its weights are of both machines and of both codes."""
+    """Its weights come from both machines and both versions of the code."""
     run = Run.of(tmp_path, "0" * 16)
 
     def begin(device: str, commit: str, dirty: bool, losses: str) -> dict:
@@ -353,7 +353,7 @@ def test_a_training_that_is_resumed_elsewhere_says_so(tmp_path: Path, monkeypatc
 
 
 def test_a_reset_that_is_cut_short_leaves_no_results_of_what_is_gone(tmp_path: Path, monkeypatch):
-    """Whatever the moment: weights, checkpoint and evaluations go before what they are of."""
+    """At any moment, what is removed first is what was made from the rest."""
     run = begun(tmp_path)
     for name in Run.FILES:
         path = run.folder / name.replace("*", "0")

@@ -61,7 +61,7 @@ TASKS = {
 
 
 def test_the_weighting_of_the_data_decides_which_clips_a_step_sees():
-    """Clips of 60, 45 and 80 frames have 54, 39 and 74 windows of 7: by windows the last is drawn most."""
+    """Clips of 60, 45 and 80 frames have 54, 39 and 74 windows of 7, so by windows the last is drawn most."""
     drawn = {}
     for weighting in ("frames", "clips"):
         experiment = build_experiment(composed([f"data.weighting={weighting}"]))
@@ -78,12 +78,12 @@ def test_the_weighting_of_the_data_decides_which_clips_a_step_sees():
 
 
 class Kill(Exception):
-    """Stands for a process that ends."""
+    """Raised where a process is killed."""
 
 
 @pytest.mark.parametrize("make", [*ROLLOUTS, *tiny.BASELINES, "vqvae"])
 def test_a_resumed_run_is_the_same_run(make, tmp_path):
-    """Stopped at step 7 of 12, two steps after the last checkpoint, and gone on by a new process' objects."""
+    """It is stopped at step 7 of 12, two steps after the last checkpoint, and resumed with new objects."""
 
     def task():
         return TASKS[make]()
@@ -112,7 +112,7 @@ def test_a_resumed_run_is_the_same_run(make, tmp_path):
 
 
 def test_what_is_drawn_after_training_is_the_same_after_a_resume_at_its_end(tmp_path):
-    """Such as the blends of an evaluation with memory.blend=sampled; within a step all draws are seeded."""
+    """An evaluation with memory.blend=sampled draws then; draws within a step are seeded by the step."""
     drawn = []
     for _ in range(2):
         train(motion_task(), OPTIM, Run(tmp_path), 0, "to the end, then nothing left to do")
@@ -153,7 +153,7 @@ def test_a_loss_that_is_no_number_stops_with_step_term_and_clips(bad, tmp_path):
 
 
 def trained(**changes) -> torch.Tensor:
-    """The stem after a few steps under changed settings."""
+    """Return the stem after a few steps under changed settings."""
     import tempfile
 
     optim = replace(OPTIM, steps=4, **changes)

@@ -44,7 +44,7 @@ def test_teacher_forcing_has_the_truth_and_zero_passes_have_nothing(shift):
 
 @torch.no_grad()
 def test_own_predictions_are_what_the_network_says():
-    """Two passes at shift one frame: the state after calling the network twice on an empty history."""
+    """With two passes and a shift of one frame, the state is that after two calls on an empty history."""
     model = tiny.model(shift="frame")
     clips, end = sampler().draw(3)
     torch.manual_seed(next(s for s in range(99) if passes(s) == 2))

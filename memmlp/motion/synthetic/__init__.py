@@ -33,10 +33,13 @@ MARGIN = 4.0  # seconds; a clip is a random excerpt of a performance that is lon
 
 
 def synthesize(out: Path, *, minutes: float = 10.0, seed: int = 0, fps: float = 60.0) -> list[Path]:
-    """Write `out`/<activity>/<activity>_<nnn>.npz, clips of 8 to 20 s, `minutes` in all; the same for a seed.
+    """Write clips of 8 to 20 s, `minutes` in all, as `out`/<activity>/<activity>_<nnn>.npz.
 
-    Where that were fewer than three clips, three shorter ones.
-    Raises InputError for bad arguments.
+    Where that makes fewer than three clips, three shorter ones are written. The clips depend on the arguments
+    alone.
+
+    Raises:
+        InputError: for bad arguments.
     """
     _check(minutes, seed, fps)
     rng = np.random.default_rng(seed)
@@ -53,7 +56,11 @@ def synthesize(out: Path, *, minutes: float = 10.0, seed: int = 0, fps: float = 
 
 
 def synthesize_clip(activity: str, seed: int, *, seconds: float = 14.0, fps: float = 60.0) -> Clip:
-    """One clip, named <activity>/<seed>, of the built-in body; float32."""
+    """Make one clip of the built-in body, named <activity>/<seed>, in float32.
+
+    Raises:
+        InputError: for an unknown activity.
+    """
     if activity not in ACTIVITIES:
         raise InputError(f"activity: {activity!r}; allowed: {', '.join(ACTIVITIES)}")
     rng = np.random.default_rng([list(ACTIVITIES).index(activity), seed])
@@ -66,14 +73,14 @@ def synthesize_clip(activity: str, seed: int, *, seconds: float = 14.0, fps: flo
 
 
 def _lengths(rng: np.random.Generator, seconds: float, fps: float) -> list[int]:
-    """Lengths of the clips in frames, at least 2 each."""
+    """Draw the lengths of the clips in frames, at least 2 each."""
     share = rng.uniform(0.6, 1.4, max(MIN_CLIPS, round(seconds / CLIP_SECONDS)))
     ends = np.round(np.cumsum(share) / share.sum() * seconds * fps).astype(int)
     return [max(2, int(n)) for n in np.diff(ends, prepend=0)]
 
 
 def _check(minutes: float, seed: int, fps: float) -> None:
-    """Bad arguments are InputErrors that name the key."""
+    """Raise InputError for bad arguments, naming the argument."""
     if not (math.isfinite(minutes) and minutes > 0):
         raise InputError(f"minutes: {minutes:g}; allowed: a positive number")
     if seed < 0:

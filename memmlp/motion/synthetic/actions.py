@@ -1,4 +1,7 @@
-"""What people do on the spot: squat, sit, reach, wave, box, jump, step sideways, look around."""
+"""What people do on the spot: squat, sit, reach, wave, box, jump, step sideways, look around.
+
+Each public function draws a performance at the times t (N,), in seconds.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +26,10 @@ from memmlp.motion.synthetic.stance import (
 )
 
 ARM = 0.53  # metres, shoulder to wrist
-SQUAT_HANDS = ((-0.05, 0.0, 0.45), (-0.16, -0.12, 0.3), (0.12, -0.5, 0.1))  # ahead, before the chest, hanging
-GUARD = ((-0.03, 0.02, 0.3), (-0.05, 0.0, 0.22))  # leading hand, hand at the chin
-PUNCHES = {  # outward, up, forward as seen by the opponent; how far the body turns in
+# Where the hands are from the shoulders (outward, up, forward, metres): ahead, before the chest, hanging.
+SQUAT_HANDS = ((-0.05, 0.0, 0.45), (-0.16, -0.12, 0.3), (0.12, -0.5, 0.1))
+GUARD = ((-0.03, 0.02, 0.3), (-0.05, 0.0, 0.22))  # of the leading hand and the hand at the chin
+PUNCHES = {  # the target: outward, up, forward along the heading, metres; how far the body turns in, radians
     "straight": (np.array([-0.12, 0.06, 0.49]), 0.45),
     "hook": (np.array([-0.1, 0.05, 0.36]), 0.6),
     "uppercut": (np.array([-0.12, 0.12, 0.33]), 0.35),
@@ -34,7 +38,7 @@ PUNCHES = {  # outward, up, forward as seen by the opponent; how far the body tu
 
 
 def squatting(rng: np.random.Generator, t: Array) -> Puppet:
-    """Squats of one person's depth, the arms as a counterweight."""
+    """Squat to one person's depth, the arms as a counterweight."""
     style = Style.draw(rng)
     puppet = stand(rng, t, replace(style, width=style.width + 0.06, splay=style.splay + 0.2))
     target, depth = np.array(SQUAT_HANDS[rng.integers(3)]), rng.uniform(0.2, 0.42)
@@ -48,7 +52,7 @@ def squatting(rng: np.random.Generator, t: Array) -> Puppet:
 
 
 def sitting(rng: np.random.Generator, t: Array) -> Puppet:
-    """Sit down on a seat of one height and stand up again, hands on the thighs or talking."""
+    """Sit down on a seat of one height and stand up again, the hands on the thighs or talking."""
     style = Style.draw(rng)
     puppet = stand(rng, t, style)
     drop, back = rng.uniform(0.4, 0.5), rng.uniform(0.34, 0.42)
@@ -70,7 +74,7 @@ def sitting(rng: np.random.Generator, t: Array) -> Puppet:
 
 
 def reaching(rng: np.random.Generator, t: Array) -> Puppet:
-    """Reach with one or both hands to places high, low, ahead and aside."""
+    """Reach with one or both hands to targets high, low, ahead and aside."""
     puppet = stand(rng, t, Style.draw(rng))
     for start, end in occasions(rng, t, (1.8, 3.5), (0.1, 1.0)):
         hold = rng.uniform(0.1, 0.25) * (end - start)
@@ -86,7 +90,16 @@ def reaching(rng: np.random.Generator, t: Array) -> Puppet:
 def _reach(
     puppet: Puppet, sides: tuple[int, ...], outward: float, elevation: float, part: float, weight: Array
 ) -> None:
-    """Bring hands `outward` and up by these angles, `part` of the arm away; trunk, knees and gaze help."""
+    """Bring hands towards a target, the trunk, knees and gaze helping.
+
+    Args:
+        puppet: the person, who is changed in place.
+        sides: the hands, of 0 (left) and 1 (right).
+        outward: angle of the target away from straight ahead, radians.
+        elevation: angle of the target above the shoulder, radians.
+        part: distance of the target as a part of the arm's length.
+        weight: how far (N,) the hands have got, in [0, 1].
+    """
     turn = sum(LEFT_RIGHT[side] for side in sides)  # a lone hand's shoulder is brought along
     low, high = max(-elevation, 0.0), max(elevation, 0.0)
     bend_knees(puppet, 0.22 * low**2 * weight)
@@ -105,7 +118,7 @@ def _reach(
 
 
 def waving(rng: np.random.Generator, t: Array) -> Puppet:
-    """Wave with one hand or both, at one's own height, rate and width."""
+    """Wave with one hand or both, at the person's own height, rate and width."""
     puppet = stand(rng, t, Style.draw(rng))
     sides = ((0,), (1,), (0, 1))[rng.choice(3, p=[0.4, 0.4, 0.2])]
     raised = rng.uniform([0.1, 0.05, 0.12], [0.3, 0.4, 0.25])
@@ -123,7 +136,7 @@ def waving(rng: np.random.Generator, t: Array) -> Puppet:
 
 
 def punching(rng: np.random.Generator, t: Array) -> Puppet:
-    """Combinations of punches from a boxer's stance, with small steps and a bounce."""
+    """Punch in combinations from a boxer's stance, with small steps and a bounce."""
     style = Style.draw(rng)
     lead = int(rng.integers(2))
     bladed = -LEFT_RIGHT[lead] * rng.uniform(0.3, 0.6)
@@ -151,7 +164,11 @@ def punching(rng: np.random.Generator, t: Array) -> Puppet:
 
 
 def _blows(rng: np.random.Generator, t: Array, lead: int) -> list[tuple[int, float, float, float, str]]:
-    """Side, start, moment of reach, end (seconds) and kind of each punch: combinations, hands in turn."""
+    """Draw combinations of punches, the hands in turn.
+
+    Returns:
+        For each punch the side, the times (seconds) of start, reach and end, and the kind.
+    """
     blows = []
     for start, end in occasions(rng, t, (0.7, 2.2), (0.3, 1.5)):
         side, now = lead if rng.random() < 0.7 else 1 - lead, start
@@ -163,7 +180,7 @@ def _blows(rng: np.random.Generator, t: Array, lead: int) -> list[tuple[int, flo
 
 
 def _aimed(puppet: Puppet, side: int, target: Array) -> Array:
-    """A place (3,) seen along the heading, as seen in the turned trunk (N, 3)."""
+    """Convert a target (3,) seen along the heading to the same point as seen in the turned trunk (N, 3)."""
     yaw = LEFT_RIGHT[side] * (puppet.tilt[:, 1] + puppet.spine[:, 1])
     out, up, forward = target
     cosine, sine = np.cos(yaw), np.sin(yaw)
@@ -172,7 +189,15 @@ def _aimed(puppet: Puppet, side: int, target: Array) -> Array:
 
 @dataclass(frozen=True)
 class Leap:
-    """One jump: seconds of its start, take-off, landing and end; metres of the crouch; factor on the arms."""
+    """One jump.
+
+    Attributes:
+        start: seconds at which the crouch begins.
+        off: seconds of the take-off.
+        on: seconds of the landing.
+        depth: metres by which the pelvis is lowered in the crouch.
+        swing: factor on the arms' swing.
+    """
 
     start: float
     off: float
@@ -186,7 +211,7 @@ class Leap:
 
 
 def jumping(rng: np.random.Generator, t: Array) -> Puppet:
-    """Jumps on the spot, ahead, aside and with a turn: crouch, take-off, flight, landing."""
+    """Jump on the spot, ahead, aside and with a turn: crouch, take-off, flight, landing."""
     style = Style.draw(rng)
     work = Footwork(Stance(style.origin, style.heading, style.width + 0.02, style.splay))
     height, leaps = rng.uniform(0.1, 0.35), []
@@ -204,7 +229,7 @@ def jumping(rng: np.random.Generator, t: Array) -> Puppet:
 
 
 def _leap(puppet: Puppet, t: Array, leap: Leap) -> None:
-    """Height of the pelvis through one jump, the trunk that goes with it, and the arms that help."""
+    """Move the pelvis through one jump, the trunk with it, and the arms to help."""
     start, off, on, end, depth = leap.start, leap.off, leap.on, leap.end, leap.depth
     low, deep, speed = off - 0.28, on + 0.22, GRAVITY * (on - off) / 2
     heights, speeds = [0, -depth, -0.04, -0.08, -0.7 * depth, 0], [0, 0, speed, -speed, 0, 0]
@@ -223,7 +248,7 @@ def _leap(puppet: Puppet, t: Array, leap: Leap) -> None:
 
 
 def sidestepping(rng: np.random.Generator, t: Array) -> Puppet:
-    """Steps to the left and the right: the leading foot goes, the other follows."""
+    """Step to the left and the right: the leading foot goes, the other follows."""
     style = Style.draw(rng)
     work = Footwork(Stance(style.origin, style.heading, style.width + 0.02, style.splay))
     pace, tempo = rng.uniform(0.15, 0.38), rng.uniform(0.38, 0.55)
@@ -244,7 +269,7 @@ def sidestepping(rng: np.random.Generator, t: Array) -> Puppet:
 
 
 def idling(rng: np.random.Generator, t: Array) -> Puppet:
-    """Stand, shift the weight, look around, now and then turn on the spot."""
+    """Stand, shift the weight, look around, and now and then turn on the spot."""
     style = Style.draw(rng)
     work = Footwork(Stance(style.origin, style.heading, style.width, style.splay))
     for start, _ in occasions(rng, t, (1.6, 2.0), (2.0, 6.0)):

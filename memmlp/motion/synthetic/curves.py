@@ -1,4 +1,4 @@
-"""Smooth functions of time, on arrays of seconds (N,): the material that motions are made of."""
+"""Smooth functions of time, on arrays of seconds (N,), of which the motions are made."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ Array = np.ndarray
 
 
 def ease(t: Array, start: float, end: float) -> Array:
-    """0 before `start`, 1 after `end`, minimum jerk between: (N,)."""
+    """Return (N,): 0 before `start`, 1 after `end`, minimum jerk between."""
     s = np.clip((t - start) / (end - start), 0.0, 1.0)
     return s * s * s * (10.0 - s * (15.0 - 6.0 * s))
 
 
 def pulse(t: Array, start: float, top: float, leave: float, end: float) -> Array:
-    """0, rising from `start` to 1 at `top`, falling from `leave` to 0 at `end`: (N,)."""
+    """Return (N,): 0, rising from `start` to 1 at `top`, falling from `leave` to 0 at `end`."""
     return ease(t, start, top) - ease(t, leave, end)
 
 
 def glide(t: Array, start: float, end: float, ramp: float = 0.3) -> Array:
-    """As `ease`, but at an even speed between two ramps that take `ramp` of the time each: (N,)."""
+    """Return (N,): as `ease`, but at an even speed between two ramps that take `ramp` of the time each."""
 
     def ramped(x: Array) -> Array:  # the integral of an ease from 0 to 1
         c = np.clip(x, 0.0, 1.0)
@@ -31,7 +31,7 @@ def glide(t: Array, start: float, end: float, ramp: float = 0.3) -> Array:
 
 
 def arc(t: Array, start: float, end: float) -> Array:
-    """0 outside [start, end], 1 in the middle, velocity and acceleration 0 at both ends: (N,)."""
+    """Return (N,): 0 outside [start, end], 1 in the middle, velocity and acceleration 0 at both ends."""
     s = glide(t, start, end)
     return 4.0 * s * (1.0 - s)
 
@@ -39,7 +39,7 @@ def arc(t: Array, start: float, end: float) -> Array:
 def wander(
     rng: np.random.Generator, t: Array, shape: tuple[int, ...] = (), low: float = 0.1, high: float = 1.0
 ) -> Array:
-    """Natural variation (N, *shape), RMS 1: independent sums of six sines of `low` to `high` Hz."""
+    """Return natural variation (N, *shape) of RMS 1: independent sums of six sines of `low` to `high` Hz."""
     size = (6, *shape)
     frequency = np.exp(rng.uniform(np.log(low), np.log(high), size))
     amplitude = rng.uniform(0.5, 1.0, size) / np.sqrt(frequency)
@@ -53,16 +53,19 @@ def wander(
 
 
 def smooth(x: Array, frames: int) -> Array:
-    """Moving average (N, ...) under a bell of 2 * `frames` + 1 frames."""
+    """Return the moving average (N, ...) under a bell of 2 * `frames` + 1 frames."""
     kernel = np.hanning(2 * frames + 3)[1:-1] ** 2
     return convolve1d(x, kernel / kernel.sum(), axis=0, mode="nearest")
 
 
 def smooth_below(x: Array, frames: int) -> Array:
-    """A smooth curve (N,) that is nowhere above `x`: the minimum over the bell, then the bell's average."""
+    """Return a smooth curve (N,) that is nowhere above `x`: the running minimum's average under the bell."""
     return smooth(minimum_filter1d(x, 2 * frames + 1, mode="nearest"), frames)
 
 
 def soft_minimum(a: Array, b: Array, width: float) -> Array:
-    """Smooth and below both: within `width` / 2 of the minimum, less where they differ more."""
+    """Return a smooth curve below both `a` and `b`.
+
+    It is within `width` / 2 of their minimum, and nearer where they differ more.
+    """
     return 0.5 * (a + b - np.sqrt((a - b) ** 2 + width**2))

@@ -1,4 +1,4 @@
-"""Walking and running: a path, a phase, the places of the feet, and a body that moves with the phase."""
+"""Walking and running: a path, a phase, the positions of the feet, and a body that moves with the phase."""
 
 from __future__ import annotations
 
@@ -16,21 +16,24 @@ GRAVITY = 9.81
 
 @dataclass(frozen=True)
 class Gait:
-    """How one goes; metres, seconds, radians. A cycle is two steps.
+    """A way of going; metres, seconds, radians. A cycle is two steps.
 
     Attributes:
-        speed: range.
-        cadence: cycles per second: this much, and this much more per metre per second.
-        duty: part of the cycle that a foot is on the floor.
+        speed: range of the full speed, m/s.
+        cadence: cycles per second at no speed, and how many more for each m/s.
+        duty: part of the cycle during which a foot is on the floor.
         ahead: part of the contact that passes before the pelvis is over the foot.
         turn: largest turn of the path at one time.
-        width: factor on the feet's distance.
-        sink: how much lower than standing the pelvis is.
+        width: factor on the distance of the feet.
+        sink: how much lower than in standing the pelvis is.
         bounce: amplitude of the pelvis' height.
-        lift, heel, toe: see Step.
-        push: see Step, in cycles.
-        lean: of the spine, forward.
-        yaw, swing: amplitude of the pelvis' turn and of the hands' swing at full speed.
+        lift: see FootStep.
+        heel: see FootStep.
+        toe: see FootStep.
+        push: see FootStep, here in cycles.
+        lean: forward lean of the spine.
+        yaw: amplitude of the pelvis' turn at full speed.
+        swing: amplitude of the hands' swing at full speed.
         elbow: how far the bent arms bring the hands up and forward.
         settle: see Puppet.
     """
@@ -68,9 +71,14 @@ RUN = Gait(
 
 @dataclass(frozen=True)
 class Course:
-    """The way over N frames: path (N, 2), metres; heading (N,); pace (N,), m/s; phase (N,), cycles.
+    """The way that is gone over N frames.
 
-    `go` (N,) is 0 while standing and 1 while going.
+    Attributes:
+        path: positions (N, 2), metres, world.
+        heading: directions (N,), radians, world.
+        pace: speeds (N,), m/s.
+        phase: phases (N,), cycles.
+        go: 0 while standing and 1 while going (N,).
     """
 
     path: Array
@@ -96,6 +104,7 @@ def running(rng: np.random.Generator, t: Array) -> Puppet:
 
 
 def _locomotion(rng: np.random.Generator, t: Array, gait: Gait) -> Puppet:
+    """Go as the gait says, in one person's style."""
     style = Style.draw(rng)
     course = _course(rng, t, gait, style)
     puppet = stand(rng, t, style)
@@ -109,7 +118,7 @@ def _locomotion(rng: np.random.Generator, t: Array, gait: Gait) -> Puppet:
 
 
 def _course(rng: np.random.Generator, t: Array, gait: Gait, style: Style) -> Course:
-    """Stand, go for most of the time with turns, stand."""
+    """Draw a course: stand, go for most of the time with turns, stand."""
     fps = 1.0 / (t[1] - t[0])
     start, stop = t[0] + rng.uniform(0.3, 1.2), t[-1] - rng.uniform(1.2, 2.0)
     top = rng.uniform(*gait.speed)
@@ -126,7 +135,7 @@ def _course(rng: np.random.Generator, t: Array, gait: Gait, style: Style) -> Cou
 
 
 def _feet(t: Array, gait: Gait, style: Style, course: Course) -> Feet:
-    """The left foot comes down at every whole phase, the right one half a cycle later."""
+    """Make the steps: the left foot comes down at every whole phase, the right one half a cycle later."""
     start = Stance(style.origin, float(course.heading[0]), style.width, style.splay)
     steps = []
     for side in (0, 1):
@@ -137,7 +146,7 @@ def _feet(t: Array, gait: Gait, style: Style, course: Course) -> Feet:
 
 
 def _step(t: Array, gait: Gait, style: Style, course: Course, side: int, strike: float) -> FootStep:
-    """The step that ends at phase `strike`; small and flat where the pace is low."""
+    """Make the step that ends at phase `strike`; it is small and flat where the pace is low."""
     off, on, over = np.interp(
         [strike - 1 + gait.duty, strike, strike + gait.ahead * gait.duty], course.phase, t
     )
@@ -155,7 +164,7 @@ def _step(t: Array, gait: Gait, style: Style, course: Course, side: int, strike:
 
 
 def _carry_along(puppet: Puppet, gait: Gait, style: Style, course: Course) -> None:
-    """Pelvis over the carrying foot, up and down twice a cycle, turned with the legs, leaning into turns."""
+    """Move the pelvis: over the carrying foot, up and down twice a cycle, and leaning into turns."""
     cycle = 2 * np.pi * course.phase
     left = direction(course.heading + np.pi / 2)
     inward = 0.6 * course.pace * np.gradient(course.heading) * puppet.fps / GRAVITY
@@ -171,7 +180,7 @@ def _carry_along(puppet: Puppet, gait: Gait, style: Style, course: Course) -> No
 
 
 def _swing_along(puppet: Puppet, gait: Gait, style: Style, course: Course) -> None:
-    """Shoulders turn against the pelvis, hands swing against the legs, the gaze goes ahead into the turn."""
+    """Turn the shoulders against the pelvis, swing the hands against the legs, look ahead into the turn."""
     cycle = 2 * np.pi * course.phase
     effort = course.go * course.pace / gait.speed[1]
     puppet.spine[:, 0] += gait.lean * effort + 0.012 * effort * np.cos(2 * cycle)

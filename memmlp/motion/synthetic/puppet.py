@@ -1,7 +1,7 @@
-"""A person driven by feet, pelvis, trunk, gaze and hands; two-bone inverse kinematics finds the joints.
+"""A person driven by feet, pelvis, trunk, gaze and hands, whose joints follow by inverse kinematics.
 
-Directions of the body are SMPL's: x left, y up, z forward. Angles about them are (pitch, yaw, roll):
-positive leans forward, turns left, leans to the right.
+Directions of the body are SMPL's: x left, y up, z forward. Angles about them are (pitch, yaw, roll): positive
+leans forward, turns left, leans to the right.
 """
 
 from __future__ import annotations
@@ -34,14 +34,15 @@ class Puppet:
     Attributes:
         fps: frames per second.
         heading: direction (N,) the body faces: 0 is world +X, pi/2 is +Y.
-        pelvis: position (N, 3) of the root, world; lowered where a standing leg would not reach.
+        pelvis: position (N, 3) of the root, world; it is lowered where a standing leg would not reach the
+            foot.
         settle: seconds over which it is lowered.
         tilt: rotation vector (N, 3) of the pelvis against the heading.
         spine: rotation vector (N, 3) of the chest against the pelvis.
         gaze: (pitch, yaw) (N, 2) of the head against the heading.
         feet: the feet.
         hands: wrists (N, 2, 3) from the shoulders at rest: outward, up, forward in the turned, upright trunk.
-        wrists: rotation vectors (N, 2, 3) of the left wrist, and of the right as its mirror image.
+        wrists: rotation vectors (N, 2, 3) of the left wrist, and of the right one as its mirror image.
     """
 
     fps: float
@@ -57,7 +58,7 @@ class Puppet:
 
 
 def solve(puppet: Puppet) -> tuple[Array, Array]:
-    """Axis-angle poses (N, 22, 3), radians, and root positions (N, 3), metres, world."""
+    """Return axis-angle poses (N, 22, 3), radians, and root positions (N, 3), metres, world."""
     pelvis = facing(puppet.heading) * Rotation.from_rotvec(puppet.tilt)
     root = _root(puppet, pelvis)
     local = {"pelvis": pelvis}
@@ -74,7 +75,7 @@ def solve(puppet: Puppet) -> tuple[Array, Array]:
 
 
 def facing(yaw: Array) -> Rotation:
-    """From the body's axes to the world for a person upright who faces `yaw` (N,)."""
+    """Return the rotation from the body's axes to the world for an upright person who faces `yaw` (N,)."""
     upright = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0])
     return Rotation.from_rotvec(np.outer(yaw + np.pi / 2, [0.0, 0.0, 1.0])) * upright
 
@@ -88,14 +89,17 @@ def two_bone(
     rest_pole: Array,
     free: Array | float,
 ) -> tuple[Rotation, Rotation]:
-    """Global rotations (N) of two bones that go from `start` to `target`.
+    """Return the global rotations (N) of two bones that go from `start` to `target`.
 
     Args:
-        start, target: positions (N, 3); a target out of reach is approached as far as the bones go.
+        start: positions (N, 3).
+        target: positions (N, 3); one out of reach is approached as far as the bones go.
         pole: directions (N, 3) to which the joint between the bones points.
-        upper, lower: bones (3,) in the rest pose.
+        upper: first bone (3,) in the rest pose.
+        lower: second bone (3,) in the rest pose.
         rest_pole: direction (3,) to which that joint points in the rest pose.
-        free: in [0, 1] (N,): how early a limb that is to be stretched slows down; 0 reaches exactly.
+        free: in [0, 1] (N,): how early a limb that is being stretched slows down; with 0 it reaches exactly,
+            up to nearly its full length.
     """
     a, b = float(np.linalg.norm(upper)), float(np.linalg.norm(lower))
     span = np.linalg.norm(target - start, axis=-1, keepdims=True)
@@ -112,7 +116,7 @@ def two_bone(
 
 
 def ankles(feet: Feet, side: int) -> tuple[Array, Rotation]:
-    """Position (N, 3), world, of an ankle and the foot's global rotation (N)."""
+    """Return an ankle's position (N, 3), world, and the foot's global rotation (N)."""
     name = SIDES[side][0]
     ball = _bone(f"{name}_ankle", f"{name}_foot")
     heel_up, toe_up = _pitch(feet.heel[:, side]), _pitch(-feet.toe[:, side])
@@ -122,7 +126,7 @@ def ankles(feet: Feet, side: int) -> tuple[Array, Rotation]:
 
 
 def _root(puppet: Puppet, pelvis: Rotation) -> Array:
-    """The root (N, 3), lowered where a leg would else be stretched out that carries or is about to."""
+    """Return the root (N, 3), lowered where a leg that carries, or is about to, would be stretched out."""
     wanted = puppet.pelvis[:, 2]
     ceiling = wanted + 0.3
     frames = round(puppet.settle * puppet.fps)
@@ -140,7 +144,7 @@ def _root(puppet: Puppet, pelvis: Rotation) -> Array:
 
 
 def _leg(puppet: Puppet, side: int, pelvis: Rotation, root: Array) -> dict[str, Rotation]:
-    """Local rotations of hip, knee, ankle and foot; the knee points where pelvis and foot point."""
+    """Return local rotations of hip, knee, ankle and foot; the knee points where pelvis and foot point."""
     name, sign = SIDES[side]
     ankle, foot = ankles(puppet.feet, side)
     frames = round(puppet.settle * puppet.fps) // 2
@@ -163,7 +167,7 @@ def _leg(puppet: Puppet, side: int, pelvis: Rotation, root: Array) -> dict[str, 
 
 
 def _spine(puppet: Puppet, pelvis: Rotation) -> tuple[Rotation, dict[str, Rotation]]:
-    """The chest's global rotation, and the local ones that share the bend."""
+    """Return the chest's global rotation, and the local rotations that share the spine's bend."""
     local = {name: Rotation.from_rotvec(share * puppet.spine) for name, share in SPINE_SHARES.items()}
     chest = pelvis
     for rotation in local.values():
@@ -172,14 +176,14 @@ def _spine(puppet: Puppet, pelvis: Rotation) -> tuple[Rotation, dict[str, Rotati
 
 
 def _head(puppet: Puppet, chest: Rotation) -> dict[str, Rotation]:
-    """Neck and head share the turn from the chest to the gaze."""
+    """Return the rotations of neck and head, which share the turn from the chest to the gaze."""
     gaze = facing(puppet.heading + puppet.gaze[:, 1]) * _pitch(puppet.gaze[:, 0])
     half = Rotation.from_rotvec(0.5 * (chest.inv() * gaze).as_rotvec())
     return {"neck": half, "head": half}
 
 
 def _arm(puppet: Puppet, side: int, chest: Rotation) -> dict[str, Rotation]:
-    """Local rotations of collar, shoulder, elbow and wrist; the collar goes some way with the hand."""
+    """Return local rotations of collar, shoulder, elbow and wrist; the collar goes some way with the hand."""
     name, sign = SIDES[side]
     shoulder = _bone("spine3", f"{name}_collar"), _bone(f"{name}_collar", f"{name}_shoulder")
     bones = _bone(f"{name}_shoulder", f"{name}_elbow"), _bone(f"{name}_elbow", f"{name}_wrist")
@@ -201,30 +205,33 @@ def _arm(puppet: Puppet, side: int, chest: Rotation) -> dict[str, Rotation]:
 
 
 def _elbow(hand: Array) -> Array:
-    """Where the elbow points (N, 3): back while the hand (N, 3) hangs, down when it is ahead."""
+    """Return where the elbow points (N, 3): back while the hand (N, 3) hangs, down when it is ahead."""
     ahead = 0.5 + 0.5 * np.tanh(2.0 * (hand[:, 2] - 0.35))
     return np.stack([np.full_like(ahead, 0.35), -0.9 * ahead, -0.9 * (1.0 - ahead)], -1)
 
 
 def _near(flags: Array, frames: int) -> Array:
-    """Whether (N,) a flag is set within `frames` frames."""
+    """Return whether (N,) a flag is set within `frames` frames."""
     return maximum_filter1d(flags, 2 * frames + 1, mode="nearest")
 
 
 def _within(span: Array, full: float, free: Array | float) -> Array:
-    """The distance (N, 1) itself up to STRETCH of the full length, then smoothly to 99.9 % of it at most."""
+    """Return the distance (N, 1) itself up to about STRETCH of the full length, then at most 99.9 % of it.
+
+    The transition is smooth, and begins earlier the larger `free` is.
+    """
     start = (STRETCH - 0.05 * np.reshape(free, (-1, 1))) * full
     room = 0.999 * full - start
     return np.where(span < start, span, start + room * np.tanh((span - start) / room))
 
 
 def _carry(rest: Array, rest_hinge: Array, bone: Array, hinge: Array) -> Rotation:
-    """The rotation (N) that takes a bone (3,) and its hinge to those given (N, 3)."""
+    """Return the rotation (N) that takes a bone (3,) and its hinge to those given (N, 3)."""
     return Rotation.from_matrix(_frame(bone, hinge) @ _frame(rest, rest_hinge).T)
 
 
 def _frame(bone: Array, hinge: Array) -> Array:
-    """Orthonormal axes (..., 3, 3) in columns: bone, hinge, and the third."""
+    """Return orthonormal axes (..., 3, 3) in columns: the bone, the hinge, and their cross product."""
     first, second = _unit(bone), _unit(hinge)
     return np.stack([first, second, np.cross(first, second)], -1)
 
@@ -234,15 +241,15 @@ def _unit(v: Array) -> Array:
 
 
 def _pitch(angle: Array) -> Rotation:
-    """Rotation (N) about the body's x: positive goes forward and down."""
+    """Return the rotation (N) about the body's x axis; positive goes forward and down."""
     return Rotation.from_rotvec(np.outer(angle, [1.0, 0.0, 0.0]))
 
 
 def _bone(parent: str, child: str) -> Array:
-    """Offset (3,) in the rest pose, metres."""
+    """Return a bone (3,), child minus parent, in the rest pose, metres."""
     return REST[INDEX[child]] - REST[INDEX[parent]]
 
 
 def _length(*chain: str) -> float:
-    """Metres along a chain of joints."""
+    """Return the length along a chain of joints, metres."""
     return float(sum(np.linalg.norm(_bone(a, b)) for a, b in pairwise(chain)))

@@ -13,7 +13,7 @@ from memmlp.motion.synthetic.puppet import Puppet
 from memmlp.motion.synthetic.steps import Feet, FootStep, tread
 
 STANDING = 0.992  # metres, the root's height with nearly straight legs
-FOLLOW = 0.3  # seconds in which the pelvis follows the feet
+FOLLOW = 0.3  # seconds within which the pelvis follows the feet
 LEFT_RIGHT = np.array([1.0, -1.0])
 
 
@@ -22,13 +22,14 @@ class Style:
     """What makes one person's clip differ from another's; metres, radians.
 
     Attributes:
-        origin, heading: where (2,) and in which direction the clip starts, world.
+        origin: where (2,) the clip starts, world.
+        heading: in which direction the person faces at the start, world.
         width: half the distance of the feet.
         splay: how far each foot points outward.
         lean: forward lean of the spine.
         look: pitch of the gaze, positive down.
         swing: factor on the arms' swing.
-        hands: the wrists' places (2, 3) when the arms hang, from the shoulders: outward, up, forward.
+        hands: positions (2, 3) of the wrists when the arms hang, from the shoulders: outward, up, forward.
         uneven: factor (2,) on the amplitude of left and right.
     """
 
@@ -44,7 +45,7 @@ class Style:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Style:
-        """A person."""
+        """Draw a person's style."""
         out, bent = rng.uniform(0.05, 0.14), rng.uniform(0.0, 0.05)
         hands = np.array([[out, -0.515 + bent, 0.03 + bent]] * 2) + rng.normal(0, 0.012, (2, 3))
         return cls(
@@ -61,7 +62,7 @@ class Style:
 
 
 def direction(yaw: float | Array) -> Array:
-    """Unit vectors (..., 2) on the floor."""
+    """Return unit vectors (..., 2) on the floor."""
     return np.stack([np.cos(yaw), np.sin(yaw)], -1)
 
 
@@ -77,7 +78,7 @@ class Stance:
 
     @property
     def places(self) -> Array:
-        """(2, 2) below the ankles, world."""
+        """Positions (2, 2) below the ankles, world."""
         along, left = direction(self.heading), direction(self.heading + np.pi / 2)
         return self.center + LEFT_RIGHT[:, None] * (self.width * left + self.stagger * along)
 
@@ -89,7 +90,7 @@ class Stance:
 
 @dataclass
 class Footwork:
-    """Changes of stance one after the other, collected as steps."""
+    """Changes of stance, one after the other, collected as steps."""
 
     start: Stance
     steps: list[FootStep] = field(default_factory=list)
@@ -107,9 +108,16 @@ class Footwork:
         first: int = 0,
         **how: Any,
     ) -> None:
-        """Foot `first` goes at `off`, the other `delay` seconds later, each for `duration` seconds.
+        """Move both feet to a new stance, one after the other.
 
-        `how` says the rest of the Step. The centre moves by `shift` (2,), world, and the heading by `turn`.
+        Args:
+            off: seconds at which the first foot leaves the floor.
+            duration: seconds that each foot is in the air.
+            delay: seconds by which the second foot leaves later.
+            shift: how far (2,) the stance's centre moves, metres, world.
+            turn: how far its heading turns, radians.
+            first: the foot that goes first, 0 left, 1 right.
+            how: the other attributes of FootStep.
         """
         s = self.stance = replace(
             self.stance, center=self.stance.center + shift, heading=self.stance.heading + turn
@@ -118,12 +126,12 @@ class Footwork:
             self.steps.append(FootStep(foot, start, start + duration, s.places[foot], s.yaws[foot], **how))
 
     def feet(self, t: Array) -> Feet:
-        """The feet at the times (N,)."""
+        """Return the feet at the times (N,)."""
         return tread(t, self.start.places, self.start.yaws, self.steps)
 
 
 def stand(rng: np.random.Generator, t: Array, style: Style, work: Footwork | None = None) -> Puppet:
-    """Stand with hanging arms, sway a little, follow the feet; the pelvis goes over the foot that carries."""
+    """Stand with hanging arms, sway a little, follow the feet; the pelvis goes over the carrying foot."""
     fps = 1.0 / (t[1] - t[0])
     work = work or Footwork(Stance(style.origin, style.heading, style.width, style.splay))
     feet = work.feet(t)
@@ -154,7 +162,14 @@ def stand(rng: np.random.Generator, t: Array, style: Style, work: Footwork | Non
 def occasions(
     rng: np.random.Generator, t: Array, length: tuple[float, float], pause: tuple[float, float]
 ) -> Iterator[tuple[float, float]]:
-    """Start and end, seconds, of things that happen one after the other with pauses between."""
+    """Yield start and end, in seconds, of events that follow one another with pauses between.
+
+    Args:
+        rng: random generator.
+        t: times (N,), seconds.
+        length: range of an event's length, seconds.
+        pause: range of a pause's length, seconds.
+    """
     start = t[0] + rng.uniform(0.0, max(pause))
     while (end := start + rng.uniform(*length)) < t[-1]:
         yield start, end

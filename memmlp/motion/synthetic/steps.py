@@ -1,4 +1,4 @@
-"""Feet: where they stand, and how they go from one place to the next."""
+"""Feet: where they stand, and how they step from one position to the next."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from memmlp.motion.synthetic.curves import Array, arc, glide, pulse
 
 @dataclass(frozen=True)
 class FootStep:
-    """One step of one foot: seconds, metres, radians.
+    """One step of one foot; seconds, metres, radians.
 
     Attributes:
         foot: 0 left, 1 right.
-        off, on: when the toes leave the floor and the heel comes back to it.
-        to: place (2,) on the floor below the ankle.
+        off: when the toes leave the floor.
+        on: when the heel comes back to it.
+        to: position (2,) on the floor below the ankle, world.
         yaw: direction of the foot there, world.
         lift: how high it is carried on the way.
         heel: angle by which the heel is up when the toes leave.
         toe: angle by which the toes are up when the heel arrives.
-        push, roll: how long before `off` the heel rises, how long after `on` the toes come down.
+        push: how long before `off` the heel rises.
+        roll: how long after `on` the toes come down.
     """
 
     foot: int
@@ -42,10 +44,11 @@ class Feet:
     """Both feet over N frames, left and right.
 
     Attributes:
-        ground: place (N, 2, 3) of the flat foot, below the ankle, metres, world; z is 0 on the floor.
+        ground: position (N, 2, 3) of the flat foot, below the ankle, metres, world; z is 0 on the floor.
         yaw: direction (N, 2), radians, world.
-        heel, toe: angles (N, 2), radians, at least 0: the foot turned about its ball, about its heel.
-        planted: bool (N, 2), ball or heel on the floor.
+        heel: angle (N, 2), radians, at least 0, by which the foot is turned about its ball.
+        toe: angle (N, 2), radians, at least 0, by which it is turned about its heel.
+        planted: whether (N, 2) ball or heel are on the floor.
     """
 
     ground: Array
@@ -56,7 +59,14 @@ class Feet:
 
 
 def tread(t: Array, places: Array, yaws: Array, steps: Iterable[FootStep]) -> Feet:
-    """Feet that start at `places` (2, 2) with directions `yaws` (2,) and make the steps, in order of time."""
+    """Return feet that make steps in order of time.
+
+    Args:
+        t: times (N,), seconds.
+        places: where (2, 2) the feet start, metres, world.
+        yaws: their directions (2,) there, radians, world.
+        steps: the steps, in order of time.
+    """
     n = len(t)
     ground = np.zeros((n, 2, 3))
     ground[:, :, :2] = places

@@ -1,1 +1,1 @@
-"""The networks that the paper compares with, as models of their own: AGRoL and AvatarPoser."""
+"""The networks that the paper compares Mem-MLP with: AGRoL and AvatarPoser."""

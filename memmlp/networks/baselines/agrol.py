@@ -1,7 +1,8 @@
 """AGRoL (Du et al., CVPR 2023): the MLP, and the diffusion model whose denoiser is that MLP.
 
-Both take a window of inputs and make the rotations of all its frames; live, the last frame is kept. Their
-papers' sizes are T = 196, d = 512 and 12 blocks, each the pre-norm pair of `memmlp.networks.layers.MLPBlock`.
+Both take a window of inputs and predict the rotations of all its frames; a live stream keeps the last frame.
+Their papers' sizes are T = 196, d = 512 and 12 blocks, each the pre-norm pair of
+`memmlp.networks.layers.MLPBlock`.
 """
 
 from __future__ import annotations
@@ -21,14 +22,17 @@ from memmlp.networks.window_model import WindowModel
 
 
 class AGRoL(WindowModel):
-    """A network that makes the rotations of a whole window from its inputs (`rotations`)."""
+    """The base of AGRoL's two networks, which map a whole window of inputs to its rotations (`rotations`)."""
 
     def rotations(self, encoded: Tensor) -> Tensor:
-        """Inputs (B, T, 54) -> rotations (B, T, 132), both in network space."""
+        """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
         raise NotImplementedError
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """See WindowModel; all T frames by default. The work is that of the whole window, as published."""
+        """Take in the newest frames; see WindowModel.
+
+        By default all T frames are returned. The work is always that of the whole window, as published.
+        """
         inputs, kept = self.taken_in(sparse, state)
         window = inputs[:, -self.frames :]
         rotation = self.rotations(self.normalizer.encode_sparse(window, self.normalizer.origin(window)))
@@ -37,11 +41,15 @@ class AGRoL(WindowModel):
 
 
 class AGRoLMLP(AGRoL):
-    """Stem, MLP blocks, head: 3,735,668 parameters at the paper's sizes, 3.74 M in Table 16.
+    """AGRoL's MLP: stem, MLP blocks, head.
+
+    It has 3,735,668 parameters at the paper's sizes (3.74 M in Table 16).
 
     Args:
-        normalizer: world <-> network space.
-        frames: T. width: d. depth: blocks.
+        normalizer: converts between the world and network space.
+        frames: T, the window's length.
+        width: d, the width of the hidden state.
+        depth: number of blocks.
     """
 
     def __init__(self, normalizer: Normalizer, *, frames: int, width: int, depth: int):
@@ -51,7 +59,7 @@ class AGRoLMLP(AGRoL):
         self.head = nn.Linear(width, ROTATION.stop)
 
     def rotations(self, encoded: Tensor) -> Tensor:
-        """Inputs (B, T, 54) -> rotations (B, T, 132), both in network space."""
+        """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
         h = self.stem(encoded)
         for block in self.blocks:
             h = block(h)
@@ -66,13 +74,22 @@ class TimedBlock(MLPBlock):
         self.time = nn.Linear(width, width)
 
     def forward(self, h: Tensor, past: object = None) -> Tensor:
-        """Hidden state (B, T, d) and embedding (B, d) in the place of the past -> (B, T, d)."""
+        """Map the hidden state (B, T, d) to (B, T, d).
+
+        Args:
+            h: hidden state (B, T, d).
+            past: the embedding (B, d) of the diffusion time; it is passed where other blocks get the past.
+        """
         assert isinstance(past, Tensor)
         return super().forward(h + self.time(F.silu(past))[:, None])
 
 
 class TimeEmbedding(nn.Module):
-    """Sines and cosines of the diffusion time, then Linear, SiLU, Linear (Ho et al. 2020)."""
+    """Sines and cosines of the diffusion time, then Linear, SiLU, Linear (Ho et al. 2020).
+
+    Args:
+        width: d, the width of the embedding.
+    """
 
     PERIOD = 10_000
 
@@ -85,27 +102,32 @@ class TimeEmbedding(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(2 * len(rates), width), nn.SiLU(), nn.Linear(width, width))
 
     def forward(self, time: Tensor) -> Tensor:
-        """Times (B,) -> (B, d)."""
+        """Map times (B,) to embeddings (B, d)."""
         angles = time[:, None] * self.rates
         return self.mlp(torch.cat([angles.cos(), angles.sin()], -1))
 
 
 class AGRoLDiffusion(AGRoL):
-    """A denoiser of rotations conditioned on the window's inputs; it predicts the clean ones.
+    """A denoiser of rotations, conditioned on the window's inputs, that predicts the clean rotations.
 
-    7,480,436 parameters at the paper's sizes, 7.48 M in Table 16: the MLP's blocks and head (3,707,508), a
-    linear of each block for the time's embedding (12 x 262,656), the embedding's own two (525,312), and a
-    stem for noisy motion and inputs side by side (95,744). The paper says that the embedding enters every
-    block; that it does so by these layers, added to the block's input, is what its count leaves (reading).
+    It has 7,480,436 parameters at the paper's sizes (7.48 M in Table 16): the MLP's blocks and head
+    (3,707,508), a linear layer of each block for the time's embedding (12 x 262,656), the embedding's own two
+    linear layers (525,312), and a stem for noisy motion and inputs side by side (95,744). The paper says that
+    the embedding enters every block; that it does so by these layers, added to the block's input, is our
+    reading of its parameter count.
 
-    A window's noise is always the same, drawn from `noise_seed`: sampling is a function of the inputs, in
-    torch as in ONNX, and consecutive windows of a stream do not differ by their noise.
+    The noise that sampling starts from is always the same, drawn from `noise_seed`: sampling is then a
+    function of the inputs alone, in torch as in ONNX, and consecutive windows of a stream do not differ by
+    their noise.
 
     Args:
-        normalizer: world <-> network space.
-        frames: T. width: d. depth: blocks.
-        diffusion_steps: of the training's noise schedule. sampling_steps: denoiser calls at inference.
-        noise_seed: of the noise that sampling starts from.
+        normalizer: converts between the world and network space.
+        frames: T, the window's length.
+        width: d, the width of the hidden state.
+        depth: number of blocks.
+        diffusion_steps: number of steps of the training's noise schedule.
+        sampling_steps: number of denoiser calls at inference.
+        noise_seed: seed of the noise that sampling starts from.
     """
 
     noise: Tensor
@@ -131,7 +153,13 @@ class AGRoLDiffusion(AGRoL):
         self.register_buffer("noise", torch.randn(frames, ROTATION.stop, generator=draw))
 
     def denoise(self, noisy: Tensor, time: Tensor, encoded: Tensor) -> Tensor:
-        """Noisy rotations (B, T, 132) at times (B,), inputs (B, T, 54) -> clean rotations (B, T, 132)."""
+        """Predict the clean rotations (B, T, 132).
+
+        Args:
+            noisy: noisy rotations (B, T, 132).
+            time: diffusion times (B,).
+            encoded: inputs (B, T, 54) in network space.
+        """
         embedding = self.time(time)
         h = self.stem(torch.cat([noisy, encoded], -1))
         for block in self.blocks:
@@ -139,12 +167,20 @@ class AGRoLDiffusion(AGRoL):
         return self.head(h)
 
     def rotations(self, encoded: Tensor) -> Tensor:
-        """Sampled rotations (B, T, 132) for inputs (B, T, 54), both in network space."""
+        """Sample rotations (B, T, 132) for inputs (B, T, 54), both in network space."""
         noise = self.noise.expand(len(encoded), -1, -1)
         return self.diffusion.sample(lambda noisy, time: self.denoise(noisy, time, encoded), noise)
 
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
-        """One denoiser call on the truth (B, T, 252) with noise of a time drawn for each window."""
+        """Make a training call: add noise to the truth (B, T, 252), and denoise it in one call.
+
+        Each window gets noise of a time that is drawn for it.
+
+        Args:
+            sparse: world inputs (B, n, 54) of the newest frames.
+            state: what the last call returned, or `initial_state`.
+            truth: world frames [X | Theta] (B, T, 252) of the window.
+        """
         _, kept = self.taken_in(sparse, state)
         window, frames = truth[..., :SPARSE_DIM], self.normalizer.encode(truth)
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]

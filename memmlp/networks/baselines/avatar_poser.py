@@ -1,6 +1,6 @@
-"""AvatarPoser (Jiang et al., ECCV 2022): a transformer encoder, the newest frame's feature read.
+"""AvatarPoser (Jiang et al., ECCV 2022): a transformer encoder whose feature of the newest frame is read.
 
-Its final step, inverse kinematics of the arms, is no part of the network and none of this one.
+Its final step, inverse kinematics of the arms, is not part of the network and is left out here.
 """
 
 from __future__ import annotations
@@ -18,7 +18,12 @@ ROOT = 6  # components of the root's orientation, the first of the rotations
 
 
 class Attention(nn.Module):
-    """Multi-head self-attention over the frames of a window (Vaswani et al. 2017, Sec. 3.2)."""
+    """Multi-head self-attention over the frames of a window (Vaswani et al. 2017, Sec. 3.2).
+
+    Args:
+        width: d, the width of the features.
+        heads: number of heads; it divides d.
+    """
 
     def __init__(self, width: int, heads: int):
         super().__init__()
@@ -27,11 +32,15 @@ class Attention(nn.Module):
         self.out = nn.Linear(width, width)
 
     def forward(self, h: Tensor) -> Tensor:
-        """(B, T, d) -> (B, T, d)."""
+        """Map features (B, T, d) to (B, T, d)."""
         return self.attend(self.query(h), self.key(h), self.value(h))
 
     def attend(self, *parts: Tensor) -> Tensor:
-        """Queries (B, n, d), keys and values (B, T, d) -> (B, n, d)."""
+        """Attend with queries (B, n, d) to keys (B, T, d) and values (B, T, d), given in this order.
+
+        Returns:
+            (B, n, d).
+        """
         query, key, value = (part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in parts)
         scores = query @ key.transpose(-1, -2) * query.shape[-1] ** -0.5
         return self.out((scores.softmax(-1) @ value).transpose(1, 2).flatten(-2))
@@ -41,7 +50,10 @@ class EncoderLayer(nn.Module):
     """Attention, then a feed-forward of two layers, each added to its input and normalised (post-norm).
 
     Args:
-        feedforward: its hidden width. dropout: of both parts' outputs and of the hidden layer.
+        width: d, the width of the features.
+        heads: number of attention heads.
+        feedforward: width of the feed-forward's hidden layer.
+        dropout: dropout rate of both parts' outputs and of the hidden layer.
     """
 
     def __init__(self, width: int, heads: int, feedforward: int, dropout: float):
@@ -53,35 +65,39 @@ class EncoderLayer(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, h: Tensor) -> Tensor:
-        """(B, T, d) -> (B, T, d)."""
+        """Map features (B, T, d) to (B, T, d)."""
         return self.finish(h, self.attention(h))
 
     def finish(self, h: Tensor, attended: Tensor) -> Tensor:
-        """What follows the attention, frame by frame."""
+        """Apply what follows the attention, frame by frame, to its inputs and outputs (..., d)."""
         h = self.attention_norm(h + self.dropout(attended))
         wide = self.dropout(F.relu(self.widen(h)))
         return self.norm(h + self.dropout(self.narrow(wide)))
 
 
 def head(width: int, size: int) -> nn.Module:
-    """Two layers to `size` outputs."""
+    """Make two linear layers with a ReLU between them, from `width` to `size`."""
     return nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, size))
 
 
 class AvatarPoser(WindowModel):
-    """Embedding, encoder, and two heads on the newest frame: the root's orientation, the local rotations.
+    """An embedding, an encoder, and two heads on the newest frame, for the root's orientation and the rest.
 
-    4,124,804 parameters at the paper's sizes (T = 40, d = 256, 8 heads, 3 layers, feed-forward 2048), 4.12 M
-    in Table 16. Post-norm, ReLU, dropout 0.1 and no code of a frame's place in the window are readings: the
-    paper names none of them, and its count leaves no room for learned places.
+    It has 4,124,804 parameters at the paper's sizes (T = 40, d = 256, 8 heads, 3 layers, feed-forward 2048),
+    4.12 M in Table 16. Post-norm, ReLU, dropout 0.1 and the lack of a positional encoding are our readings:
+    the paper names none of them, and its parameter count leaves no room for learned positions.
 
-    Every frame is made from its own window, so both evaluation modes give the same numbers but for the
-    shifted tail window, before which the buffer does not hold the frames of its overlap.
+    Every frame is predicted from its own window, so both evaluation modes give the same numbers, except for
+    the shifted tail window: there the buffer does not hold the frames of its overlap.
 
     Args:
-        normalizer: world <-> network space.
-        frames: T. width: d. depth: layers. heads: of attention; they divide d.
-        feedforward: hidden width of the feed-forward layers. dropout: in the encoder, while training.
+        normalizer: converts between the world and network space.
+        frames: T, the window's length.
+        width: d, the width of the features.
+        depth: number of encoder layers.
+        heads: number of attention heads; it divides d.
+        feedforward: width of the feed-forward's hidden layers.
+        dropout: dropout rate in the encoder, while training.
     """
 
     def __init__(
@@ -102,18 +118,21 @@ class AvatarPoser(WindowModel):
         self.rotation = head(width, ROTATION.stop - ROOT)
 
     def rotations(self, encoded: Tensor) -> Tensor:
-        """Windows of inputs (B, T, 54) -> rotations (B, 132) of their last frames, both in network space."""
+        """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
         h = self.embedding(encoded)
         for layer in self.layers:
             h = layer(h)
         return self.read(h[:, -1])
 
     def read(self, newest: Tensor) -> Tensor:
-        """The newest frame's feature (..., d) -> rotations (..., 132)."""
+        """Map the newest frame's feature (..., d) to rotations (..., 132)."""
         return torch.cat([self.orientation(newest), self.rotation(newest)], -1)
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """See WindowModel; by default the n new frames, which are the most that it can make."""
+        """Take in the newest frames; see WindowModel.
+
+        By default the n new frames are returned, which are the most that it can make.
+        """
         inputs, kept = self.taken_in(sparse, state)
         wanted = sparse.shape[1] if newest is None else newest
         ends = torch.arange(inputs.shape[1] - wanted, inputs.shape[1], device=inputs.device)

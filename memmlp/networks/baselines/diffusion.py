@@ -1,4 +1,4 @@
-"""Denoising diffusion with a network that predicts the clean signal: noise schedule, training noise, DDIM."""
+"""Denoising diffusion with a network that predicts the clean signal: schedule, training noise, DDIM."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ Denoise = Callable[[Tensor, Tensor], Tensor]
 
 
 def cosine_schedule(steps: int) -> Tensor:
-    """Shares of signal (steps,) in the noisy signal's variance (Nichol & Dhariwal 2021, Eq. 17), float64.
+    """Return the share (steps,) of signal in the noisy signal's variance, float64.
 
-    A step's share of noise is at most 0.999.
+    This is Eq. 17 of Nichol & Dhariwal 2021, where the noise that one step adds has a share of at most 0.999.
     """
     offset = 0.008
     time = torch.arange(steps + 1, dtype=torch.float64) / steps
@@ -24,11 +24,12 @@ def cosine_schedule(steps: int) -> Tensor:
 
 
 class Diffusion(nn.Module):
-    """The noise of training and the way back from it.
+    """The noising of training signals, and DDIM, which samples clean signals.
 
     Args:
-        steps: of the schedule. sampling_steps: denoiser calls of a sample, evenly spaced from the last
-            step down (Song et al. 2021, App. D.2: linear), so that the first one sees noise alone.
+        steps: number of steps of the noise schedule.
+        sampling_steps: number of denoiser calls for a sample, evenly spaced from the last step down (Song et
+            al. 2021, App. D.2: linear), so that the first one sees noise alone.
     """
 
     signal: Tensor
@@ -40,16 +41,16 @@ class Diffusion(nn.Module):
         self.register_buffer("signal", cosine_schedule(steps).float(), persistent=False)
 
     def noised(self, clean: Tensor, time: Tensor, noise: Tensor) -> Tensor:
-        """Clean signals (B, ...) at times (B,) with standard normal noise of their shape."""
+        """Mix clean signals (B, ...) with standard normal noise (B, ...) as the times (B,) demand."""
         signal = self.signal[time].view(-1, *[1] * (clean.dim() - 1))
         return signal.sqrt() * clean + (1 - signal).sqrt() * noise
 
     def sample(self, denoise: Denoise, noise: Tensor) -> Tensor:
-        """The clean signal (B, ...) by DDIM without noise of its own (Song et al. 2021, Eq. 12, eta = 0).
+        """Sample the clean signal (B, ...) by DDIM that adds no noise (Song et al. 2021, Eq. 12, eta = 0).
 
         Args:
-            denoise: noisy signal (B, ...) and times (B,) -> its estimate of the clean signal.
-            noise: where it starts from (B, ...).
+            denoise: maps a noisy signal (B, ...) and times (B,) to an estimate of the clean signal.
+            noise: the noise (B, ...) to start from.
         """
         x = noise
         for index, time in enumerate(self.times):
@@ -59,7 +60,16 @@ class Diffusion(nn.Module):
         return clean
 
     def stepped(self, x: Tensor, clean: Tensor, index: int) -> Tensor:
-        """The noisy signal one sampling step on, of x and the estimate made from it at step `index`."""
+        """Take one sampling step.
+
+        Args:
+            x: the noisy signal (B, ...) at sampling step `index`.
+            clean: the estimate of the clean signal that was made from it.
+            index: number of the sampling step, from 0.
+
+        Returns:
+            The noisy signal (B, ...) at sampling step `index` + 1.
+        """
         here, there = (self.signal[time] for time in self.times[index : index + 2])
         direction = (x - here.sqrt() * clean) / (1 - here).sqrt()
         return there.sqrt() * clean + (1 - there).sqrt() * direction

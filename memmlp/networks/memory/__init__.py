@@ -1,7 +1,7 @@
 """The memory slot: what the backbone is told of the past, and what is kept for the next call.
 
-A memory gives the backbone its blocks (`block`), turns the buffers of past frames into what those blocks
-see (`recall`), and updates its buffers after the network's output (`remember`). All in network space.
+A memory makes the backbone's blocks (`block`), turns the buffers of past frames into what those blocks see
+(`recall`), and updates its buffers with the network's output (`remember`). All of it is in network space.
 """
 
 from memmlp.networks.memory.features import (

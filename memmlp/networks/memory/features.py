@@ -1,4 +1,4 @@
-"""Memory features: what a memory block makes of what is recalled, and the block that takes it in."""
+"""Memory features, which memory blocks compute from what is recalled, and the memory block itself."""
 
 from __future__ import annotations
 
@@ -15,7 +15,13 @@ State = dict[str, Tensor]
 
 
 class Past(NamedTuple):
-    """The T frames that end one shift before the newest: inputs, the network's motion, code-vectors."""
+    """What a memory of the network's own past recalls: the T frames that end one shift before the newest.
+
+    Attributes:
+        sparse: inputs (B, T, 54).
+        motion: the network's motion (B, T, 198).
+        codes: code-vectors (B, T, width), of width 0 for a memory without them.
+    """
 
     sparse: Tensor
     motion: Tensor
@@ -23,14 +29,24 @@ class Past(NamedTuple):
 
 
 class Recurred(NamedTuple):
-    """SiLU of the recurrent layers' outputs in the window (B, blocks, T, k), and what they carry on."""
+    """What a recurrent memory recalls.
+
+    Attributes:
+        features: SiLU of the recurrent layers' outputs in the window (B, blocks, T, k).
+        carried: the layers' states after the newest frame, each (B, blocks, k).
+    """
 
     features: Tensor
     carried: State
 
 
 class Projection(nn.Module):
-    """Linear, LayerNorm, SiLU to the memory's width k (Sec. 3.2.1)."""
+    """Linear, LayerNorm and SiLU, to the memory's width k (Sec. 3.2.1).
+
+    Args:
+        size: number of inputs.
+        width: k.
+    """
 
     def __init__(self, size: int, width: int):
         super().__init__()
@@ -38,14 +54,16 @@ class Projection(nn.Module):
         self.norm = nn.LayerNorm(width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, T, size) -> (B, T, k)."""
+        """Map (B, T, size) to (B, T, k)."""
         return F.silu(self.norm(self.linear(x)))
 
 
 class Blend(nn.Module):
-    """The coefficient m (reading 7): U[0, 1] per frame and channel in training, `value` at inference.
+    """The coefficient m (reading 7), drawn from U[0, 1] per frame and channel in training.
 
-    value: a number in [0, 1], or "sampled" to draw at inference as in training. ONNX has the mean of draws.
+    Args:
+        value: m at inference, in [0, 1], or "sampled" to draw it at inference too. An exported ONNX file has
+            the mean of such draws instead.
     """
 
     MEAN = 0.5
@@ -56,22 +74,28 @@ class Blend(nn.Module):
 
     @property
     def sampled(self) -> bool:
-        """Whether m is drawn at inference."""
+        """Whether m is drawn at inference too."""
         return isinstance(self.value, str)
 
     def forward(self, like: Tensor) -> Tensor | float:
-        """m, broadcastable to (B, T, k)."""
+        """Return m: a number, or draws of the shape (B, T, k) of `like`."""
         if self.training or isinstance(self.value, str):
             return torch.rand_like(like)
         return self.value
 
 
 class ProjectedFeature(nn.Module):
-    """A memory feature made of projections."""
+    """A memory feature made of projections; the base of those with and without code-vectors."""
 
 
 class CodeFeature(ProjectedFeature):
-    """Z_l = Z_x + m * Z_theta + (1 - m) * Z_E (Sec. 3.2.1)."""
+    """The paper's memory feature Z_l = Z_x + m * Z_theta + (1 - m) * Z_E (Sec. 3.2.1).
+
+    Args:
+        width: k, the width of the feature.
+        code_width: width of a code-vector.
+        blend: the coefficient m.
+    """
 
     def __init__(self, width: int, code_width: int, blend: Blend):
         super().__init__()
@@ -81,14 +105,19 @@ class CodeFeature(ProjectedFeature):
         self.blend = blend
 
     def forward(self, past: Past) -> Tensor:
-        """The memory feature (B, T, k)."""
+        """Return the memory feature (B, T, k)."""
         motion = self.motion(past.motion)
         m = self.blend(motion)
         return self.sparse(past.sparse) + m * motion + (1 - m) * self.codes(past.codes)
 
 
 class NoCodesFeature(ProjectedFeature):
-    """Z_l = Z_x + m * Z_theta: Table 11's memory without the VQ-VAE."""
+    """The memory feature without the VQ-VAE, Z_l = Z_x + m * Z_theta (Table 11).
+
+    Args:
+        width: k, the width of the feature.
+        blend: the coefficient m.
+    """
 
     def __init__(self, width: int, blend: Blend):
         super().__init__()
@@ -97,25 +126,30 @@ class NoCodesFeature(ProjectedFeature):
         self.blend = blend
 
     def forward(self, past: Past) -> Tensor:
-        """The memory feature (B, T, k)."""
+        """Return the memory feature (B, T, k)."""
         motion = self.motion(past.motion)
         return self.sparse(past.sparse) + self.blend(motion) * motion
 
 
 class RecurredFeature(nn.Module):
-    """The feature of a memory's recurrent layer of that index."""
+    """The output of a recurrent memory's layer of the given index."""
 
     def __init__(self, index: int):
         super().__init__()
         self.index = index
 
     def forward(self, past: Recurred) -> Tensor:
-        """The memory feature (B, T, k)."""
+        """Return the memory feature (B, T, k)."""
         return past.features[:, self.index]
 
 
 class MemoryBlock(nn.Module):
-    """A block that computes its memory feature from what is recalled of the past and takes it in."""
+    """A block that computes its memory feature from what is recalled of the past, and takes it in.
+
+    Args:
+        feature: computes the feature (B, T, k).
+        fusion: the MLP block that takes it in.
+    """
 
     def __init__(self, feature: nn.Module, fusion: ResidualFusion | PlainFusion):
         super().__init__()
@@ -123,5 +157,5 @@ class MemoryBlock(nn.Module):
         self.fusion = fusion
 
     def forward(self, h: Tensor, past: Past | Recurred) -> Tensor:
-        """(B, T, d) -> (B, T, d)."""
+        """Map the hidden state (B, T, d) to (B, T, d)."""
         return self.fusion.fuse(h, self.feature(past))

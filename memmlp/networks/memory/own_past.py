@@ -1,4 +1,4 @@
-"""Memories of the network's own past, with code-vectors (Sec. 3.2.1) and without."""
+"""Memories of the network's own past, with code-vectors (Sec. 3.2.1) and without (Table 11)."""
 
 from __future__ import annotations
 
@@ -16,16 +16,21 @@ from memmlp.networks.vqvae import VQVAE, straight_through
 
 
 class NoCodesMemory(FeatureMemory):
-    """Memory of the network's own past without code-vectors (Table 11).
+    """A memory of the network's own past without code-vectors (Table 11).
 
     Args:
         layers: the backbone's layers (1-based) that get a memory feature.
         width: k, the width of the memory feature.
-        shift: "frame" (the window that ends one frame ago) or "window" (the one that ends T frames ago).
-        history: a past frame's motion as "first" estimated, when it was the newest, or its "latest" estimate.
+        shift: which past window is recalled: "frame" for the one that ends one frame ago, "window" for the
+            one that ends T frames ago.
+        history: which estimate of a past frame's motion is recalled: "first" for the one made when that frame
+            was the newest, "latest" for the most recent one.
         fusion: "residual" or "plain".
         blend: m at inference, in [0, 1], or "sampled"; `memory.blend.value` changes it in a trained network.
-        hidden, frames, depth: the backbone's d, T and L. codes: the frozen VQ-VAE.
+        hidden: the backbone's d.
+        frames: the backbone's T.
+        depth: the backbone's L.
+        codes: the frozen VQ-VAE; not used here.
     """
 
     def __init__(
@@ -49,34 +54,52 @@ class NoCodesMemory(FeatureMemory):
         self.length = frames + self.shift - 1
 
     def feature(self) -> nn.Module:
-        """The module that makes a block's memory feature."""
+        """Make the module that computes a block's memory feature."""
         return NoCodesFeature(self.width, self.blend)
 
     def initial_state(self, batch: int) -> State:
-        """Zeros: the paper's fallback where there is no previous prediction."""
+        """Return a motion of zeros, the paper's fallback where there is no previous prediction."""
         return {"motion": torch.zeros(batch, self.length, MOTION_DIM)}
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
-        """The true motion (B, length, 198) as history: teacher forcing."""
+        """Return the true motion (B, length, 198) as history, for teacher forcing."""
         return {"motion": motion}
 
     def needed(self, new: int) -> int:
-        """How many of the output's newest frames `remember` looks at."""
+        """Return how many of the output's newest frames `remember` looks at."""
         return self.frames if self.history == "latest" else new
 
     def recall(self, sparse: Tensor, state: State, new: int) -> Past:
-        """The T frames that end one shift before the newest, of inputs (B, length + new, 54)."""
+        """Recall the T frames that end one shift before the newest frame.
+
+        Where several new frames make that window reach into them, it ends just before the first of them
+        instead.
+
+        Args:
+            sparse: inputs (B, length + new, 54).
+            state: the motion before the new frames (B, length, 198).
+            new: how many of the inputs are new.
+        """
+        # The buffers begin T + shift - 1 frames before the first new one, so the window begins at new - 1,
+        # but not after shift - 1: the motion of the new frames is not known yet.
         start = min(new, self.shift) - 1
         view = slice(start, start + self.frames)
         sparse, motion = sparse[:, view], state["motion"][:, view]
         return Past(sparse, motion, self.code_vectors(sparse, motion))
 
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
-        """None of them: (B, T, 0)."""
+        """Return code-vectors of width 0, (B, T, 0), since this memory has none."""
         return sparse[..., :0]
 
     def remember(self, motion: Tensor, past: Past | Recurred | None, state: State, new: int) -> State:
-        """The state after an output (B, at least `needed`, 198) whose last `new` frames are new."""
+        """Return the state after an output.
+
+        Args:
+            motion: output (B, n, 198), n at least `needed(new)`.
+            past: not used here.
+            state: the state before the new frames.
+            new: how many of the output's last frames are new.
+        """
         buffer = torch.cat([state["motion"], motion[:, -new:]], 1)[:, -self.length :]
         if self.history == "latest":
             buffer = torch.cat([buffer[:, : self.length - self.frames], motion], 1)
@@ -84,24 +107,24 @@ class NoCodesMemory(FeatureMemory):
 
 
 class VQMemory(NoCodesMemory):
-    """Code-vectors beside the network's own past (Sec. 3.2.1), whatever VQ-VAE they come from.
+    """A memory of the network's own past with code-vectors (Sec. 3.2.1), whatever VQ-VAE they come from.
 
-    One code-vector per frame of the past window, shared by all memory blocks (reading 4).
+    Each frame of the past window has one code-vector, shared by all memory blocks (reading 4).
     """
 
     codes: VQVAE
 
     def feature(self) -> nn.Module:
-        """The module that makes a block's memory feature."""
+        """Make the module that computes a block's memory feature."""
         return CodeFeature(self.width, self.codes.width, self.blend)
 
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
-        """(B, T, code width) for inputs (B, T, 54) and motion (B, T, 198)."""
+        """Return code-vectors (B, T, code width) of inputs (B, T, 54) and motion (B, T, 198)."""
         return self.codes.code_vectors(sparse, motion)
 
 
 class CodeMemory(VQMemory):
-    """The paper's memory: the VQ-VAE is trained before and frozen."""
+    """The paper's memory, whose VQ-VAE is trained beforehand and frozen."""
 
     uses_codes: ClassVar[bool] = True
 
@@ -111,21 +134,22 @@ class CodeMemory(VQMemory):
         self.codes = codes.requires_grad_(False)
 
     def train(self, mode: bool = True) -> CodeMemory:
-        """The VQ-VAE stays frozen in evaluation mode."""
+        """Set the training mode of everything but the VQ-VAE, which stays in evaluation mode."""
         super().train(mode)
         self.codes.eval()
         return self
 
 
 class JointCodeMemory(VQMemory):
-    """A VQ-VAE of the network's own, trained with it from scratch (App. A: worse than the frozen one).
+    """A memory whose VQ-VAE is trained from scratch with the network (App. A: worse than the frozen one).
 
-    Its loss, on the true frames of the window, is added as it is: it is no task of Eq. 5, and an
-    uncertainty weight on a codebook loss that goes to zero would grow without bound. The network's loss
-    reaches its encoder by the straight-through gradient of the code-vectors.
+    The VQ-VAE's loss, on the true frames of the window, is added with weight 1: it is not one of Eq. 5's
+    terms, and an uncertainty weight on a codebook loss that goes to zero would grow without bound. The
+    network's own loss reaches the encoder by the straight-through gradient of the code-vectors.
 
     Args:
         vqvae: makes the VQ-VAE.
+        codes: ignored; there is no frozen VQ-VAE.
     """
 
     trains_codes: ClassVar[bool] = True
@@ -135,13 +159,19 @@ class JointCodeMemory(VQMemory):
         self.codes = vqvae()
 
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
-        """(B, T, code width) for inputs (B, T, 54) and motion (B, T, 198), in training straight-through."""
+        """Return code-vectors (B, T, code width) of inputs (B, T, 54) and motion (B, T, 198).
+
+        In training they have the straight-through gradient.
+        """
         if not self.training:
             return super().code_vectors(sparse, motion)
         latent = self.codes.encoder(torch.cat([sparse, motion], -1))
         return straight_through(latent, self.codes.codebook(latent)[0])
 
     def auxiliary_losses(self, frames: Tensor, normalizer: Normalizer) -> dict[str, Tensor]:
-        """Eq. 1 of the VQ-VAE's reconstruction and its codebook's loss; an EMA codebook learns here."""
+        """Return the VQ-VAE's losses, Eq. 1 of its reconstruction and its codebook's, at true world frames.
+
+        An EMA codebook learns from this call.
+        """
         auxiliary_losses, _ = self.codes.loss_terms(normalizer.encode(frames).flatten(0, 1), normalizer)
         return {f"vqvae_{name}": term for name, term in auxiliary_losses.items()}

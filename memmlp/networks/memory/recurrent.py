@@ -1,4 +1,4 @@
-"""Recurrent layers in the place of the paper's memory (Table 15)."""
+"""Memories of recurrent layers, which replace the paper's memory (Table 15)."""
 
 from __future__ import annotations
 
@@ -19,8 +19,12 @@ from memmlp.networks.vqvae import VQVAE
 class Recurrence(nn.Module):
     """LayerNorm of the sparse features, a recurrent layer, SiLU (App. A, reading 19).
 
+    Args:
+        width: k, the layer's hidden size.
+
     Attributes:
-        kind: the recurrent layer. carried: names of its states, the hidden one first.
+        kind: the class of the recurrent layer.
+        carried: names of its states, the hidden one first.
     """
 
     kind: ClassVar[Callable[..., nn.RNNBase]]
@@ -33,63 +37,74 @@ class Recurrence(nn.Module):
         self.layer = self.kind(SPARSE_DIM, width, batch_first=True)
 
     def begin(self, sparse: Tensor) -> Tensor:
-        """The hidden state (B, k) that a training window starts from, of the input (B, 54) before it."""
+        """Map the input (B, 54) just before a training window to the hidden state (B, k) to start from."""
         return self.first(self.norm(sparse))
 
     def forward(self, sparse: Tensor, carried: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
-        """Inputs (B, n, 54) and states (B, k) -> features (B, n, k) and the states after them."""
+        """Run over the inputs (B, n, 54) from the carried states, each (B, k).
+
+        Returns:
+            Features (B, n, k), and the states after the last input.
+        """
         with torch.autocast(sparse.device.type, enabled=False):  # not every CPU has an LSTM in bfloat16
             output, states = self.run(self.norm(sparse), [state.contiguous()[None] for state in carried])
         return F.silu(output), [state[0] for state in states]
 
     def run(self, x: Tensor, states: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
-        """The recurrent layer, its states (1, B, k) in a sequence."""
+        """Run the recurrent layer over inputs (B, n, 54) from a sequence of states, each (1, B, k)."""
         raise NotImplementedError
 
 
 @register_flop_formula(torch.ops.aten.mkldnn_rnn_layer)
 def lstm_flops(x: Sequence[int], to_gates: Sequence[int], again: Sequence[int], *shapes, **rest) -> int:
-    """FLOPs of a CPU's LSTM, one operation that the counter does not know, from the shapes of its arguments.
+    """Count the FLOPs of a CPU's LSTM, an operation that torch's counter does not know.
 
-    x is (n, B, inputs), the weights (4 k, inputs) and (4 k, k).
+    The arguments are the shapes of the operation's: the inputs are (n, B, inputs), the weights (4 k, inputs)
+    and (4 k, k).
     """
     return 2 * x[0] * x[1] * (to_gates[0] * to_gates[1] + again[0] * again[1])
 
 
 class LSTM(Recurrence):
-    """Hidden and cell state."""
+    """A recurrence with a hidden and a cell state."""
 
     kind = nn.LSTM
     carried = ("hidden", "cell")
 
     def run(self, x: Tensor, states: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
-        """The recurrent layer, its states (1, B, k) in a sequence."""
+        """Run the recurrent layer over inputs (B, n, 54) from a sequence of states, each (1, B, k)."""
         return self.layer(x, tuple(states))
 
 
 class GRU(Recurrence):
-    """Hidden state alone."""
+    """A recurrence with a hidden state alone."""
 
     kind = nn.GRU
     carried = ("hidden",)
 
     def run(self, x: Tensor, states: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
-        """The recurrent layer, its states (1, B, k) in a sequence."""
+        """Run the recurrent layer over inputs (B, n, 54) from a sequence of one state (1, B, k)."""
         output, hidden = self.layer(x, states[0])
         return output, [hidden]
 
 
 class RecurrentMemory(FeatureMemory):
-    """A recurrent layer for each block in place of the paper's memory (Table 15, reading 19).
+    """A recurrent layer for each memory block in place of the paper's memory (Table 15, reading 19).
 
-    It runs once over each frame, so its outputs for the window's older frames are kept beside its states:
-    a stream taken frame by frame is then the same as one taken in larger steps. A training call takes a
-    whole window. With teacher forcing the hidden state starts from the last input before the window,
-    projected, and the cell at zero (`true_state`); else, and in evaluation, states are carried from call to
-    call, zeros at a fresh start.
+    A layer runs once over each frame, and its outputs for the window's older frames are kept beside its
+    states: a stream taken frame by frame is then the same as one taken in larger steps. A training call takes
+    in a whole window. With teacher forcing the hidden state starts from the last input before the window,
+    projected, and the cell at zero (`true_state`); otherwise, and in evaluation, the states are carried from
+    call to call and are zeros at a fresh start.
 
     Args:
-        layers, width, fusion, hidden, frames, depth: see FeatureMemory; the width is the layer's hidden size.
+        layers: the backbone's layers (1-based) that get a memory feature.
+        width: k, the hidden size of the recurrent layers and so the width of the memory feature.
+        fusion: "residual" or "plain".
+        hidden: the backbone's d.
+        frames: the backbone's T.
+        depth: the backbone's L.
+        codes: the frozen VQ-VAE; not used here.
     """
 
     recurrence: ClassVar[type[Recurrence]]
@@ -111,23 +126,23 @@ class RecurrentMemory(FeatureMemory):
         self.length = frames - 1
 
     def feature(self) -> nn.Module:
-        """One more recurrent layer; the module that looks its output up."""
+        """Add one more recurrent layer and make the module that looks up its output."""
         self.recurrences.append(self.recurrence(self.width))
         return RecurredFeature(len(self.recurrences) - 1)
 
     def initial_state(self, batch: int) -> State:
-        """Zeros: states (B, blocks, k), and features (B, blocks, T - 1, k) of the frames before."""
+        """Return zeros: states (B, blocks, k), and the earlier frames' features (B, blocks, T - 1, k)."""
         blocks = len(self.recurrences)
         states = {name: torch.zeros(batch, blocks, self.width) for name in self.recurrence.carried}
         return states | {"features": torch.zeros(batch, blocks, self.frames - 1, self.width)}
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
-        """Hidden states from the last of inputs (B, length, 54)."""
+        """Return hidden states projected from the last of the inputs (B, length, 54), for teacher forcing."""
         hidden = torch.stack([layer.begin(sparse[:, -1]) for layer in self._layers()], 1)
         return {"hidden": hidden.float()}
 
     def recall(self, sparse: Tensor, state: State, new: int) -> Recurred:
-        """The layers' features, those of the `new` frames made now."""
+        """Run the layers over the `new` last inputs of (B, length + new, 54), and recall the window."""
         features, states = [], []
         for index, layer in enumerate(self._layers()):
             carried = [state[name][:, index] for name in layer.carried]
@@ -142,7 +157,7 @@ class RecurrentMemory(FeatureMemory):
         return Recurred(window, carried_on)
 
     def remember(self, motion: Tensor, past: Past | Recurred | None, state: State, new: int) -> State:
-        """The states after the newest frame, and the features of the last T - 1 frames."""
+        """Return the states after the newest frame, and the features of the last T - 1 frames."""
         assert isinstance(past, Recurred)
         return past.carried | {"features": past.features[:, :, 1:]}
 
@@ -151,12 +166,12 @@ class RecurrentMemory(FeatureMemory):
 
 
 class LSTMMemory(RecurrentMemory):
-    """Table 15's LSTM-MB."""
+    """A memory of LSTM layers (Table 15's LSTM-MB)."""
 
     recurrence = LSTM
 
 
 class GRUMemory(RecurrentMemory):
-    """Table 15's GRU-MB."""
+    """A memory of GRU layers (Table 15's GRU-MB)."""
 
     recurrence = GRU

@@ -1,4 +1,4 @@
-"""The memory slot's interface, the empty slot, and memories that give blocks a feature."""
+"""The memory slot's interface, the empty memory, and the base of memories that give blocks a feature."""
 
 from __future__ import annotations
 
@@ -17,14 +17,16 @@ FUSIONS: dict[str, type[ResidualFusion | PlainFusion]] = {"residual": ResidualFu
 
 
 class Memory(nn.Module):
-    """The slot's interface; as it stands, nothing is kept and nothing recalled.
+    """The memory slot's interface; in this base class nothing is kept and nothing is recalled.
 
     Attributes:
-        uses_codes: wants a frozen VQ-VAE. trains_codes: has one of its own, trained with the network.
-        shift: frames by which the past ends before the newest and a training step moves; 0 without a past.
-        length: frames of inputs in the buffer, the last one just before the new ones.
+        uses_codes: whether the memory needs a frozen VQ-VAE.
+        trains_codes: whether it has a VQ-VAE of its own that is trained with the network.
+        shift: by how many frames the recalled past ends before the newest frame, and a training step moves; 0
+            without a past.
+        length: how many past frames of inputs the buffer holds; the last one directly precedes the new ones.
         frames: T, the window's length.
-        settled: what is recalled of a frame never changes, so that a stream may compute it once.
+        settled: whether what is recalled of a frame never changes, so that a stream may compute it once.
     """
 
     uses_codes: ClassVar[bool] = False
@@ -35,40 +37,60 @@ class Memory(nn.Module):
     settled: bool = True
 
     def block(self, layer: int) -> nn.Module:
-        """The backbone's block of that layer (1-based)."""
+        """Make the backbone's block of a layer (1-based)."""
         raise NotImplementedError
 
     def memory_block(self) -> nn.Module:
-        """One more block that takes a memory feature in: for the predictor's branches (Table 8)."""
+        """Make one more block that takes in a memory feature, for the predictor's branches (Table 8)."""
         raise NotImplementedError
 
     def initial_state(self, batch: int) -> State:
-        """What is kept at a fresh start: zeros."""
+        """Return what is kept at a fresh start: zeros."""
         return {}
 
     def true_state(self, sparse: Tensor, motion: Tensor) -> State:
-        """The state after inputs (B, length, 54) with the true motion (B, length, 198): teacher forcing."""
+        """Return the state after inputs (B, length, 54) with the true motion (B, length, 198) as history."""
         return {}
 
     def needed(self, new: int) -> int:
-        """How many of the output's newest frames `remember` looks at."""
+        """Return how many of the output's newest frames `remember` looks at."""
         return 0
 
     def recall(self, sparse: Tensor, state: State, new: int) -> Past | Recurred | None:
-        """What the blocks see at inputs (B, length + new, 54) whose last `new` frames are new."""
+        """Return what the blocks see of the past.
+
+        Args:
+            sparse: inputs (B, length + new, 54) in network space.
+            state: what the last call returned, or `initial_state`.
+            new: how many of the inputs are new.
+        """
         return None
 
     def remember(self, motion: Tensor, past: Past | Recurred | None, state: State, new: int) -> State:
-        """The state after an output (B, at least `needed`, 198) whose last `new` frames are new."""
+        """Return the state after an output.
+
+        Args:
+            motion: output (B, n, 198), n at least `needed(new)`.
+            past: what `recall` returned.
+            state: the state before the new frames.
+            new: how many of the output's last frames are new.
+        """
         return {}
 
     def auxiliary_losses(self, frames: Tensor, normalizer: Normalizer) -> dict[str, Tensor]:
-        """Losses of its own at true world frames (B, T, 252), added to the network's."""
+        """Return the memory's own losses at true world frames (B, T, 252), added to the network's."""
         return {}
 
 
 class NoMemory(Memory):
-    """The empty slot: plain blocks, no past, no state."""
+    """The empty memory: plain blocks, no past, no state.
+
+    Args:
+        hidden: the backbone's d.
+        frames: the backbone's T.
+        depth: the backbone's L; not used here.
+        codes: the frozen VQ-VAE; not used here.
+    """
 
     def __init__(self, *, hidden: int, frames: int, depth: int, codes: VQVAE | None = None):
         super().__init__()
@@ -77,11 +99,11 @@ class NoMemory(Memory):
         self.length = frames - 1
 
     def block(self, layer: int) -> nn.Module:
-        """The backbone's block of that layer (1-based)."""
+        """Make the backbone's block of a layer (1-based)."""
         return MLPBlock(self.hidden, self.frames)
 
     def memory_block(self) -> nn.Module:
-        """There is none. Raises InputError."""
+        """Raise InputError, since there are no memory blocks."""
         raise InputError("memory=none has no memory blocks: allowed is a predictor without memory")
 
 
@@ -92,7 +114,12 @@ class FeatureMemory(Memory):
         layers: the backbone's layers (1-based) that get a memory feature.
         width: k, the width of the memory feature.
         fusion: "residual" or "plain".
-        hidden, frames, depth: the backbone's d, T and L.
+        hidden: the backbone's d.
+        frames: the backbone's T.
+        depth: the backbone's L.
+
+    Raises:
+        InputError: if a layer is not one of the backbone's.
     """
 
     def __init__(
@@ -105,13 +132,13 @@ class FeatureMemory(Memory):
         self.hidden, self.frames = hidden, frames
 
     def block(self, layer: int) -> nn.Module:
-        """The backbone's block of that layer (1-based)."""
+        """Make the backbone's block of a layer (1-based)."""
         return self.memory_block() if layer in self.layers else MLPBlock(self.hidden, self.frames)
 
     def memory_block(self) -> nn.Module:
-        """A block that takes a memory feature in."""
+        """Make a block that takes in a memory feature."""
         return MemoryBlock(self.feature(), self.fusion(self.hidden, self.frames, self.width))
 
     def feature(self) -> nn.Module:
-        """The module that makes a block's memory feature of what `recall` gives."""
+        """Make the module that computes a block's memory feature from what `recall` returns."""
         raise NotImplementedError

@@ -1,6 +1,6 @@
-"""The live stream of a trained network with nothing computed twice: the same numbers, less work.
+"""Streaming graphs: a trained network's live stream with nothing computed twice; same numbers, less work.
 
-What depends on one frame alone is computed when the frame enters and carried in the state, and of the last
+What depends on one frame alone is computed when the frame enters, and carried in the state. Of the last
 layers only what the newest frame needs is computed.
 """
 
@@ -26,10 +26,11 @@ STREAMS: dict[type[WindowModel], type[StreamingGraph]] = {
 
 
 def streaming(model: WindowModel) -> StreamingGraph:
-    """The live stream of a trained network, which itself stays as it is.
+    """Make the streaming graph of a trained network, which itself stays as it is.
 
-    Raises InputError where there is none: where estimates of past frames change at each step
-    (`memory.history=latest`), nothing can be carried.
+    Raises:
+        InputError: if the network has none: where estimates of past frames change at each step
+            (`memory.history=latest`), nothing can be carried.
     """
     if not model.settled:
         raise InputError(

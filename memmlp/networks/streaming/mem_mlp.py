@@ -1,8 +1,8 @@
-"""Mem-MLP as a live stream: the numbers of `MemMLP.advance` a frame at a time.
+"""Mem-MLP's streaming graph: the numbers of `MemMLP.advance`, one frame at a time.
 
-The stem's output and, of each memory block, the share that its memory feature has in the block's linear
-layer are computed when a frame enters, with the code-vectors and projections before it, and carried. Only
-the mixing over frames, and what follows it, is left.
+When a frame enters, everything that depends on it alone is computed, and carried: the stem's output, the
+code-vector, the projections and, for each memory block, the share that its memory feature has in the block's
+linear layer. Only the mixing over frames, and what follows it, is left for every step.
 """
 
 from __future__ import annotations
@@ -28,10 +28,13 @@ Way = Callable[[Tensor, Tensor], Tensor]
 
 
 class Coordinates(nn.Module):
-    """World <-> network space as matrices: both ways are linear for a given turn, and in cosine and sine.
+    """The normalizer's conversions as matrices, which need few operations at a step.
+
+    For a given turn of the coordinates both conversions are linear, and their matrices are linear in the
+    turn's numbers, the cosine and sine of the heading. So the matrices are found by converting a basis.
 
     Args:
-        normalizer: whose `encode_sparse` and `decode_motion` these are; the matrices are found by trying.
+        normalizer: the normalizer whose `encode_sparse` and `decode_motion` these are.
     """
 
     def __init__(self, normalizer: Normalizer):
@@ -57,16 +60,26 @@ class Coordinates(nn.Module):
         )
 
     def encode(self, sparse: Tensor, origin: Tensor) -> Tensor:
-        """World inputs (1, 54) of a frame whose place is (1, 3 or 5) -> network space (1, 54)."""
+        """Convert a frame's world inputs (1, 54), whose origin is (1, 3 or 5), to network space (1, 54)."""
         return _apply(self.encoder, self.encoder_bias, sparse, origin)
 
     def decode(self, motion: Tensor, origin: Tensor) -> Tensor:
-        """Network space (1, 198) -> world motion (1, 198)."""
+        """Convert motion (1, 198) in network space to world motion (1, 198), given its origin (1, 3 or 5)."""
         return _apply(self.decoder, self.decoder_bias, torch.cat([motion, origin[:, :3]], -1), origin)
 
 
 def _matrices(way: Way, basis: Tensor, turns: int) -> tuple[Tensor, Tensor]:
-    """Matrices (1 + turns, out, in), offsets (1 + turns, 1, out): the constant, then one a turn's number."""
+    """Find the matrices and offsets of a conversion that is linear for any given turn.
+
+    Args:
+        way: the conversion, of vectors (n, in) and a turn (turns,) to vectors (n, out).
+        basis: the identity (in, in).
+        turns: how many numbers a turn has.
+
+    Returns:
+        Matrices (1 + turns, out, in) and offsets (1 + turns, 1, out): first those at a turn of zeros, then
+        what each of the turn's numbers adds to them.
+    """
     size = basis.shape[-1]
     tried = [torch.zeros(turns).double(), *torch.eye(turns).double()]
     offsets = torch.stack([way(torch.zeros(1, size).double(), turn) for turn in tried])
@@ -77,7 +90,7 @@ def _matrices(way: Way, basis: Tensor, turns: int) -> tuple[Tensor, Tensor]:
 
 
 def _apply(matrices: Tensor, offsets: Tensor, x: Tensor, origin: Tensor) -> Tensor:
-    """The sum of the matrices' products with x (1, in), each times its turn's number."""
+    """Apply the conversion to x (1, in): the sum of all matrices' products, each times its turn's number."""
     parts, out = len(matrices), matrices.shape[1]
     products = F.linear(x, matrices.reshape(parts * out, -1), offsets.reshape(-1)).view(parts, out)
     turn = torch.cat([torch.ones_like(origin[:, :1]), origin[:, 3:]], -1)
@@ -85,12 +98,12 @@ def _apply(matrices: Tensor, offsets: Tensor, x: Tensor, origin: Tensor) -> Tens
 
 
 class MemMLPStream(StreamingGraph):
-    """A Mem-MLP as a live stream."""
+    """Mem-MLP's streaming graph."""
 
     ends = ("coordinates", "stem", "predictor.rotation.linear", "predictor.position.linear")
 
     def build(self, model: WindowModel) -> None:
-        """Make the stream's parts of a copy of the network."""
+        """Make the graph's parts from a copy of the network."""
         assert isinstance(model, MemMLP)
         self.coordinates = Coordinates(model.normalizer)
         self.stem = model.stem
@@ -105,7 +118,7 @@ class MemMLPStream(StreamingGraph):
         self.shares = [f"memory.{index}" for index in range(len(converter.shared))]
 
     def windows(self) -> State:
-        """The stem's outputs and the shares of the window's frames, and what the memory keeps."""
+        """Return zeros: windows of the stem's outputs and of the shares (T, d), and what the memory keeps."""
         memory, window = self.recall.memory, torch.zeros(self.frames, self.stem.out_features)
         return {
             "sparse": torch.zeros(1, memory.length, SPARSE_DIM),
@@ -114,7 +127,7 @@ class MemMLPStream(StreamingGraph):
         }
 
     def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
-        """World inputs (1, 54) and the state -> motion (1, 198) in the world, and what is carried on."""
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
         memory = self.recall.memory
         origin = self.normalizer.origin(sparse)
         encoded = self.coordinates.encode(sparse, origin)

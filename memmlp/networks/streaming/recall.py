@@ -1,4 +1,4 @@
-"""A memory at one frame: what enters a stream's memory windows at a step."""
+"""What a memory recalls for one frame: what enters a stream's windows at a step."""
 
 from __future__ import annotations
 
@@ -27,7 +27,11 @@ Pieces = Sequence[Tensor]
 
 
 class Projections(nn.Module):
-    """The projections that several memory blocks make of one input, at once."""
+    """The projections that several memory blocks make of the same input, computed at once.
+
+    Args:
+        parts: the blocks' projections, all of the same shape.
+    """
 
     def __init__(self, parts: Sequence[Projection]):
         super().__init__()
@@ -38,55 +42,63 @@ class Projections(nn.Module):
         self.offset = nn.Parameter(torch.stack([part.norm.bias for part in parts]))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(n, size) -> (n, blocks, k)."""
+        """Map inputs (n, size) to the projections of all blocks (n, blocks, k)."""
         y = F.linear(x, self.weight, self.bias).view(-1, *self.shape)
         return F.silu(F.layer_norm(y, self.shape[1:]) * self.scale + self.offset)
 
 
 class CodeTable(nn.Module):
-    """Those projections of code-vectors, which are few: computed before, looked up by index."""
+    """The projections of all code-vectors, which are few: computed beforehand, looked up by index.
+
+    Args:
+        parts: the blocks' projections.
+        vectors: the code-vectors (K, width).
+    """
 
     def __init__(self, parts: Sequence[Projection], vectors: Tensor):
         super().__init__()
         self.projected = nn.Parameter(Projections(parts)(vectors).detach())
 
     def forward(self, index: Tensor) -> Tensor:
-        """Indices (1,) of code-vectors -> (1, blocks, k)."""
+        """Map the index (1,) of a code-vector to its projections (1, blocks, k)."""
         return self.projected.index_select(0, index)
 
 
 class Indices(nn.Module):
-    """A VQ-VAE that gives the index of a frame's code-vector in the place of the vector."""
+    """A stand-in for a VQ-VAE that gives the index of a frame's code-vector instead of the vector."""
 
     def __init__(self, codes: VQVAE):
         super().__init__()
         self.encoder, self.codebook = codes.encoder, codes.codebook
 
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
-        """(1, 1) for a frame's inputs (1, 1, 54) and motion (1, 1, 198)."""
+        """Return the index (1, 1) for a frame's inputs (1, 1, 54) and motion (1, 1, 198)."""
         return self.codebook.indices(self.encoder(torch.cat([sparse[0], motion[0]], -1)))[None]
 
 
 class Recall(nn.Module):
-    """What a memory recalls at a step, as the share that it has in each memory block.
+    """Computes at each step the share that the recalled feature has in each memory block.
 
     Args:
-        memory: the network's. features: its memory blocks' features. blocks: the stream's memory blocks.
+        memory: the network's memory.
+        features: the feature modules of its memory blocks.
+        blocks: the streaming memory blocks.
     """
 
     def __init__(self, memory: Memory, features: Sequence[Any], blocks: Sequence[SharedBlock]):
         super().__init__()
-        self.memory = copy.copy(memory)  # over windows of one frame: what each new frame brings in
+        # The memory is asked for windows of one frame: only the frame that enters is new to the stream.
+        self.memory = copy.copy(memory)
         self.memory.frames, self.memory.length = 1, memory.length - memory.frames + 1
         self.parts = nn.ModuleList(block.feature_part for block in blocks)
         if features:
             self.gather(features)
 
     def gather(self, features: Sequence[Any]) -> None:
-        """Put what gives all blocks' features of one frame at once together."""
+        """Join the blocks' feature modules into one that computes a frame's features for all of them."""
 
     def forward(self, past: Past | Recurred | None) -> tuple[Pieces, Pieces]:
-        """Of the frame that enters, and of those before the first one: (1, d) a block."""
+        """Return each block's share (1, d) of the frame that enters, and of frames before the first one."""
         if not self.parts:
             return (), ()
         z = self.feature(past)
@@ -95,11 +107,11 @@ class Recall(nn.Module):
         return shares, shares if before is z else self._shares(before)
 
     def feature(self, past: Any) -> Tensor:
-        """The features (1, blocks, k) of the frame that enters."""
+        """Return the features (1, blocks, k) of the frame that enters."""
         raise NotImplementedError
 
     def before(self, first: Tensor) -> Tensor:
-        """Those of the frames before the first one, given the first one's."""
+        """Return the features of frames before the first one, given the first one's (1, blocks, k)."""
         return first
 
     def _shares(self, z: Tensor) -> Pieces:
@@ -107,57 +119,58 @@ class Recall(nn.Module):
 
 
 class OwnPast(Recall):
-    """Of a memory that projects the inputs and the network's own motion."""
+    """For memories that project the inputs and the network's own motion."""
 
     def gather(self, features: Sequence[ProjectedFeature]) -> None:
-        """One feature whose projections are those of all blocks."""
+        """Make one feature module whose projections are those of all blocks."""
         self.whole = copy.deepcopy(features[0])
         for name, child in list(self.whole.named_children()):
             if isinstance(child, Projection):
                 setattr(self.whole, name, self.projections(name, [getattr(f, name) for f in features]))
 
     def projections(self, name: str, parts: Sequence[Projection]) -> nn.Module:
-        """All blocks' projections of the input of that name."""
+        """Join all blocks' projections of the input of that name: "sparse", "motion" or "codes"."""
         return Projections(parts)
 
     def feature(self, past: Past) -> Tensor:
-        """The features (1, blocks, k) of the frame that enters."""
+        """Return the features (1, blocks, k) of the frame that enters."""
         return self.whole(Past(*(part[0] for part in past)))
 
 
 class Coded(OwnPast):
-    """And code-vectors, whose projections are looked up."""
+    """For memories that have code-vectors as well, whose projections are looked up."""
 
     def gather(self, features: Sequence[ProjectedFeature]) -> None:
-        """One feature whose projections are those of all blocks."""
+        """Make one feature module whose projections are those of all blocks."""
         assert isinstance(self.memory, VQMemory)
         self.vectors = self.memory.codes.codebook.vectors
         super().gather(features)
+        # In a new dict, since the shallow copy of the memory shares its own with the network's.
         self.memory._modules = {**self.memory._modules, "codes": Indices(self.memory.codes)}
 
     def projections(self, name: str, parts: Sequence[Projection]) -> nn.Module:
-        """All blocks' projections of the input of that name."""
+        """Join all blocks' projections of the input of that name; those of code-vectors are a table."""
         return CodeTable(parts, self.vectors) if name == "codes" else super().projections(name, parts)
 
 
 class FromRecurrence(Recall):
-    """Of recurrent layers, which have seen nothing before the first frame."""
+    """For recurrent memories, whose features before the first frame are zeros."""
 
     def gather(self, features: Sequence[Any]) -> None:
-        """The blocks' layers, by index."""
+        """Note the index of each block's recurrent layer."""
         self.layers = [feature.index for feature in features]
 
     def feature(self, past: Recurred) -> Tensor:
-        """The features (1, blocks, k) of the frame that enters."""
+        """Return the features (1, blocks, k) of the frame that enters."""
         return past.features[:, self.layers, -1]
 
     def before(self, first: Tensor) -> Tensor:
-        """Zeros."""
+        """Return zeros, since the layers have seen nothing before the first frame."""
         return torch.zeros_like(first)
 
 
 def recall(memory: Memory, features: Sequence[nn.Module], blocks: Sequence[SharedBlock]) -> Recall:
-    """The memory's way of recalling a frame."""
+    """Choose the kind of Recall that fits the memory."""
     ways: dict[type[Memory], type[Recall]] = {
         VQMemory: Coded,
         NoCodesMemory: OwnPast,

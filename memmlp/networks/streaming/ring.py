@@ -1,4 +1,4 @@
-"""What every stream is, and the ring in which it carries windows of frames."""
+"""The interface of streaming graphs, and the ring in which they carry windows of frames."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ from memmlp.networks.window_model import WindowModel
 
 
 class Ring(NamedTuple):
-    """Where the newest of T frames stands in windows whose frames stay in place, the oldest one overwritten.
+    """Where frames stand in windows of T frames: they stay in place, and the newest overwrites the oldest.
 
-    slot: the newest frame's index (1,). entered: the indices that a step writes to: that slot, and at a fresh
-    start all of them.
+    This spares moving the whole window by one frame at every step.
+
+    Attributes:
+        slot: index (1,) of the newest frame.
+        entered: indices that a step writes to: the newest frame's, and at a fresh start all of them.
     """
 
     slot: Tensor
@@ -24,23 +27,23 @@ class Ring(NamedTuple):
 
     @classmethod
     def at(cls, count: Tensor, frames: int) -> Ring:
-        """The ring of `frames` slots after a count (1,) of steps; see `counted`."""
+        """Return the ring of T = `frames` slots at a step, given the count (1,) before it (see `counted`)."""
         slot = count.remainder(frames).long()
         slots = torch.arange(frames, device=count.device)
         return cls(slot, torch.nonzero((slots == slot) | (count == 0))[:, 0])
 
     def put(self, window: Tensor, entering: Tensor, before: Tensor) -> Tensor:
-        """The window (T, size) with a frame (1, size); at a fresh start `before` it in all others."""
+        """Put a frame (1, size) into a window (T, size); at a fresh start `before` goes into all others."""
         window = _written(window, self.entered, before)
         return window if before is entering else _written(window, self.slot, entering)
 
     def newest(self, window: Tensor) -> Tensor:
-        """The newest frame (1, size) of a window (T, size)."""
+        """Return the newest frame (1, size) of a window (T, size)."""
         return window.index_select(0, self.slot)
 
 
 def counted(count: Tensor, frames: int) -> Tensor:
-    """The count of steps after this one: 0 is a fresh start only, and after `frames` comes 1 again."""
+    """Return the count after a step: 1 to `frames` and then 1 again, so that only a fresh start has 0."""
     return count.remainder(frames) + 1
 
 
@@ -49,13 +52,14 @@ def _written(window: Tensor, index: Tensor, normalizer: Tensor) -> Tensor:
 
 
 class StreamingGraph(nn.Module):
-    """A network as a live stream, for one stream and without gradients.
+    """A network as a graph for one live stream, without gradients; the interface of all of them.
 
     Args:
-        model: the trained network; what is shared with it is a copy.
+        model: the trained network; the graph is made from a copy.
 
     Attributes:
-        ends: names of the modules that make the hidden state of the inputs, and the motion of it.
+        ends: names of the modules at the network's two ends: from the inputs to the hidden state, and from it
+            to the motion. They stay in float32 when the graph is quantised.
     """
 
     ends: ClassVar[tuple[str, ...]]
@@ -68,37 +72,43 @@ class StreamingGraph(nn.Module):
         self.requires_grad_(False)
 
     def build(self, model: WindowModel) -> None:
-        """Make the stream's parts of a copy of the network."""
+        """Make the graph's parts from a copy of the network."""
         raise NotImplementedError
 
     def windows(self) -> State:
-        """What is carried beside the count of steps, at a fresh start: zeros."""
+        """Return what is carried beside the count of steps, at a fresh start: zeros."""
         raise NotImplementedError
 
     def initial_state(self, batch: int = 1) -> State:
-        """A fresh start: zeros. At the first call the first frame stands for all before it.
+        """Return the state of a fresh start, all zeros.
 
-        batch: 1. Windows are (T, size), which exports to fewer operations.
+        At the first call the first frame stands for all frames before it.
+
+        Args:
+            batch: must be 1. Without a batch axis, windows (T, size) are exported to fewer operations.
         """
         assert batch == 1
         state = {"count": torch.zeros(1), **self.windows()}
         return {name: tensor.to(self.normalizer.mean) for name, tensor in state.items() if tensor.numel()}
 
     def advance(self, sparse: Tensor, state: State, newest: int = 1) -> tuple[Tensor, State]:
-        """Take one frame in.
+        """Take in one frame.
 
         Args:
-            sparse: world inputs (1, 1, 54). state: what the last call returned, or `initial_state`.
-            newest: 1; no other frame is made.
+            sparse: world inputs (1, 1, 54).
+            state: what the last call returned, or `initial_state`.
+            newest: must be 1, since no other frame is computed.
 
         Returns:
-            Motion (1, 1, 198) in the world, and the state.
+            Motion (1, 1, 198) in the world, and the new state.
         """
+        # Parts of the state that are empty (a queue of no frames) are no inputs of the exported graph, so
+        # they are taken out of the new state and put back from `windows` here.
         ring = Ring.at(state["count"], self.frames)
         motion, kept = self.step(sparse[0], self.windows() | state, ring)
         kept["count"] = counted(state["count"], self.frames)
         return motion[None], {name: tensor for name, tensor in kept.items() if tensor.numel()}
 
     def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
-        """World inputs (1, 54) and the state -> motion (1, 198) in the world, and what is carried on."""
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
         raise NotImplementedError
