@@ -25,7 +25,7 @@ from memmlp.networks.window_model import WindowModel
 OPSET = 18
 
 
-class StreamStep(nn.Module):
+class OneStep(nn.Module):
     """One step of the live stream with flat inputs and outputs, as ONNX wants them."""
 
     def __init__(self, model: WindowModel | StreamingGraph):
@@ -44,7 +44,7 @@ class StreamStep(nn.Module):
 
 def export(model: WindowModel | StreamingGraph, path: Path, run_id: str) -> None:
     """Write the model's streaming step, on the CPU in float32, as one ONNX file with its metadata."""
-    step = StreamStep(model.cpu().eval())
+    step = OneStep(model.cpu().eval())
     names = [f"state.{name}" for name in step.names]
     save(
         step,

@@ -180,10 +180,10 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared) -> None:
     with timed(run, "export"):
         model = experiment.architecture.load(run.weights())
         clips = [data.open(split).clips() for split in ("train", "test")]
-        place = run.deployment(experiment.deployed)
-        place.latency.unlink(missing_ok=True)  # of one that is made again, as a file of it is gone
-        record = experiment.deployment.ship(model, place, run.id, *clips)
-        place.finish(
+        deployed = run.deployment(experiment.deployed)
+        deployed.latency.unlink(missing_ok=True)  # it lacks a file and is made again, from the start
+        record = experiment.deployment.ship(model, deployed, run.id, *clips)
+        deployed.finish(
             {"run": run.manifest["id"], "settings": deployment_settings(experiment.config), **record}
         )
 

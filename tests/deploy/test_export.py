@@ -82,9 +82,9 @@ def test_zeros_are_a_fresh_start(exported):
     _, path = exported
     stream = OnnxStream(path)
     sparse = CLIP[:5, None, :SPARSE_DIM].numpy()
-    first = [stream.step(normalizer)[1] for normalizer in sparse]
+    first = [stream.step(frame)[1] for frame in sparse]
     stream.reset()
-    again = [stream.step(normalizer)[1] for normalizer in sparse]
+    again = [stream.step(frame)[1] for frame in sparse]
     assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
 
 

@@ -13,7 +13,7 @@ from memmlp.evaluation.predictions import prediction_arrays
 from memmlp.motion.body import HEAD, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import axis_angle_to_matrix, matrix_to_sixd
 
-FRAME = tiny.normalizer()
+NORMALIZER = tiny.normalizer()
 TRUTH = tiny.clip(40)
 SPARSE, MOTION = TRUTH[:, :SPARSE_DIM], TRUTH[:, SPARSE_DIM:]
 LEAVES = [10, 11, 15, 20, 21]
@@ -30,18 +30,18 @@ def perturbed(size: float, seed: int = 0) -> Tensor:
 def distance(motion: Tensor) -> Tensor:
     """Return the largest distance (N,) of a joint by the rotations from that by the positions, cm."""
     target = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
-    return 100 * (FRAME.pose(motion, SPARSE[: len(motion)]) - target).norm(dim=-1).amax(-1)
+    return 100 * (NORMALIZER.pose(motion, SPARSE[: len(motion)]) - target).norm(dim=-1).amax(-1)
 
 
 def objective(motion: Tensor) -> JointDistance:
     """Return the objective of a motion, in float64."""
     head = SPARSE[: len(motion), 36:39].double()
     target = motion[:, POSITION].double().unflatten(-1, (N_JOINTS, 3)) - head[:, None]
-    return JointDistance(local_rotations(motion.double()), target, FRAME.rest.double())
+    return JointDistance(local_rotations(motion.double()), target, NORMALIZER.rest.double())
 
 
 def solve(motion: Tensor, iterations: int = 15) -> Tensor:
-    return LBFGS(iterations).solutions(FRAME, motion, SPARSE[: len(motion)])["combined"]
+    return LBFGS(iterations).solutions(NORMALIZER, motion, SPARSE[: len(motion)])["combined"]
 
 
 def test_reachable_targets_are_reached():
@@ -78,7 +78,7 @@ def test_the_objective_is_the_distance_that_is_measured():
     """It is the sum of squares over joints, the head on its tracker, as by `Normalizer.pose`."""
     motion = perturbed(0.3)
     target = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
-    expected = (FRAME.pose(motion, SPARSE) - target).square().sum((1, 2))
+    expected = (NORMALIZER.pose(motion, SPARSE) - target).square().sum((1, 2))
     rows = torch.arange(len(motion))
     value = objective(motion)(torch.zeros(len(motion), 66, dtype=torch.float64), rows)
     torch.testing.assert_close(value.float(), expected, rtol=1e-4, atol=1e-6)
@@ -108,13 +108,13 @@ def test_identity_and_half_turns_give_no_nan(angle):
 def test_a_frame_is_solved_alike_alone_in_a_batch_and_in_chunks():
     motion = torch.cat([perturbed(0.3, seed)[:5] for seed in range(3)] + [perturbed(2.0, 9)[:5]])
     sparse = SPARSE[:5].repeat(4, 1)
-    together = LBFGS(15).solutions(FRAME, motion, sparse)["combined"]
-    chunks = LBFGS(15, chunk=3).solutions(FRAME, motion, sparse)["combined"]
+    together = LBFGS(15).solutions(NORMALIZER, motion, sparse)["combined"]
+    chunks = LBFGS(15, chunk=3).solutions(NORMALIZER, motion, sparse)["combined"]
     torch.testing.assert_close(chunks, together, atol=1e-5, rtol=0)
     for i in range(0, len(motion), 4):
-        alone = LBFGS(15).solutions(FRAME, motion[i : i + 1], sparse[i : i + 1])["combined"]
+        alone = LBFGS(15).solutions(NORMALIZER, motion[i : i + 1], sparse[i : i + 1])["combined"]
         torch.testing.assert_close(alone[0], together[i], atol=1e-5, rtol=0)
-    assert torch.equal(together, LBFGS(15).solutions(FRAME, motion, sparse)["combined"])
+    assert torch.equal(together, LBFGS(15).solutions(NORMALIZER, motion, sparse)["combined"])
 
 
 def test_more_iterations_get_nearer():
@@ -161,8 +161,8 @@ def test_the_combined_report_is_of_the_solved_rotations():
 
 def test_prediction_files_hold_the_solved_pose():
     motion = perturbed(0.2)
-    plain = prediction_arrays(FRAME, TRUTH, motion, NoIK())
-    arrays = prediction_arrays(FRAME, TRUTH, motion, LBFGS(5))
+    plain = prediction_arrays(NORMALIZER, TRUTH, motion, NoIK())
+    arrays = prediction_arrays(NORMALIZER, TRUTH, motion, LBFGS(5))
     assert set(arrays) - set(plain) == {"combined_positions", "combined_rotations"}
     assert arrays["combined_rotations"].shape == (40, N_JOINTS, 3, 3)
     target = arrays["predicted_positions_of_position_branch"]

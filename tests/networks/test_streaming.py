@@ -37,9 +37,9 @@ def largest_difference(model, sparse: torch.Tensor) -> float:
     """Return the largest difference over a stream (1, N, 54), graph and network each on its own history."""
     live = streaming(model)
     whole, carried, worst = model.initial_state(1), live.initial_state(), 0.0
-    for normalizer in sparse.split(1, 1):
-        expected, whole = model.advance(normalizer, whole, 1)
-        found, carried = live.advance(normalizer, carried)
+    for frame in sparse.split(1, 1):
+        expected, whole = model.advance(frame, whole, 1)
+        found, carried = live.advance(frame, carried)
         worst = max(worst, float((expected - found).abs().max()))
     return worst
 

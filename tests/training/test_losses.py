@@ -14,12 +14,12 @@ DRAW = torch.Generator().manual_seed(0)
 TRUTH = torch.stack([tiny.clip(9, seed) for seed in range(2)])
 MOTION = TRUTH[..., SPARSE_DIM:] + 0.1 * torch.randn(2, 9, 198, generator=DRAW)
 SPARSE = TRUTH[..., :SPARSE_DIM]
-FRAME = tiny.normalizer()
+NORMALIZER = tiny.normalizer()
 
 
 def terms(hand=None, branches=BOTH):
     loss = MotionLoss(Manual(), hand or HandPosition(), branches)
-    return loss.terms(MOTION, TRUTH[..., SPARSE_DIM:], SPARSE, FRAME)
+    return loss.terms(MOTION, TRUTH[..., SPARSE_DIM:], SPARSE, NORMALIZER)
 
 
 def test_terms_are_the_papers_equations():
@@ -47,7 +47,7 @@ def test_hand_by_forward_kinematics_is_of_the_rotation_branch():
     moved = MOTION.clone()
     moved[..., 132:] += 1
     loss = MotionLoss(Manual(), HandFK(), BOTH)
-    args = (TRUTH[..., SPARSE_DIM:], SPARSE, FRAME)
+    args = (TRUTH[..., SPARSE_DIM:], SPARSE, NORMALIZER)
     assert torch.equal(loss.terms(MOTION, *args)["hand"], loss.terms(moved, *args)["hand"])
     assert float(loss.terms(TRUTH[..., SPARSE_DIM:], *args)["hand"]) == pytest.approx(0, abs=1e-4)
 

@@ -47,8 +47,8 @@ def counted(count: Tensor, frames: int) -> Tensor:
     return count.remainder(frames) + 1
 
 
-def _written(window: Tensor, index: Tensor, normalizer: Tensor) -> Tensor:
-    return window.index_put((index,), normalizer.expand(index.shape[0], -1))
+def _written(window: Tensor, index: Tensor, frame: Tensor) -> Tensor:
+    return window.index_put((index,), frame.expand(index.shape[0], -1))
 
 
 class StreamingGraph(nn.Module):
