@@ -1,4 +1,4 @@
-"""The schemas of what makes a network: conf/frame, model, predictor, memory and vqvae."""
+"""The schemas of what makes a network: conf/frame, conf/model, conf/predictor, conf/memory, conf/vqvae."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ModelConfig:
 
 @dataclass
 class BaselineConfig(ModelConfig):
-    """A network without slots: it leaves memory, predictor and hand empty."""
+    """A baseline network, which has no slots: memory, predictor and hand are null with it."""
 
     name: str = key(Text())
     _target_: str = MISSING

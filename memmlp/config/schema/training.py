@@ -1,4 +1,4 @@
-"""The schemas of how it is trained: conf/rollout, loss, hand and optim."""
+"""The schemas of how a network is trained: conf/rollout, conf/loss, conf/hand and conf/optim."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class ManualConfig(LossConfig):
 
 @dataclass
 class BaselineLossConfig(LossConfig):
-    """A whole loss, where the others are weights of Mem-MLP's terms."""
+    """The loss of a baseline: a complete loss, whereas the other options only weight Mem-MLP's loss terms."""
 
 
 @dataclass
