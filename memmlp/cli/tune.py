@@ -132,7 +132,8 @@ def _check_space(setup: Setup) -> str:
         except InputError as error:
             raise InputError(f"search.space: {error}") from None
     first = _tasks(setup, setup.search.first())[0][-1]
-    return f"{first.id}, validated every {first.config['optim']['validate_every']} steps"  # when trials are pruned
+    # The interval of validations is part of what is searched: at validations a trial may be pruned.
+    return f"{first.id}, validated every {first.config['optim']['validate_every']} steps"
 
 
 def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]:
