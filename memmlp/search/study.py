@@ -107,7 +107,7 @@ class Study:
         return trial
 
     def report(self, trial: Trial, step: int, value: float) -> None:
-        """Report the objective's value at one of a trial's validations; only for searches with one objective."""
+        """Report the objective's value at one of a trial's validations, where there is one objective."""
         trial.report(value, step)
 
     def prune(self, trial: Trial) -> bool:

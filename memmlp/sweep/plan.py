@@ -40,7 +40,7 @@ class RunTask:
 
     @property
     def key(self) -> str:
-        """What tells the task from others: the run's id and its stages, for arms may want different stages."""
+        """What tells the task from others: the run's id and the stages that are wanted of it."""
         return " ".join((self.id, *self.stages))
 
 

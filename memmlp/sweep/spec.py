@@ -131,7 +131,10 @@ class Sweep:
         return self if arms == self.arms else replace(self, arms=arms, branch_source=None)
 
     def control_of(self, arm: Arm) -> str | None:
-        """Return the label of the arm that an arm is compared with; None for a control that names no other."""
+        """Return the label of the arm that an arm is compared with; None for the sweep's control itself.
+
+        The sweep's control may still name another arm with `against`.
+        """
         return arm.against or (self.control if arm.label != self.control else None)
 
     def seeds_of(self, arm: Arm) -> tuple[int, ...]:
