@@ -48,9 +48,8 @@ def collect(
     """
     shown = tuple(modes) if set(sweep.metrics) - set(COSTS) else tuple(modes)[:1]
     seen = with_existing_branches(sweep, runs)
-    every = (
-        MODES if set(sweep.metrics) - set(COSTS) else shown
-    )  # the correction is over both modes, whichever are shown
+    # The correction is over both modes, whichever of them are shown.
+    every = MODES if set(sweep.metrics) - set(COSTS) else shown
     found = effects(seen, runs, every)
     compared = sum(effect.p is not None for effect in found.values())
     if rounds:

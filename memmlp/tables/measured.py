@@ -184,9 +184,8 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
         return str(manifest.get(key) or UNKNOWN)
 
     git = manifest.get("git") or {}
-    before = (
-        [git["before"][:7]] if git.get("before") else []
-    )  # the code that the training began with, if other code resumed it
+    # A training that other code resumed names the commit that it began with, too.
+    before = [git["before"][:7]] if git.get("before") else []
     return Origin(
         code=", ".join([*before, git["commit"][:7]]) if git else f"version {of('version')}",
         changed=bool(git.get("dirty")),
