@@ -165,6 +165,7 @@ def _stale(folder: Path, made: Mapping[str, str]) -> list[str]:
 
 
 def _write(folder: Path, made: Mapping[str, str], stale: list[str]) -> None:
+    """Write the pages, and remove those whose data or template no longer exists."""
     from memmlp.common.files import atomic_write
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -59,6 +59,7 @@ def check_claims(name: str, text: str) -> None:
 
 
 def _filled(name: str, text: str, words: Words) -> str:
+    """Return a page: its template with the placeholders filled in. Raises InputError, naming the template."""
     check_claims(name, text)
     environment = Environment(undefined=StrictUndefined, keep_trailing_newline=True, trim_blocks=True)
     environment.globals = words.functions()
@@ -169,6 +170,7 @@ class Words:
         return self.sources[name].table
 
     def _cell(self, name: str, arm: str, mode: str, metric: str) -> Cell:
+        """Return a cell of a table. Raises InputError where any of the names is wrong."""
         table = self._table(name)
         rows = {row.label: row for row in table.rows}
         _allowed(f"arm of {name}", arm, rows)

@@ -183,6 +183,7 @@ def _clips_key(run: Measured) -> str:
 
 
 def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str]]) -> Measured:
+    """Return a run from what is kept of it."""
     names, errors = [clip for clip, _ in clips], record["errors"]
     return Measured(
         id=name,

@@ -172,6 +172,7 @@ def write_plots(study: Study, folder: Path) -> list[Path]:
 
 
 def _png(study: Study, name: str, keywords: dict[str, Any], path: Path) -> Path:
+    """Draw a plot with matplotlib into a PNG file, and return the file."""
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
@@ -187,6 +188,7 @@ def _png(study: Study, name: str, keywords: dict[str, Any], path: Path) -> Path:
 
 
 def _page(study: Study, wanted: dict[str, dict[str, Any]], path: Path) -> Path:
+    """Draw all plots with plotly into one HTML page, and return its file."""
     parts: list[str] = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ExperimentalWarning)

@@ -195,6 +195,7 @@ def _range(key: str, node: Mapping[str, Any], where: str) -> Range:
 
 
 def _choices(key: str, node: Mapping[str, Any], where: str) -> Range:
+    """Return the range of a node with `choices`. Raises InputError where it is wrong."""
     choices = node["choices"]
     if isinstance(choices, list):
         choices = [_listed(item) if isinstance(item, list) else item for item in choices]
@@ -212,6 +213,7 @@ def _listed(items: list[Any]) -> str:
 
 
 def _interval(key: str, node: Mapping[str, Any], where: str) -> Range:
+    """Return the range of a node with `low` and `high`. Raises InputError where it is wrong."""
     low, high = (_number(node.get(end), f"{where}.{end}") for end in ("low", "high"))
     log, step, first = node.get("log", False), node.get("step"), node.get("first")
     if not isinstance(log, bool):

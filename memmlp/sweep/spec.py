@@ -361,6 +361,7 @@ def _seeds(value: Any, name: str) -> tuple[int, ...]:
 
 
 def _metrics(value: Any) -> tuple[str, ...]:
+    """Return the names of the columns, checked to be metrics or costs."""
     names = _texts(value, "metrics")
     if not names:
         raise InputError("metrics: empty; allowed is at least one")

@@ -77,6 +77,8 @@ def without_runs(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
 
 
 def _row(sweep: Sweep, arm: Arm, runs: Runs | None, modes: Sequence[str], found: Mapping[Key, Effect]) -> Row:
+    """Return an arm's row; `runs` is None for a row that is the paper's alone."""
+
     def cell(mode: str, metric: str) -> Cell:
         numbers = {seed: run.value(mode, arm.branch, metric) for seed, run in (runs or {}).items()}
         values = {seed: value for seed, value in numbers.items() if value is not None}

@@ -56,6 +56,10 @@ def _errors(runs: Runs, clips: list[str], mode: str, arm: Arm, metric: str) -> n
 
 
 def _distribution(label: str, errors: Mapping[str, np.ndarray], other: Arm | None) -> Distribution:
+    """Return an arm's distribution, over the clips for which all its runs have a number.
+
+    The comparison with the control is over the clips for which the control's runs have one, too.
+    """
     every, theirs = errors[label], errors.get(other.label) if other else None
     known = ~np.isnan(every).any(0)
     ours = every[:, known]

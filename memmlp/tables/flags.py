@@ -53,6 +53,7 @@ def flags(
 
 
 def _missing(sweep: Sweep, runs: Mapping[str, Runs], command: str, state: Say) -> Iterable[str]:
+    """Flag the runs that are missing, how far they are, and the command that makes them."""
     gaps = []
     for arm in sweep.runnable():
         seeds = _gaps(sweep, arm, runs)
@@ -94,6 +95,7 @@ def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, Runs], command: str
 
 
 def _unequal_clips(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+    """Flag arms that don't have the same test clips as their controls."""
     for arm in sweep.runnable():
         other = control_arm(sweep, arm)
         if other is None:

@@ -180,6 +180,8 @@ def _costs(latency: Mapping[str, float]) -> dict[str, float]:
 
 
 def _origin(manifest: Mapping[str, Any]) -> Origin:
+    """Return the origin that a run's manifest tells."""
+
     def of(key: str) -> str:
         return str(manifest.get(key) or UNKNOWN)
 

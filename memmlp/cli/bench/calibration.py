@@ -134,6 +134,13 @@ class Simulated:
         self.looks = {n: self._look(fixed, noise[:, :n], variances[:, :n]) for n in looks(cell.seeds)}
 
     def _look(self, fixed: np.ndarray, noise: np.ndarray, variances: np.ndarray) -> SimulatedLook:
+        """Return what a look needs at its seeds.
+
+        Args:
+            fixed: the groups' means of the effects of groups, clips and skewed clips (K, 3, G).
+            noise: the groups' means of the noise (K, S, G), of the look's seeds.
+            variances: the variance of each seed's noise over groups (K, S).
+        """
         effects = np.concatenate([fixed, noise.mean(1, keepdims=True)], 1)
         effects -= effects.mean(2, keepdims=True)
         covariances = effects @ effects.transpose(0, 2, 1) / (len(self.weights) - 1)

@@ -69,6 +69,7 @@ def unknown_key(name: str, keys: Sequence[str]) -> str:
 
 
 def _value(node: DictConfig, own: str, name: str) -> Any:
+    """Return a key's value. Raises InputError where it is missing or can't be resolved."""
     if OmegaConf.is_missing(node, own):
         raise InputError(f"{name}: has no value; give one with {name}=...")
     try:

@@ -73,6 +73,8 @@ from memmlp.config.schema.training import (
 
 @dataclass
 class PathsConfig:
+    """Where runs, caches and sweeps are kept."""
+
     outputs: str = key(Text())
 
 
@@ -116,6 +118,8 @@ class ProfileConfig:
 
 @dataclass
 class EvaluationConfig:
+    """How a trained network is evaluated (conf/evaluation)."""
+
     modes: list[str] = key(EachOf(OneOf(("window", "stream"))))
     batch: int = at_least(1)
     ik: str = one_of("off", "lbfgs")
@@ -124,6 +128,8 @@ class EvaluationConfig:
 
 @dataclass
 class ExportConfig:
+    """How a trained network is shipped and timed (conf/export)."""
+
     latency_steps: int = at_least(1)
     graph: str = one_of("auto", "streaming", "naive")
     precision: str = one_of("fp32", "int8")
@@ -131,6 +137,8 @@ class ExportConfig:
 
 @dataclass
 class TrackingConfig:
+    """Where runs are shown beside their folders (conf/tracking)."""
+
     name: str = key(Text())
     _target_: str = MISSING
 

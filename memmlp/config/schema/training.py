@@ -14,6 +14,8 @@ from memmlp.config.schema.rules import Text, Within, at_least, called, key, one_
 
 @dataclass
 class RolloutConfig:
+    """The rollout slot: which history a training step sees (conf/rollout)."""
+
     name: str = key(Text())
     _target_: str = MISSING
 
@@ -40,6 +42,8 @@ class StreamsConfig(RolloutConfig):
 
 @dataclass
 class LossConfig:
+    """The loss (conf/loss)."""
+
     name: str = key(Text())
     _target_: str = MISSING
 
@@ -86,6 +90,8 @@ class AvatarPoserLossConfig(BaselineLossConfig):
 
 @dataclass
 class HandConfig:
+    """The hand term of Mem-MLP's loss (conf/hand)."""
+
     name: str = key(Text())
     _target_: str = MISSING
 
@@ -110,6 +116,8 @@ class NoHandConfig(HandConfig):
 
 @dataclass
 class OptimConfig:
+    """How the network is trained (conf/optim)."""
+
     steps: int = at_least(1)
     batch: int = at_least(1)
     lr: float = positive()

@@ -123,6 +123,7 @@ def needs_osc() -> None:
 
 
 def _tracker(name: str, values: Any) -> Tracker:
+    """Return a tracker from its seven numbers. Raises ValueError where they are no pose."""
     if values is None:
         return None
     if not isinstance(values, list) or len(values) != POSE or not all(map(_number, values)):

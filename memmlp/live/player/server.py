@@ -113,6 +113,7 @@ class Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def _events(self) -> None:
+        """Send the greeting and all frames as they come, until the page or the server is closed."""
         self._head("text/event-stream", {})
         with self.server.hub.watch() as watcher:
             while True:
