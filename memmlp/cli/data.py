@@ -32,7 +32,10 @@ def data() -> None:
 @click.option("--seed", default=0, show_default=True)
 @click.option("--fps", default=60.0, show_default=True, help="Frame rate of the clips.")
 def synth(out: Path, minutes: float, seed: int, fps: float) -> None:
-    """Write procedural motion (walking, squats, reaching, ...) in AMASS' layout."""
+    """Write procedural motion as AMASS npz.
+
+    The clips show walking, squats, reaching and other movements.
+    """
     from memmlp.motion.synthetic import synthesize
 
     paths = synthesize(out, minutes=minutes, seed=seed, fps=fps)
@@ -51,7 +54,10 @@ def synth(out: Path, minutes: float, seed: int, fps: float) -> None:
 def import_(
     source: Path, out: Path, skeleton: str | None, fps: tuple[str, ...], body: str, strict: bool
 ) -> None:
-    """Import BVH files (a folder or one file) as AMASS npz on the 22-joint tree."""
+    """Import BVH files as AMASS npz.
+
+    SOURCE is a folder or one file. The clips are brought to the 22-joint tree.
+    """
     from memmlp.motion.importing import import_folder
 
     rates = dict(map(_rate, fps))
@@ -70,10 +76,11 @@ def import_(
 @click.option("--skeleton", help="A shipped joint map or the path of one.")
 @click.option("--body", default="builtin", show_default=True, help="builtin, or an SMPL-H model.npz.")
 def verify(source: Path, skeleton: str | None, body: str) -> None:
-    """Check imported BVH files against the files' own joints; exit code 1 if an error is too large.
+    """Check imports against the BVH files' joints.
 
-    "worst mm" is the largest distance of any mapped joint, on the clip's own bones. "worst degrees" is the
-    largest angle between directions of upper arms, forearms, thighs and shins on the body.
+    Exits with 1 if an error is too large. "worst mm" is the largest distance of any mapped joint, on the
+    clip's own bones. "worst degrees" is the largest angle between directions of upper arms, forearms, thighs
+    and shins on the body.
     """
     from memmlp.motion.fidelity import verify_folder
 
@@ -119,7 +126,10 @@ def prepare(
     min_frames: int,
     strict: bool,
 ) -> None:
-    """Write the memory-mappable cache of a folder of AMASS npz files, with its manifest."""
+    """Write the cache of a folder of AMASS npz.
+
+    The cache is memory-mappable, and has a manifest of what became of each file.
+    """
     from memmlp.motion.prepare import ClipFolder
     from memmlp.motion.prepare import prepare as run
 
@@ -130,7 +140,10 @@ def prepare(
 @data.command("inspect")
 @click.argument("path", type=PATH)
 def inspect(path: Path) -> None:
-    """Show what a cache or a folder of npz files holds: clips, hours, frame rates, splits, bad files."""
+    """Show clips, hours, rates and bad files.
+
+    PATH is a cache, whose splits are shown too, or a folder of npz files.
+    """
     from memmlp.motion.prepare import MANIFEST, Manifest, survey
 
     if (path / MANIFEST).is_file():

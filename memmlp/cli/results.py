@@ -40,10 +40,10 @@ def results() -> None:
 @click.option("--name", "stem", help="Of the file, in place of the sweep's.")
 @outputs_option
 def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | None, outputs: Path) -> None:
-    """Keep the per-clip results of a sweep's finished runs in one small file.
+    """Keep a sweep's results in one small file.
 
-    SWEEP and OVERRIDES are those of `memmlp sweep`. Results that the file already has of other arms and seeds
-    stay.
+    They are the per-clip results of its finished runs. SWEEP and OVERRIDES are those of `memmlp sweep`.
+    Results that the file already has of other arms and seeds stay.
     """
     from memmlp.cli.rounds import shown
     from memmlp.common.files import plain
@@ -79,10 +79,11 @@ def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | N
 )
 @click.option("--check", is_flag=True, help="Write nothing; exit with 1 where a page differs.")
 def docs(folder: Path, check: bool) -> None:
-    """Make all pages of results again from what is kept, without a training.
+    """Make all pages of results from what is kept.
 
-    Every file of data/ gives a table's page. The templates give pages whose sentences take their numbers and
-    verdicts from the tables. Prose that claims an effect by hand is refused, there and in README.md.
+    No training is needed. Every file of data/ gives a table's page. The templates give pages whose sentences
+    take their numbers and verdicts from the tables. Prose that claims an effect by hand is refused, there and
+    in README.md.
     """
     from memmlp.report.markdown import check_claims, pages
 

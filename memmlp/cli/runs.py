@@ -36,7 +36,10 @@ def runs() -> None:
 @click.option("--all", "every", is_flag=True, help=f"All of them, not only the newest {NEWEST}.")
 @outputs_option
 def list_command(every: bool, outputs: Path) -> None:
-    """List the runs, the newest first: MPJPE (rotation branch) in both modes, Jitter, a frame's latency."""
+    """List the runs, the newest first.
+
+    Shown are the MPJPE of the rotation branch in both modes, Jitter, and the latency of a frame.
+    """
     from memmlp.runs.lookup import list_runs
 
     found = list_runs(outputs)
@@ -59,7 +62,10 @@ def list_command(every: bool, outputs: Path) -> None:
 @click.option("--config", "config", is_flag=True, help="Print the resolved config too.")
 @outputs_option
 def show_command(run: str, config: bool, outputs: Path) -> None:
-    """Show one run, by its id, the beginning of it, or its folder."""
+    """Show one run and its results.
+
+    RUN is its id, the beginning of it, or its folder.
+    """
     from memmlp.runs.identity import flatten
     from memmlp.runs.lookup import find_run
 
@@ -81,7 +87,10 @@ def show_command(run: str, config: bool, outputs: Path) -> None:
 @click.argument("b")
 @outputs_option
 def diff_command(a: str, b: str, outputs: Path) -> None:
-    """Show in what two runs differ: config and results."""
+    """Show in what two runs differ.
+
+    Their configs and results are compared.
+    """
     from memmlp.runs.lookup import diff, find_run
 
     first, second = find_run(outputs, a), find_run(outputs, b)

@@ -21,7 +21,10 @@ def track() -> None:
 @click.option("--uri", default=None, help="MLflow's store, if not MLFLOW_TRACKING_URI or sqlite in OUTPUTS.")
 @outputs_option
 def sync(uri: str | None, outputs: Path) -> None:
-    """Bring MLflow's store up to date with all finished runs and sweeps; may be repeated at any time."""
+    """Bring MLflow up to date with all runs.
+
+    All finished runs and sweeps are shown in its store. It may be repeated at any time.
+    """
     from memmlp.common.progress import track as bar
     from memmlp.runs.lookup import list_runs
     from memmlp.runs.tracking import MLflowTracking

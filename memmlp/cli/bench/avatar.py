@@ -36,10 +36,11 @@ def avatar(
     outputs: Path,
     overrides: tuple[str, ...],
 ) -> None:
-    """Time a frame of the live stream beside the network's session alone: milliseconds, and the ratio.
+    """Time a frame of the live stream.
 
-    The two take turns, frame by frame. OVERRIDES are those of `memmlp train`, for random weights; the default
-    is profile=paper. Their graph is the streaming one, where the network has it.
+    It is timed beside the network's session alone: milliseconds, and the ratio. The two take turns, frame by
+    frame. OVERRIDES are those of `memmlp train`, for random weights; the default is profile=paper. Their
+    graph is the streaming one, where the network has it.
     """
     import tempfile
 
@@ -112,11 +113,12 @@ def _random(overrides: tuple[str, ...], path: Path) -> Path:
 @click.option("--hours", default=1.0, show_default=True, help="Of motion, at least.")
 @outputs_option
 def soak(run: str | None, onnx: Path | None, hours: float, outputs: Path) -> None:
-    """Stream RUN's test clips, one after the other and over again, for hours of motion without a reset.
+    """Stream for hours of motion without a reset.
 
-    The motion is repeated as a whole, a multiple of ten times, so that every tenth holds the same frames.
-    Printed are whether all numbers were finite, the MPJPE of the first and of the last tenth, and how much
-    memory grew between their ends. Without RUN the motion is synthetic.
+    RUN's test clips are streamed one after the other and over again; without RUN the motion is synthetic. It
+    is repeated as a whole, a multiple of ten times, so that every tenth holds the same frames. Printed are
+    whether all numbers were finite, the MPJPE of the first and of the last tenth, and how much memory grew
+    between their ends.
     """
     from memmlp.common.errors import InputError
     from memmlp.live.soak import repetitions

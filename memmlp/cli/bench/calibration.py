@@ -414,9 +414,10 @@ def markdown(rows: Sequence[dict[str, Any]], seed: int) -> str:
 @click.option("--json", "file", type=click.Path(path_type=Path), help="Write all rates to this file.")
 @click.option("--markdown", "as_markdown", is_flag=True, help="Print the table as Markdown.")
 def calibration(tables: int, quick: bool, seed: int, file: Path | None, as_markdown: bool) -> None:
-    """Simulate how often the verdicts' claims are false, over seeds, clips, groups and shares of variance.
+    """Simulate how often verdicts are wrong.
 
-    Exits with 1 where a cell breaks a promise by more than two standard errors of the simulation.
+    The simulation covers a grid of seeds, clips, groups and shares of variance. Exits with 1 where a cell
+    breaks a promise by more than two standard errors of the simulation.
     """
     from rich.console import Console
 

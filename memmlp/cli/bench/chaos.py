@@ -43,9 +43,10 @@ Launch = Callable[[], subprocess.Popen[bytes]]
 @click.option("--seed", default=0, show_default=True, help="Of the killer.")
 @click.argument("overrides", nargs=-1)
 def chaos(runs: int, kills: int, controllers: int, seed: int, overrides: tuple[str, ...]) -> None:
-    """Run a sweep by several controllers under random SIGKILLs, beside an undisturbed one.
+    """Run a sweep under random SIGKILLs.
 
-    Every run must be finished exactly once, with bit-identical weights. Exits with 1 where one isn't.
+    Several controllers work on it, beside an undisturbed sweep. Every run must be finished exactly once, with
+    bit-identical weights. Exits with 1 where one isn't.
     """
     with tempfile.TemporaryDirectory() as folder:
         sweep = Path(folder) / "chaos.yaml"
@@ -70,9 +71,10 @@ def chaos(runs: int, kills: int, controllers: int, seed: int, overrides: tuple[s
 @click.option("--seed", default=0, show_default=True, help="Of the killer.")
 @click.argument("overrides", nargs=-1)
 def chaos_tune(trials: int, kills: int, seed: int, overrides: tuple[str, ...]) -> None:
-    """Run a search whose controller and workers are killed at random.
+    """Run a search under random SIGKILLs.
 
-    It must end with exactly the trials it should have, none repeated, none lost. Exits with 1 otherwise.
+    Its controller and workers are killed. It must end with exactly the trials it should have, none repeated,
+    none lost. Exits with 1 otherwise.
     """
     with tempfile.TemporaryDirectory() as folder:
         outputs = Path(folder) / "outputs"

@@ -35,10 +35,11 @@ VARIANTS = ("naive", "streaming", "int8")
 def latency(
     rounds: int, steps: int, models: str, file: Path | None, profile: str | None, overrides: tuple[str, ...]
 ) -> None:
-    """Time a step of every network in ONNX Runtime, all in turn in one process, on one thread.
+    """Time a step of every network.
 
-    OVERRIDES are those of `memmlp train`; the default is profile=paper. Weights are random: they do not
-    matter for the time. The ratio is to AvatarPoser as published, of each round's medians.
+    All run in ONNX Runtime, in turn in one process, on one thread. OVERRIDES are those of `memmlp train`; the
+    default is profile=paper. Weights are random: they do not matter for the time. The ratio is to AvatarPoser
+    as published, of each round's medians.
     """
     import tempfile
 
