@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from memmlp.motion.splits import Split
 
 PATH = click.Path(path_type=Path)
-MOST_MM, MOST_DEGREES = 1.0, 3.0  # what an import may be off by
-SHOWN = 8  # skipped files named on the screen; the manifest has all
+MOST_MM, MOST_DEGREES = 1.0, 3.0  # the largest errors that an import may have
+SHOWN = 8  # skipped files that are named on the screen; the manifest lists all
 
 
 @click.group("data")
@@ -32,7 +32,10 @@ def data() -> None:
 @click.option("--seed", default=0, show_default=True)
 @click.option("--fps", default=60.0, show_default=True, help="Frame rate of the clips.")
 def synth(out: Path, minutes: float, seed: int, fps: float) -> None:
-    """Write procedural motion (walking, squats, reaching, ...) in AMASS' layout."""
+    """Write procedural motion as AMASS npz.
+
+    The clips show walking, squats, reaching and other movements.
+    """
     from memmlp.motion.synthetic import synthesize
 
     paths = synthesize(out, minutes=minutes, seed=seed, fps=fps)
@@ -51,7 +54,10 @@ def synth(out: Path, minutes: float, seed: int, fps: float) -> None:
 def import_(
     source: Path, out: Path, skeleton: str | None, fps: tuple[str, ...], body: str, strict: bool
 ) -> None:
-    """Import BVH files (a folder or one file) as AMASS npz on the 22-joint tree."""
+    """Import BVH files as AMASS npz.
+
+    SOURCE is a folder or one file. The clips are brought to the 22-joint tree.
+    """
     from memmlp.motion.importing import import_folder
 
     rates = dict(map(_rate, fps))
@@ -70,10 +76,11 @@ def import_(
 @click.option("--skeleton", help="A shipped joint map or the path of one.")
 @click.option("--body", default="builtin", show_default=True, help="builtin, or an SMPL-H model.npz.")
 def verify(source: Path, skeleton: str | None, body: str) -> None:
-    """Check what an import of BVH files gives against the files' own joints; exit code 1 if it is off.
+    """Check imports against the BVH files' joints.
 
-    Millimetres: of any mapped joint, on the clip's own bones. Degrees: of upper arms, forearms, thighs and
-    shins on the body.
+    Exits with 1 if an error is too large. "worst mm" is the largest distance of any mapped joint, on the
+    clip's own bones. "worst degrees" is the largest angle between directions of upper arms, forearms, thighs
+    and shins on the body.
     """
     from memmlp.motion.fidelity import verify_folder
 
@@ -119,7 +126,10 @@ def prepare(
     min_frames: int,
     strict: bool,
 ) -> None:
-    """Write the memory-mappable cache of a folder of AMASS npz files, and its manifest."""
+    """Write the cache of a folder of AMASS npz.
+
+    The cache is memory-mappable, and has a manifest of what became of each file.
+    """
     from memmlp.motion.prepare import ClipFolder
     from memmlp.motion.prepare import prepare as run
 
@@ -130,7 +140,10 @@ def prepare(
 @data.command("inspect")
 @click.argument("path", type=PATH)
 def inspect(path: Path) -> None:
-    """Show a cache or a folder of npz files: clips, hours, frame rates, splits, what is bad."""
+    """Show clips, hours, rates and bad files.
+
+    PATH is a cache, whose splits are shown too, or a folder of npz files.
+    """
     from memmlp.motion.prepare import MANIFEST, Manifest, survey
 
     if (path / MANIFEST).is_file():
@@ -144,7 +157,7 @@ def inspect(path: Path) -> None:
 
 
 def _rate(text: str) -> tuple[str, float]:
-    """FOLDER=HZ or HZ as folder ("" for all) and rate."""
+    """Parse FOLDER=HZ or HZ into folder ("" for all) and rate. Raises InputError for anything else."""
     folder, _, rate = text.rpartition("=")
     try:
         return folder, float(rate)
@@ -153,7 +166,7 @@ def _rate(text: str) -> tuple[str, float]:
 
 
 def _split(name: str, val: float, test: float, seed: int, groups: tuple[str, ...]) -> Split:
-    """The split of that name."""
+    """Return the split that --split names. Raises InputError for an unknown name."""
     from memmlp.motion.splits import S2_TEST, S2_TRAIN, ListSplit, SeededSplit, SubsetSplit
 
     if name == "seeded":
@@ -166,7 +179,7 @@ def _split(name: str, val: float, test: float, seed: int, groups: tuple[str, ...
 
 
 def _show_manifest(manifest: Manifest) -> None:
-    """Parts, frame rates and losses of a cache."""
+    """Print the parts, frame rates and skipped files of a cache."""
     table = Table("part")
     for name in ("clips", "frames", "hours"):
         table.add_column(name, justify="right")
@@ -183,13 +196,13 @@ def _show_manifest(manifest: Manifest) -> None:
 
 
 def _show_rates(clips: tuple[ClipRecord, ...]) -> None:
-    """How the frame rates found were brought to 60 Hz."""
+    """Print the frame rates that were found, and how each was brought to 60 Hz."""
     for (fps, how), count in sorted(Counter((clip.fps, clip.resampling) for clip in clips).items()):
         click.echo(f"{count} clips at {fps:g} Hz: {how}")
 
 
 def _show_skipped(lines: list[str]) -> None:
-    """The first few skipped files."""
+    """Print the first few skipped files and the number of the others."""
     for line in lines[:SHOWN]:
         click.echo(f"skipped {line}")
     if len(lines) > SHOWN:

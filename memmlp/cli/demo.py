@@ -1,4 +1,4 @@
-"""`memmlp demo`: the whole way on the embedded data."""
+"""`memmlp demo`: the whole pipeline on synthetic motion."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import click
 @click.command("demo")
 @click.argument("overrides", nargs=-1)
 def demo(overrides: tuple[str, ...]) -> None:
-    """Synthetic motion -> VQ-VAE -> Mem-MLP -> metrics -> ONNX -> latency, in minutes, on the CPU.
+    """Run synthetic motion -> VQ-VAE -> Mem-MLP -> metrics -> ONNX -> latency, in minutes, on the CPU.
 
     OVERRIDES are those of `memmlp train`, for example profile=tiny.
     """

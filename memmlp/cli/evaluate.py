@@ -1,4 +1,4 @@
-"""`memmlp eval`: a finished run's metrics, found or made, in any mode, with any inverse kinematics."""
+"""`memmlp eval`: the metrics of a finished run, read where they were measured before, else measured now."""
 
 from __future__ import annotations
 

@@ -106,9 +106,19 @@ def write_exact(
     clips: list[Tensor],
     full: str | None,
 ) -> None:
-    """Write the network's float32 file if it computes on all clips (N, 252) what the trained model does.
+    """Write the float32 ONNX file, provided that it computes on all clips what the trained model does.
 
-    full: the space of the poses, where the file is to have all of the way from trackers to joints.
+    Args:
+        model: the network as it was trained.
+        network: the graph to export, the model itself or its streaming graph.
+        out: the file to write.
+        run_id: the run's id, for the file's metadata.
+        clips: frames (N, 252) of each clip to compare on.
+        full: the frame of reference of the poses, for a file that covers the whole way from trackers to
+            joints; None for the network alone.
+
+    Raises:
+        ClickException: where file and model differ by more than the tolerance; nothing is written then.
     """
     import tempfile
 
@@ -126,7 +136,7 @@ def write_exact(
         else:
             export_network(network, path, run_id)
             apart = [parity(model, path, clip) for clip in clips]
-        worst = float(np.max(apart))  # NaN, if one is
+        worst = float(np.max(apart))  # NaN as soon as one is NaN, unlike max()
         said = f"differs from torch by {worst:.1e} at most on {len(clips)} test clips"
         if not worst <= TOLERANCE:
             raise click.ClickException(f"{said}, more than {TOLERANCE:.0e}: not written")
@@ -142,7 +152,19 @@ def write_int8(
     test: list[Tensor],
     max_growth: float,
 ) -> None:
-    """Write the int8 file if it is as accurate as asked; say what it costs."""
+    """Write the int8 ONNX file, provided that it is accurate enough, and say what it costs.
+
+    Args:
+        network: the streaming graph to quantise.
+        out: the file to write.
+        run_id: the run's id, for the file's metadata.
+        train: frames (N, 252) of the clips that calibrate the quantisation.
+        test: frames (N, 252) of the clips that the cost is measured on.
+        max_growth: the fraction by which MPJPE may grow (0.01 is 1 %).
+
+    Raises:
+        ClickException: where MPJPE grows by more; nothing is written then.
+    """
     import tempfile
 
     from memmlp.deploy.export import export as export_network

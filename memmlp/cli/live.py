@@ -1,4 +1,4 @@
-"""`memmlp live`: a network on a clip or on live trackers, watched on a local page."""
+"""`memmlp live`: a network fed by a clip or by live trackers, watched on a local page."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def live(
     send: bool,
     outputs: Path,
 ) -> None:
-    """A finished run (id, its beginning, or folder) or an ONNX file, live, on a page of this machine.
+    """Show a finished run (id, its beginning, or folder) or an ONNX file live, on a page of this machine.
 
     It is fed a clip in real time, over and over, or tracker poses that arrive as packets.
     The README has their format. Ctrl-C ends it.
@@ -74,7 +74,7 @@ def live(
 
 
 class Feed(NamedTuple):
-    """What the options name: a network, and the poses that it is fed with."""
+    """What the command's options name: a network, and the poses that it is fed."""
 
     network: str
     clip: str | None
@@ -86,7 +86,7 @@ class Feed(NamedTuple):
 
 
 def source_of(feed: Feed) -> PoseSource:
-    """The source of the poses: packets at a port, or a clip over and over."""
+    """Return the source of the poses: packets at a port, or a clip that is repeated."""
     from memmlp.live.player.packets import from_json, from_osc
     from memmlp.live.player.sources import PacketSource
 
@@ -98,14 +98,18 @@ def source_of(feed: Feed) -> PoseSource:
 
 
 def clip_source(feed: Feed, rounds: float = float("inf")) -> ClipSource:
-    """The clip at its rate, so many times."""
+    """Return a source that plays the clip in real time, `rounds` times."""
     from memmlp.live.player.sources import ClipSource
 
     return ClipSource(clip_of(feed), feed.hz, rounds)
 
 
 def clip_of(feed: Feed) -> TrackedClip:
-    """A test clip of a run, or an AMASS npz on the built-in body."""
+    """Load the clip of --clip: an AMASS npz on the built-in body, or a test clip of the run.
+
+    Raises:
+        InputError: for a test clip where the network is an ONNX file, which has none, or an unknown name.
+    """
     from memmlp.common.errors import InputError
     from memmlp.live.player.sources import TrackedClip
 
@@ -123,7 +127,11 @@ def clip_of(feed: Feed) -> TrackedClip:
 
 
 def npz_frames(path: Path) -> np.ndarray:
-    """Frames (N, 252) at 60 Hz of an AMASS npz on the built-in body."""
+    """Return the frames (N, 252) of an AMASS npz, resampled to 60 Hz, on the built-in body.
+
+    Raises:
+        InputError: for a clip of fewer than 3 frames at 60 Hz.
+    """
     import torch
 
     from memmlp.common.errors import InputError
@@ -139,7 +147,7 @@ def npz_frames(path: Path) -> np.ndarray:
 
 
 def sent(feed: Feed) -> None:
-    """Send a clip's packets once, in a space."""
+    """Send the clip's packets once to the port of the options, in the frame of reference of --space."""
     from memmlp.live.player.packets import to_json, to_osc
     from memmlp.live.player.sources import send
     from memmlp.live.spaces import space_of
@@ -152,7 +160,7 @@ def sent(feed: Feed) -> None:
 
 
 def watched(feed: Feed, port: int, no_browser: bool) -> None:
-    """Play the source through the network, and serve the page, until Ctrl-C."""
+    """Play the source through the network and serve the page until Ctrl-C."""
     import threading
     import webbrowser
 

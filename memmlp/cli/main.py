@@ -1,4 +1,4 @@
-"""The command `memmlp`. Sub-commands are imported when they are called, so that --help is quick."""
+"""The command `memmlp`. A sub-command is imported only when it is called, so that --help is quick."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from memmlp.common.errors import InputError, TrainingDiverged
 
 
 class Command(NamedTuple):
-    """Where a command is, and its line of help."""
+    """Where a sub-command is implemented, and its line in the help."""
 
     module: str
     attribute: str
@@ -53,32 +53,35 @@ REFUSED = {
     errno.ENOENT,
     errno.ENAMETOOLONG,
 }
-"""What the system says of a path that a person gave; other errors (a full disk) end a run that began."""
+"""Errors of the operating system that blame a path which a person gave, so that they count as bad input.
+
+Others, such as a full disk, end a run that had begun, and count as its failure.
+"""
 
 
 class Commands(click.Group):
-    """A group that imports a command when it is called."""
+    """A group of commands that imports each one when it is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """The names in the order of the table."""
+        """Return the commands' names in the order of COMMANDS."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The command of that name."""
+        """Import and return the command of that name; None where there is none."""
         if cmd_name not in COMMANDS:
             return None
         command = COMMANDS[cmd_name]
         return getattr(importlib.import_module(f"memmlp.cli.{command.module}"), command.attribute)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The help lines of the table."""
+        """Write the help lines of COMMANDS, without importing the commands."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, command.help) for name, command in COMMANDS.items()])
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The command that the first argument names."""
+        """Find the command that the first argument names. Raises InputError, with a hint, if none fits."""
         if args[0] not in COMMANDS:
             near = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f"did you mean {near[0]}? " if near else ""
@@ -98,7 +101,7 @@ def commands() -> None:
 def main(argv: Sequence[str] | None = None) -> None:
     """Run a command line. Exits with 1 for a failed run, 2 for bad input, 130 when interrupted.
 
-    MEMMLP_TRACEBACK=1 shows where an error came from.
+    With MEMMLP_TRACEBACK=1 in the environment the error is raised, to show where it came from.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
@@ -121,7 +124,7 @@ def _run(arguments: list[str]) -> None:
 
 
 def _exit_code(error: Exception) -> int | None:
-    """The exit code of an error that a line explains; None for a bug."""
+    """Return the exit code of an error that one line explains; None for a bug, which needs its traceback."""
     if isinstance(error, click.Abort):  # what click makes of Ctrl-C
         return 130
     if isinstance(error, click.ClickException):
@@ -132,7 +135,7 @@ def _exit_code(error: Exception) -> int | None:
 
 
 def _line(error: Exception) -> str:
-    """The error in one line."""
+    """Return the error in one line."""
     if isinstance(error, click.Abort):
         return "interrupted; the same command goes on where it was left"
     if isinstance(error, click.UsageError):
@@ -144,7 +147,11 @@ def _line(error: Exception) -> str:
 
 
 def _complete(arguments: list[str]) -> None:
-    """Answer the shell: what `memmlp train -sc install=bash` prints asks `memmlp -sc query=bash`."""
+    """Answer a shell that asks for completions.
+
+    `memmlp train -sc install=bash` prints a script that calls `memmlp -sc query=bash` at every tab. Here the
+    names of commands are completed; below `memmlp train` Hydra does it.
+    """
     words = os.environ.get("COMP_LINE", "").split(" ")
     if len(words) <= 2:
         print(" ".join(name for name in COMMANDS if len(words) == 2 and name.startswith(words[1])))
@@ -156,7 +163,7 @@ def _complete(arguments: list[str]) -> None:
 
 
 def _fail(line: str, code: int) -> NoReturn:
-    """One line on stderr, and out."""
+    """Print one line to stderr and exit."""
     print(f"memmlp: {' '.join(line.split())}", file=sys.stderr)
     sys.exit(code)
 

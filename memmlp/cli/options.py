@@ -1,4 +1,4 @@
-"""Options that several commands share."""
+"""Command-line options and parameter types that several commands share."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import click
 
 
 class Finite(click.FloatRange):
-    """A finite number in a range."""
+    """A number in a range, NaN and infinity excluded."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The number; click takes NaN and infinity for some."""
+        """Return the number; click itself accepts NaN and infinity."""
         number = super().convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value} is no finite number", param, ctx)

@@ -1,4 +1,4 @@
-"""What a person sees at the end of a run."""
+"""What `memmlp train` prints at the end of a run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHE
 
 
 def show(outcome: Outcome) -> None:
-    """Print a run's metrics in both modes, its latency and sizes, and what to look at next."""
+    """Print a run's metrics in both modes, its latency and sizes, and where to look next."""
     console = Console(highlight=False)
     run, results = outcome.run, outcome.results
     console.print(said(outcome), soft_wrap=True)
@@ -43,7 +43,7 @@ def show(outcome: Outcome) -> None:
 
 
 def said(outcome: Outcome) -> str:
-    """What was done, and what was found done."""
+    """Say which stages were done now, and which were found done."""
     if not outcome.made:
         return f"run {outcome.run.id} is finished already; nothing was done (force=true does it again)"
     found = [stage for stage in STAGES if stage not in outcome.made]
@@ -52,7 +52,7 @@ def said(outcome: Outcome) -> str:
 
 
 def older_code(run: Run, changed: Sequence[str]) -> str:
-    """The warning that a run was made before code changed under the same recipe numbers."""
+    """Return the warning that code changed since the run was made, though no recipe number was raised."""
     names = ", ".join(changed[:5]) + (f" and {len(changed) - 5} more" if len(changed) > 5 else "")
     return (
         f"run {run.id} was made before the code of {names} changed, under the same recipe numbers: "
@@ -61,7 +61,7 @@ def older_code(run: Run, changed: Sequence[str]) -> str:
 
 
 def metrics_table(results: dict[str, Any]) -> Table:
-    """The test metrics by mode and branch."""
+    """Make a table of the metrics on test clips, with a column for each mode and branch."""
     columns = [(mode, branch) for mode, branch in COLUMNS if branch in results.get(mode, {})]
     table = Table(
         title="test clips", title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0)

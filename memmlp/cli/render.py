@@ -1,4 +1,4 @@
-"""`memmlp render`: runs beside the truth, coloured by error, as a figure or a film."""
+"""`memmlp render`: predictions of runs beside the truth, coloured by error, as a figure or a film."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ def render(
     frames: int,
     outputs: Path,
 ) -> None:
-    """The truth and finished RUNS (ids, their beginnings, or folders) on one test clip, coloured by error.
+    """Draw the truth and finished RUNS (ids, their beginnings, or folders) on a test clip, coloured by error.
 
-    A PNG has a row for each run and a column for each pose; a GIF or MP4 has them side by side at 30
-    pictures a second. One colour scale holds for all.
+    A PNG has a row for each run and a column for each pose; a GIF or MP4 has them side by side at 30 pictures
+    a second. One colour scale holds for all.
     """
     from memmlp.common.errors import InputError
     from memmlp.config.open_run import open_run
@@ -79,7 +79,7 @@ def render(
 
 
 def check(out: Path, runs: tuple[str, ...], labels: tuple[str, ...]) -> None:
-    """Raise InputError for what is wrong before any run is read."""
+    """Raise InputError for options that are known to be wrong before any run is read."""
     from memmlp.common.errors import InputError
 
     if out.suffix.lower() not in SUFFIXES:
@@ -98,7 +98,19 @@ def taken(
     branch: str,
     mode: str,
 ) -> Take:
-    """The piece of a clip between two times, seconds, as these runs predict it."""
+    """Return the piece of a clip between two times as these runs predict it.
+
+    Args:
+        runs: the opened runs.
+        labels: a label for each run; empty for their ids.
+        clip: the test clip's name; None for the first.
+        times: begin and end of the piece, seconds; None for the clip's end.
+        branch: "rotation" (forward kinematics, the head on its tracker) or "position".
+        mode: "stream" or "window".
+
+    Raises:
+        InputError: where labels repeat, the piece is empty, or the runs have different truths for the clip.
+    """
     import numpy as np
 
     from memmlp.common.errors import InputError
@@ -123,14 +135,14 @@ def taken(
 
 
 def predicted(run: OpenedRun, clip: str, last: int, branch: str, mode: str) -> tuple[np.ndarray, np.ndarray]:
-    """Truth and prediction (last, 22, 3) of a test clip's frames up to `last`, metres, world."""
+    """Return truth and prediction (last, 22, 3) of a test clip's first `last` frames, metres, world."""
     from memmlp.config.open_run import clip_of
     from memmlp.evaluation import modes as evaluation
     from memmlp.motion.body import SPARSE_DIM
 
     model = run.experiment.architecture.load(run.run.weights())
     frames = clip_of(run.test, clip)
-    if mode == "stream":  # what comes later can't matter, as it does to the windows of the other
+    if mode == "stream":  # a stream sees no later frames; windows may
         frames = frames[:last]
     motion = evaluation.MODES[mode](model, [frames])[0][:last]
     frames = frames[:last]
@@ -142,7 +154,11 @@ def predicted(run: OpenedRun, clip: str, last: int, branch: str, mode: str) -> t
 
 
 def span(length: int, title: str, begin: float, end: float | None) -> tuple[int, int]:
-    """The first frame of a clip's piece between two times, seconds, and the one after its last."""
+    """Return a piece's first frame and the one after its last, for begin and end in seconds.
+
+    Raises:
+        InputError: where nothing lies between.
+    """
     from memmlp.common.errors import InputError
     from memmlp.motion.body import FPS
 

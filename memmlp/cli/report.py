@@ -25,10 +25,10 @@ EVERY = ["all", "memory_control"]
 )
 @outputs_option
 def report(words: tuple[str, ...], out: Path | None, outputs: Path) -> None:
-    """One page of tables, effects, accuracy against latency, training curves and runs; needs no network.
+    """Write one page of tables, effects, accuracy against latency, training curves and runs.
 
-    NAMES are those of `memmlp table`; without any, all tables of the paper and the memory's controls.
-    OVERRIDES find the runs again that were made with them.
+    The page needs no network. NAMES are those of `memmlp table`; without any, it has all tables of the paper
+    and the memory's controls. OVERRIDES are those that the sweeps were run with; they find the runs again.
     """
     from memmlp.cli.table import write
     from memmlp.config.shipped import shipped
@@ -48,7 +48,7 @@ def report(words: tuple[str, ...], out: Path | None, outputs: Path) -> None:
 
 
 def chapters_of(names: Sequence[str], overrides: Sequence[str], outputs: Path) -> list[Chapter]:
-    """The tables of some names with the finished runs behind them, each run read once."""
+    """Return the tables of some names with the finished runs behind them; each run is read once."""
     from memmlp.cli.table import MODES, gathered
     from memmlp.report.html import Chapter
     from memmlp.tables.measured import load

@@ -1,4 +1,4 @@
-"""`memmlp results`: runs' results kept with the code, and the pages that are made of them."""
+"""`memmlp results`: runs' results that are kept with the code, and the pages that are made of them."""
 
 from __future__ import annotations
 
@@ -40,9 +40,10 @@ def results() -> None:
 @click.option("--name", "stem", help="Of the file, in place of the sweep's.")
 @outputs_option
 def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | None, outputs: Path) -> None:
-    """Keep the per-clip results of a sweep's finished runs in one small file.
+    """Keep a sweep's results in one small file.
 
-    SWEEP and OVERRIDES are those of `memmlp sweep`. What the file has of other arms and seeds stays.
+    They are the per-clip results of its finished runs. SWEEP and OVERRIDES are those of `memmlp sweep`.
+    Results that the file already has of other arms and seeds stay.
     """
     from memmlp.cli.rounds import shown
     from memmlp.common.files import plain
@@ -78,10 +79,11 @@ def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | N
 )
 @click.option("--check", is_flag=True, help="Write nothing; exit with 1 where a page differs.")
 def docs(folder: Path, check: bool) -> None:
-    """Make all pages of results again from what is kept, without a training.
+    """Make all pages of results from what is kept.
 
-    Every file of data/ gives a table's page; the templates are pages whose sentences take their numbers and
-    verdicts from the tables. Prose that claims an effect by hand is refused, there and in README.md.
+    No training is needed. Every file of data/ gives a table's page. The templates give pages whose sentences
+    take their numbers and verdicts from the tables. Prose that claims an effect by hand is refused, there and
+    in README.md.
     """
     from memmlp.report.markdown import check_claims, pages
 
@@ -101,7 +103,7 @@ def docs(folder: Path, check: bool) -> None:
 
 
 def sources(folder: Path) -> dict[str, KeptTable]:
-    """The tables of all results that are kept below a folder, by the files' names."""
+    """Return the tables of all results that are kept below a folder, by the stems of their files."""
     from memmlp.report.markdown import KeptTable
     from memmlp.report.store import load_kept
 
@@ -113,7 +115,7 @@ def sources(folder: Path) -> dict[str, KeptTable]:
 
 
 def _table(kept: Kept) -> Table:
-    """The table that kept results come to, of the seeds that any of them has."""
+    """Compute the table of kept results, over the seeds that any of their runs has."""
     from memmlp.cli.rounds import of_another
     from memmlp.config.plan import find_sweep
     from memmlp.tables.collect import collect
@@ -134,7 +136,7 @@ def _table(kept: Kept) -> Table:
 
 
 def _outdated(kept: Kept) -> list[str]:
-    """The line about kept runs whose components have other recipe numbers now."""
+    """Return a flag that names the components whose recipe numbers have changed since, if any."""
     from memmlp.runs.recipes import outdated
 
     found = sorted({words for run in kept.every for words in outdated(run.origin.recipes)})
@@ -154,12 +156,12 @@ def _templates(folder: Path) -> dict[str, str]:
 
 
 def _text(path: Path) -> str | None:
-    """A file's text, None where there is none."""
+    """Return a file's text; None where there is no file."""
     return path.read_bytes().decode("utf-8", "replace") if path.exists() else None
 
 
 def _stale(folder: Path, made: Mapping[str, str]) -> list[str]:
-    """Pages of earlier times, whose data or template is gone."""
+    """Return the generated pages whose data or template no longer exists."""
     from memmlp.report.markdown import MARK
 
     every = {path.name for path in folder.glob("*.md") if (_text(path) or "").startswith(MARK)}
@@ -167,6 +169,7 @@ def _stale(folder: Path, made: Mapping[str, str]) -> list[str]:
 
 
 def _write(folder: Path, made: Mapping[str, str], stale: list[str]) -> None:
+    """Write the pages, and remove those whose data or template no longer exists."""
     from memmlp.common.files import atomic_write
 
     folder.mkdir(parents=True, exist_ok=True)

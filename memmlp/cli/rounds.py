@@ -1,4 +1,4 @@
-"""`memmlp sweep --until-decided`: rounds of seeds for the arms whose verdicts are open."""
+"""`memmlp sweep --until-decided`: seeds are added in rounds, for the arms whose verdicts are open."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 
 def record(sweep: Sweep, outputs: Path) -> Path:
-    """The file where a sweep's rounds are kept."""
+    """Return the file where a sweep's rounds are kept."""
     from memmlp.config.plan import sweep_folder
 
     return sweep_folder(sweep, outputs) / "rounds.json"
 
 
 def read(path: Path) -> Rounds | None:
-    """The rounds of a file; None where there is none. Raises InputError where it is damaged."""
+    """Read the rounds of a file; None where there is no file. Raises InputError where it is damaged."""
     from memmlp.tables.rounds import of_json
 
     try:
@@ -39,9 +39,15 @@ def read(path: Path) -> Rounds | None:
 
 
 def begun(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
-    """The rounds of a sweep as far as they are, new ones where no look was taken.
+    """Return the rounds of a sweep as far as they went; new ones where no look was taken yet.
 
-    Raises InputError where looks were taken of something else than the sweep is now, or to another end.
+    Args:
+        sweep: the sweep as it is now.
+        outputs: the folder of runs and caches.
+        most: the seeds of an arm at most (--max-seeds); None for those of the kept rounds, or the default.
+
+    Raises:
+        InputError: where looks were taken of another sweep than it is now, or with another maximum.
     """
     from memmlp.tables.rounds import MOST, begin
 
@@ -58,7 +64,7 @@ def begun(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
 
 
 def check(overrides: Sequence[str], wanted: bool, most: int | None) -> None:
-    """Refuse words that don't go together."""
+    """Refuse words of the command line that don't go together. Raises InputError."""
     from memmlp.statistics import looks
     from memmlp.tables.rounds import MOST
 
@@ -74,7 +80,15 @@ def check(overrides: Sequence[str], wanted: bool, most: int | None) -> None:
 def until_decided(
     sweep: Sweep, outputs: Path, rounds: Rounds, work: Callable[[Sweep, Plan], None], fail_fast: bool
 ) -> tuple[Rounds, Plan]:
-    """Take look after look, the runs that the next one needs made by `work`, until none can be taken."""
+    """Take look after look until none can be taken, and return the last rounds and plan.
+
+    Args:
+        sweep: the sweep as it was begun with.
+        outputs: the folder of runs and caches.
+        rounds: the rounds so far.
+        work: brings the runs of a sweep's plan to their end.
+        fail_fast: whether the first failed run ends it.
+    """
     from dataclasses import replace
 
     from memmlp.config.plan import planned
@@ -95,7 +109,10 @@ def until_decided(
 
 
 def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
-    """Take the next look that can be taken, and record it. Another process may have done so before."""
+    """Take the next look that can be taken, record it, and return the rounds.
+
+    Another process may have taken a look in the meantime; its rounds are returned then.
+    """
     from filelock import FileLock
 
     from memmlp.common.files import write_json
@@ -117,13 +134,16 @@ def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
 
 
 def names(rounds: Rounds, sweep: Sweep, plan: Plan) -> dict[str, str]:
-    """What tells the runs of each arm and its control up to the arm's next look."""
+    """Return, by label, a digest of the runs that each arm's next look will compare."""
     ahead = rounds.next_looks(sweep)
     return {label: _name(rounds, sweep, plan, label, rounds.looks[number]) for label, number in ahead.items()}
 
 
 def _name(rounds: Rounds, sweep: Sweep, plan: Plan, label: str, seeds: int) -> str:
-    """A digest of the identities of an arm's and its control's first runs, and of what is shown of them."""
+    """Digest the identities of the first runs, that many seeds, of an arm and its control.
+
+    The identities include the evaluations that the sweep shows of them.
+    """
     from memmlp.config.plan import digest
     from memmlp.tables.rounds import pair_of
 
@@ -133,7 +153,11 @@ def _name(rounds: Rounds, sweep: Sweep, plan: Plan, label: str, seeds: int) -> s
 
 
 def same_runs(rounds: Rounds, sweep: Sweep, plan: Plan, path: Path) -> None:
-    """Raises InputError where a look was taken of other runs than the sweep's arms have now."""
+    """Check that past looks compared the very runs that the sweep's arms have now.
+
+    Raises:
+        InputError: where a look was of other runs, because data, configs or recipes changed since.
+    """
     for taken in rounds.taken:
         for label, name in taken.runs.items():
             if name != _name(rounds, sweep, plan, label, taken.seeds):
@@ -144,7 +168,7 @@ def same_runs(rounds: Rounds, sweep: Sweep, plan: Plan, path: Path) -> None:
 
 
 def _difference(kept: Rounds, wanted: Rounds) -> str | None:
-    """In what two rounds of a sweep differ, in a word."""
+    """Name in a word what differs between two rounds of a sweep; None where nothing does."""
     if kept.seeds != wanted.seeds:
         return "seeds"
     if (kept.looks, kept.levels) != (wanted.looks, wanted.levels):
@@ -156,8 +180,10 @@ class Shown(NamedTuple):
     """What a table shows of a sweep whose seeds may have been spent in rounds.
 
     Attributes:
-        sweep: with the seeds that were spent. plan: its runs. rounds: whose verdicts stand, if any do.
-        flags: what a reader has to know where rounds were taken, but not of this.
+        sweep: the sweep with the seeds that were spent.
+        plan: the plan of its runs.
+        rounds: the rounds whose verdicts stand; None where no verdict of rounds does.
+        flags: what a reader has to know where rounds were taken of something else.
     """
 
     sweep: Sweep
@@ -167,7 +193,10 @@ class Shown(NamedTuple):
 
 
 def shown(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> Shown:
-    """The sweep with its rounds, where there were any and they are of what it is now."""
+    """Return the sweep with its rounds, where rounds were taken and fit what the sweep is now.
+
+    Otherwise the sweep is shown with its own seeds, and a flag says so where rounds were taken.
+    """
     from memmlp.config.plan import planned
 
     path = record(sweep, outputs)
@@ -187,9 +216,9 @@ def shown(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> Shown:
 
 
 def of_another(kept: Rounds, sweep: Sweep, chosen: bool = False) -> str | None:
-    """The line about looks that were of something else than the sweep is now; None where they are of it.
+    """Return a flag where looks were of something else than the sweep is now; None where they are of it.
 
-    chosen: whether the sweep's seeds were chosen by hand.
+    `chosen` says that the sweep's seeds were chosen by hand.
     """
     from memmlp.tables.rounds import begin
 
@@ -202,7 +231,7 @@ def of_another(kept: Rounds, sweep: Sweep, chosen: bool = False) -> str | None:
 
 
 def spent_before(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
-    """What a reader of verdicts of a fixed number of seeds has to know, where rounds were taken before."""
+    """Return a flag for verdicts of a fixed number of seeds, where rounds were taken of the sweep before."""
     kept = read(record(sweep, outputs))
     if kept is None or not kept.taken:
         return ()
@@ -210,7 +239,7 @@ def spent_before(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
 
 
 def schedule(rounds: Rounds) -> str:
-    """The looks and what they spend."""
+    """Say at how many seeds there are looks, and what share of the 5 % each one spends."""
     words = [
         f"{seeds} ({100 * level:.2g} %)" for seeds, level in zip(rounds.looks, rounds.levels, strict=True)
     ]
@@ -218,7 +247,7 @@ def schedule(rounds: Rounds) -> str:
 
 
 def told(rounds: Rounds, sweep: Sweep, last: Look | None = None) -> list[str]:
-    """How far the arms are: comparisons decided and open, seeds, and what comes next."""
+    """Say how far each arm is: comparisons decided and open, seeds so far, and its next look."""
     latest = rounds.latest()
     ahead, counts = rounds.next_looks(sweep), rounds.counts(sweep)
     tally: dict[str, Counter[str]] = {label: Counter() for label in counts}
@@ -234,7 +263,7 @@ def told(rounds: Rounds, sweep: Sweep, last: Look | None = None) -> list[str]:
 
 
 def closing(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs]) -> list[str]:
-    """Why it ended, what more seeds could do, and how many runs it took."""
+    """Say why the rounds ended, what more seeds could do, and how many runs were spent."""
     latest = [finding for finding, _ in rounds.latest().values()]
     still = [finding for finding in latest if finding.verdict == "open"]
     unseen = Counter(key.label for key in rounds.unseen(sweep))
@@ -249,7 +278,7 @@ def closing(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs]) -> list[str]
 
 
 def _outlooks(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs]) -> list[str]:
-    """A line for each arm that stays open."""
+    """Return a line for each arm that has open comparisons and no next look."""
     from memmlp.tables.rounds import outlook
 
     arms: dict[str, list[int | None]] = {}
@@ -266,7 +295,7 @@ def _outlooks(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs]) -> list[st
 
 
 def _spent(rounds: Rounds, sweep: Sweep) -> str:
-    """The runs that it took, beside those of all arms."""
+    """Say how many runs were spent, beside how many a fixed number of seeds would have taken."""
     used, arms = sum(rounds.counts(sweep).values()), len(sweep.runnable())
     last = max((look.seeds for look in rounds.taken), default=rounds.looks[0])
     fixed = [f"{arms * seeds} with {seeds} seeds for every arm" for seeds in sorted({last, rounds.looks[-1]})]
@@ -274,7 +303,7 @@ def _spent(rounds: Rounds, sweep: Sweep) -> str:
 
 
 def _lined(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Rows as columns."""
+    """Align rows of words in columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip() for row in rows

@@ -1,4 +1,4 @@
-"""`memmlp runs`: what the run folders hold."""
+"""`memmlp runs`: list, show and compare run folders."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 NEWEST = 20
 SHOWN = {
-    # column -> where it is in results.json
+    # the column's head -> the path of its number in results.json
     "stream\ncm": ("stream", "rotation", "MPJPE"),
     "window\ncm": ("window", "rotation", "MPJPE"),
     "jitter": ("stream", "rotation", "Jitter"),
@@ -36,7 +36,10 @@ def runs() -> None:
 @click.option("--all", "every", is_flag=True, help=f"All of them, not only the newest {NEWEST}.")
 @outputs_option
 def list_command(every: bool, outputs: Path) -> None:
-    """The runs, the newest first: MPJPE of the rotation branch in both modes, Jitter, latency of a frame."""
+    """List the runs, the newest first.
+
+    Shown are the MPJPE of the rotation branch in both modes, Jitter, and the latency of a frame.
+    """
     from memmlp.runs.lookup import list_runs
 
     found = list_runs(outputs)
@@ -59,7 +62,10 @@ def list_command(every: bool, outputs: Path) -> None:
 @click.option("--config", "config", is_flag=True, help="Print the resolved config too.")
 @outputs_option
 def show_command(run: str, config: bool, outputs: Path) -> None:
-    """One run, by its id, the beginning of it, or its folder."""
+    """Show one run and its results.
+
+    RUN is its id, the beginning of it, or its folder.
+    """
     from memmlp.runs.identity import flatten
     from memmlp.runs.lookup import find_run
 
@@ -81,7 +87,10 @@ def show_command(run: str, config: bool, outputs: Path) -> None:
 @click.argument("b")
 @outputs_option
 def diff_command(a: str, b: str, outputs: Path) -> None:
-    """What two runs differ in: config and results."""
+    """Show in what two runs differ.
+
+    Their configs and results are compared.
+    """
     from memmlp.runs.lookup import diff, find_run
 
     first, second = find_run(outputs, a), find_run(outputs, b)
@@ -101,7 +110,7 @@ def _console() -> Console:
 
 
 def _table(*columns: str, title: str | None = None) -> Table:
-    """A table of lines without a frame; ids and words stay whole, long values fold."""
+    """Make a table without a border; long values fold, and no word is cut."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=title, title_justify="left")
     for column in columns:
         table.add_column(column, overflow="fold")
@@ -109,7 +118,7 @@ def _table(*columns: str, title: str | None = None) -> Table:
 
 
 def _pairs(facts: Mapping[str, Any], title: str | None = None) -> Table:
-    """Keys and values."""
+    """Make a table of keys and values."""
     table = _table("", "", title=title)
     table.show_header = False
     for key, value in facts.items():
@@ -118,14 +127,14 @@ def _pairs(facts: Mapping[str, Any], title: str | None = None) -> Table:
 
 
 def _text(value: Any) -> str:
-    """A value in few characters."""
+    """Return a value in few characters."""
     if isinstance(value, float):
         return f"{value:.4g}"
     return "-" if value is None else str(value)
 
 
 def _number(results: Mapping[str, Any], path: tuple[str, ...]) -> str:
-    """The number at a path of nested results; - where it is not there."""
+    """Return the number at a path of nested results as text; "-" where there is none."""
     value: Any = results
     for key in path:
         value = value.get(key) if isinstance(value, Mapping) else None
@@ -133,7 +142,7 @@ def _number(results: Mapping[str, Any], path: tuple[str, ...]) -> str:
 
 
 def _age(run: Run) -> str:
-    """Time since the start."""
+    """Return the time since the run started, in its largest whole unit."""
     try:
         started = datetime.fromisoformat(run.manifest.get("started", ""))
         seconds = (datetime.now(UTC) - started).total_seconds()

@@ -1,4 +1,4 @@
-"""`memmlp sweep`: bring all runs of a table, or of a sweep of one's own, to their end."""
+"""`memmlp sweep`: bring all runs of a table, or of a sweep file of one's own, to their end."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def sweep(
     of this machine, Slurm jobs (`executor=slurm slurm.partition=P slurm.time=MINUTES slurm.mem_gb=16
     slurm.cpus=4 slurm.gpus=1`) or tasks of Ray (`executor=ray`).
 
-    With --until-decided all arms get three seeds, and then those with open verdicts alone further ones, up to
-    --max-seeds.
+    With --until-decided all arms get three seeds first. Then only those with open verdicts, and their
+    controls, get more, up to --max-seeds.
     """
     from memmlp.cli import rounds
     from memmlp.config.plan import find_sweep, planned, sweep_folder
@@ -102,14 +102,18 @@ def sweep(
 
 
 def reset(plan: Plan) -> None:
-    """Remove what the plan's networks are so far, so that all of them are to be made."""
+    """Remove what the plan's networks are so far, so that all of them are made again; VQ-VAEs stay."""
     for run in {task.id: plan.run_of(task) for task in plan.tasks if task.kind != "vqvae"}.values():
         with run.lock():
             run.reset()
 
 
 def split_executor(words: tuple[str, ...]) -> tuple[str, dict[str, object], tuple[str, ...]]:
-    """The executor, submitit's parameters for its jobs, and the words that are Hydra's overrides."""
+    """Split the words into the executor's name, submitit's parameters for its jobs, and Hydra's overrides.
+
+    Raises:
+        InputError: for an unknown executor or an unknown or misplaced slurm key.
+    """
     engine, options, rest = "local", {}, []
     for word in words:
         key, _, value = word.partition("=")
@@ -130,7 +134,7 @@ def split_executor(words: tuple[str, ...]) -> tuple[str, dict[str, object], tupl
 
 
 def executor(engine: str, options: dict[str, object], folder: Path) -> Executor:
-    """The executor of that name, its workers' logs below the sweep's folder."""
+    """Return the executor of that name; its workers' logs lie in `folder`/workers."""
     from memmlp.sweep.executors import Ray, Submitit
 
     if engine == "ray":
@@ -139,7 +143,7 @@ def executor(engine: str, options: dict[str, object], folder: Path) -> Executor:
 
 
 def slurm_options(options: dict[str, str]) -> dict[str, object]:
-    """submitit's parameters for ours."""
+    """Translate our slurm keys into submitit's parameters. Raises InputError for a number that is none."""
     numbers = {"time": "timeout_min", "mem_gb": "mem_gb", "cpus": "cpus_per_task", "gpus": "gpus_per_node"}
     words = {"account", "qos", "constraint", "partition"}
     found: dict[str, object] = {}
@@ -156,7 +160,7 @@ def slurm_options(options: dict[str, str]) -> dict[str, object]:
 
 
 def bring_to_end(chosen: Sweep, plan: Plan, engine: str, options: dict[str, object], workers: int) -> None:
-    """Start workers, wait for them, and show the runs as the sweep's."""
+    """Start workers, wait until they have done the plan's runs, and show these as one group in tracking."""
     from memmlp.config.plan import sweep_folder
     from memmlp.sweep.board import Board
     from memmlp.sweep.controller import oversee
@@ -169,9 +173,17 @@ def bring_to_end(chosen: Sweep, plan: Plan, engine: str, options: dict[str, obje
 def hire(
     folder: Path, plan: Plan, engine: str, options: dict[str, object], workers: int
 ) -> tuple[Path, Fleet]:
-    """The file of this process' plan, whatever others plan meanwhile, and workers for it, none started yet.
+    """Save the plan in a file of this process' own, and return that file with a fleet of workers for it.
 
-    folder: of the sweep or search; the workers' logs lie there too.
+    No worker is started yet. Other processes that work on the same sweep have files of their own, so that
+    nobody changes the plan under this one's workers.
+
+    Args:
+        folder: the folder of the sweep or search, where the workers' logs lie too.
+        plan: the plan to work on.
+        engine: the executor's name.
+        options: submitit's parameters.
+        workers: how many workers at most.
     """
     from memmlp.config.work import work, work_alone
     from memmlp.sweep.controller import Fleet
@@ -188,7 +200,7 @@ def hire(
 
 
 def track(plan: Plan) -> None:
-    """Show the runs as the sweep's, where they are tracked."""
+    """Show the plan's finished runs as one group, where runs are tracked."""
     from omegaconf import OmegaConf
 
     from memmlp.config.build import build_tracking
@@ -202,7 +214,7 @@ def track(plan: Plan) -> None:
 
 
 def show(chosen: Sweep, plan: Plan) -> None:
-    """The board once, and what earlier versions of the file left."""
+    """Print the board once, and the runs that earlier versions of the sweep file left behind."""
     from rich.console import Console
 
     from memmlp.config.plan import orphans
@@ -218,7 +230,7 @@ def show(chosen: Sweep, plan: Plan) -> None:
 
 
 def forecast(plan: Plan, workers: int) -> None:
-    """How long what is left may take, from finished runs of the same size and kind."""
+    """Print how long the remaining runs may take, judged by the plan's finished runs of the same kind."""
     left = plan.left()
     known = {kind: _seconds(plan, kind) for kind in {task.kind for task in left}}
     line = f"{len(left)} of {len(plan.tasks)} runs to do, {workers} at once"
@@ -229,14 +241,17 @@ def forecast(plan: Plan, workers: int) -> None:
 
 
 def _seconds(plan: Plan, kind: str) -> list[float]:
-    """What the plan's finished runs of that kind took, all their stages together."""
+    """Return the seconds that each of the plan's finished runs of that kind took, all stages together."""
     runs = [plan.run_of(task) for task in plan.tasks if task.kind == kind]
     found = [run.manifest.get("seconds", 0) for run in runs if run.done]
     return [sum(seconds.values()) if isinstance(seconds, dict) else seconds for seconds in found]
 
 
 def report(shown: Shown, words: Sequence[str], chosen: Sweep) -> None:
-    """The table, what is done, what failed, and the next command. Exits with 1 where something failed."""
+    """Print the table, what is done, what failed, and the next command.
+
+    Exits with 1 where something failed.
+    """
     from memmlp.cli.rounds import closing
     from memmlp.cli.table import MODES, of_plan, on_screen
     from memmlp.config.plan import orphans

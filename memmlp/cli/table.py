@@ -1,4 +1,4 @@
-"""`memmlp table`: what was measured beside what the paper prints."""
+"""`memmlp table`: measured values beside those that the paper prints."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def table(
     plan: bool,
     outputs: Path,
 ) -> None:
-    """The table of a sweep: NAME is a file's path, a shipped sweep, a table's number, or `all`.
+    """Show the table of a sweep: NAME is a file's path, a shipped sweep, a table's number, or `all`.
 
     OVERRIDES are those that the sweep was run with; they find its runs again.
     """
@@ -78,7 +78,10 @@ def table(
 
 @contextmanager
 def _uncollected() -> Iterator[None]:
-    """No garbage collection: what is read of the runs is all kept, and searching it takes a second."""
+    """Switch garbage collection off for a while.
+
+    Everything that is read of the runs is kept, so searching it for garbage would cost a second for nothing.
+    """
     gc.disable()
     try:
         yield
@@ -102,10 +105,21 @@ def gathered(
     read: Read,
     branch: str | None = None,
 ) -> list[Found]:
-    """The tables that some names stand for; of another branch than theirs where one is given.
+    """Gather the tables that some names stand for.
 
-    A table of the paper whose config lacks something (where AMASS lies) shows the paper's values and says so.
-    Raises InputError where none can be composed with the command line's overrides.
+    A table of the paper whose config lacks something (such as the folder of AMASS) shows the paper's values
+    alone and says so.
+
+    Args:
+        names: names of sweeps, as `memmlp table` takes them.
+        overrides: the command line's overrides.
+        outputs: the folder of runs and caches.
+        modes: modes of evaluation to show.
+        read: reads a run (`memmlp.tables.measured.load`).
+        branch: shows this branch in place of the arms' own; None for theirs.
+
+    Raises:
+        InputError: where none of them can be composed with the command line's overrides.
     """
     from memmlp.cli.rounds import shown
     from memmlp.tables.collect import without_runs
@@ -125,7 +139,7 @@ def gathered(
 
 
 def of_plan(shown: Shown, modes: Sequence[str], command: str, read: Read) -> Found:
-    """A planned sweep's finished runs and table."""
+    """Return a planned sweep's finished runs and its table."""
     from memmlp.tables.collect import collect, finished
     from memmlp.tables.planned_runs import finder, older, states
 
@@ -137,7 +151,7 @@ def of_plan(shown: Shown, modes: Sequence[str], command: str, read: Read) -> Fou
 
 
 def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
-    """The sweeps of some names, with the command line's overrides, and the commands that run them."""
+    """Return the sweeps of some names, with the overrides, and the command that runs each."""
     from memmlp.config.plan import find_sweep
     from memmlp.config.shipped import shipped
 
@@ -150,7 +164,7 @@ def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, 
 
 
 def on_screen(tables: Sequence[Table]) -> None:
-    """Show tables as wide as the screen."""
+    """Print tables as wide as the screen."""
     from rich.console import Console
 
     from memmlp.tables.formats import show
@@ -161,7 +175,7 @@ def on_screen(tables: Sequence[Table]) -> None:
 
 
 def plans_on_screen(found: Sequence[Found], modes: Sequence[str]) -> None:
-    """Show how many seeds the paper's effects need, sweep by sweep."""
+    """Print, sweep by sweep, how many seeds the paper's effects would need."""
     from memmlp.tables.grid import caption
     from memmlp.tables.seeds_needed import needs
 
@@ -176,7 +190,7 @@ def plans_on_screen(found: Sequence[Found], modes: Sequence[str]) -> None:
 
 
 def _needed(wanted: Sequence[Need]) -> str:
-    """A line for each comparison, and how to read it."""
+    """Return a line for each comparison, and a note on how to read them."""
     rows = [("arm", "mode", "metric", "paper", "here", "seeds", "needed")]
     for need in wanted:
         differences = (f"{need.paper:+.2f}", f"{need.measured:+.2f}")
@@ -198,7 +212,7 @@ def _needed(wanted: Sequence[Need]) -> str:
 
 
 def _formatted(tables: Sequence[Table], form: str, alone: bool) -> str:
-    """The tables' text; of JSON one object, or a list for `all`."""
+    """Return the tables as one text; in JSON a single object if `alone`, else a list."""
     from memmlp.tables.formats import FORMATS
 
     texts = [FORMATS[form](one) for one in tables]
@@ -208,7 +222,7 @@ def _formatted(tables: Sequence[Table], form: str, alone: bool) -> str:
 
 
 def _form_of(out: Path | None) -> str:
-    """The format that a file's ending tells."""
+    """Return the format that a file's ending tells. Raises InputError for an unknown ending."""
     from memmlp.tables.formats import FORMATS
 
     ending = out.suffix.removeprefix(".") if out else ""
@@ -218,7 +232,7 @@ def _form_of(out: Path | None) -> str:
 
 
 def write(out: Path, text: str) -> None:
-    """Write a file that the command line asks for, and say where."""
+    """Write the file of --out and say where it is. Raises InputError where it can't be written."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""`memmlp track` and `memmlp ui`: MLflow as a view of the run folders."""
+"""`memmlp track` and `memmlp ui`: run folders shown in MLflow."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ def track() -> None:
 @click.option("--uri", default=None, help="MLflow's store, if not MLFLOW_TRACKING_URI or sqlite in OUTPUTS.")
 @outputs_option
 def sync(uri: str | None, outputs: Path) -> None:
-    """Bring MLflow's store up to date with all finished runs and sweeps; again as often as you like."""
+    """Bring MLflow up to date with all runs.
+
+    All finished runs and sweeps are shown in its store. It may be repeated at any time.
+    """
     from memmlp.common.progress import track as bar
     from memmlp.runs.lookup import list_runs
     from memmlp.runs.tracking import MLflowTracking
@@ -42,7 +45,7 @@ def sync(uri: str | None, outputs: Path) -> None:
 @click.option("--port", default=5000, show_default=True)
 @outputs_option
 def ui(port: int, outputs: Path) -> None:
-    """MLflow's page on the tracked runs (needs pip install 'memmlp[ui]')."""
+    """Open MLflow's page on the tracked runs (needs pip install 'memmlp[ui]')."""
     from memmlp.runs.tracking import MLflowTracking
 
     store = MLflowTracking(None, outputs).store()

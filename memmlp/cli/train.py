@@ -1,4 +1,4 @@
-"""`memmlp train`: a Hydra application whose errors are one line each and come before anything runs."""
+"""`memmlp train`: a Hydra application whose errors take one line each and come before anything runs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,15 @@ def command(hydra_arguments: Sequence[str]) -> None:
 
 
 def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None) -> None:
-    """Run Hydra on the arguments of `memmlp train`; `job` takes each composed and checked config."""
+    """Run Hydra on the arguments of `memmlp train`.
+
+    Args:
+        argv: the arguments.
+        job: what to do with each composed and checked config; by default, to train it.
+
+    Raises:
+        InputError: for bad input; of several failed jobs, the last one's failure, the others' being printed.
+    """
     args, parser = parse(argv)
     register()
     version.setbase(VERSION_BASE)
@@ -54,14 +62,14 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
 
 
 def _runs(args: argparse.Namespace) -> bool:
-    """Whether anything is to be trained, and not only shown."""
+    """Return whether the arguments ask to train, and not only to show something."""
     shows = (args.help, args.hydra_help, args.cfg, args.info, args.shell_completion)
     return not any(shows)
 
 
 @contextmanager
 def _raising(overrides: Sequence[str]) -> Iterator[None]:
-    """Let Hydra raise instead of printing, and put its own complaints into one line."""
+    """Make Hydra raise its errors instead of printing them, and put its own complaints into one line."""
     before = os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
@@ -80,7 +88,7 @@ def _raising(overrides: Sequence[str]) -> Iterator[None]:
 def _collecting(
     job: Callable[[DictConfig], object], failures: list[Exception]
 ) -> Callable[[DictConfig], None]:
-    """The job, whose expected failures are kept so that a sweep's other jobs still run."""
+    """Wrap the job so that its expected failures are kept, and the other jobs of a multirun still run."""
 
     def task(cfg: DictConfig) -> None:
         try:
@@ -92,7 +100,7 @@ def _collecting(
 
 
 def run_training(cfg: DictConfig) -> None:
-    """Check the config, bring its run to its end, and show the results."""
+    """Check the config, bring its run to its end, and print the results."""
     import torch
 
     from memmlp.cli.outcome import show

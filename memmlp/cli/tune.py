@@ -1,4 +1,4 @@
-"""`memmlp tune`: search loss weights, or any numeric keys, by the errors on validation."""
+"""`memmlp tune`: search loss weights, or any config keys, by the errors on validation."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def tune(
     OVERRIDES are those of `memmlp train` for all trials, those of the search (`search.n_trials=50`,
     `search.seeds=3`, `search.objectives=[MPJPE,Jitter] search.pruner=none`, `+search.space.optim.lr={low:
     1e-4, high: 1e-2, log: true}`; `search=NAME` takes conf/search/NAME.yaml), and the executor's of `memmlp
-    sweep`. Started again, it goes on where it was left.
+    sweep`. Started again, it goes on where it stopped.
     """
     from memmlp.cli.sweep import split_executor
     from memmlp.search.study import Study
@@ -61,8 +61,11 @@ class Setup(NamedTuple):
     """A search, where it is kept, and what makes its trials' runs.
 
     Attributes:
-        search: what is searched. words: overrides of the command line. outputs: folder of the runs' folder.
-        folder: of the search. config_dir: of configs of the user's.
+        search: what is searched.
+        words: the command line's overrides for all trials.
+        outputs: the folder of runs and caches.
+        folder: the folder of the search.
+        config_dir: a folder of the user's own configs; None for none.
     """
 
     search: Search
@@ -72,12 +75,16 @@ class Setup(NamedTuple):
     config_dir: Path | None
 
     def overrides(self, values: Mapping[str, Value]) -> list[str]:
-        """Those of a trial: the search's base, the command line's, the values."""
+        """Return a trial's overrides: the search's base, the command line's, and the trial's values."""
         return [*self.search.base, *self.words, *self.search.overrides(values)]
 
 
 def prepared(words: Sequence[str], config_dir: Path | None, outputs: Path) -> Setup:
-    """The search of a command line, its keys and ranges checked against the config."""
+    """Return the search of a command line, its keys and ranges checked against the config.
+
+    Raises:
+        InputError: naming the key that is wrong.
+    """
     from memmlp.config.plan import digest
     from memmlp.search.spec import parse_search
 
@@ -88,12 +95,12 @@ def prepared(words: Sequence[str], config_dir: Path | None, outputs: Path) -> Se
     base = _check_space(setup)
     counted = {**asdict(wanted), "n_trials": None, "storage": None}
     if wanted.seeds == 1:
-        del counted["seeds"]  # a search that came before the key is the same one
+        del counted["seeds"]  # so that searches from before this key keep their folder
     return setup._replace(folder=outputs / "tune" / f"{wanted.name}-{digest([base, counted])[:8]}")
 
 
 def _search_config(words: Sequence[str], config_dir: Path | None) -> dict[str, Any]:
-    """The composed config of the search alone."""
+    """Compose the config of the search alone."""
     from memmlp.config.compose import composed_plain
 
     found = composed_plain("tune", words, config_dir).get("search")
@@ -103,9 +110,16 @@ def _search_config(words: Sequence[str], config_dir: Path | None) -> dict[str, A
 
 
 def _check_space(setup: Setup) -> str:
-    """Refuse a range with a value that the config refuses, and a key that changes no trial.
+    """Check the ranges of a search, and describe what a trial's numbers follow from.
 
-    Gives what the trials follow from: the first one's run, and its validations.
+    Returns:
+        A text that names the first trial's run, its interval of validations, and how its network is used. It
+        enters the digest in the name of the search's folder, so that another config or other data is another
+        search.
+
+    Raises:
+        InputError: where a searched key is set on the command line or changes no training, or the config
+            refuses a value.
     """
     from memmlp.runs.identity import inference, trained_with
 
@@ -125,12 +139,12 @@ def _check_space(setup: Setup) -> str:
         except InputError as error:
             raise InputError(f"search.space: {error}") from None
     first = _tasks(setup, setup.search.first())[0][-1]
-    often = f"validated every {first.config['optim']['validate_every']} steps"  # and may be pruned
+    often = f"validated every {first.config['optim']['validate_every']} steps"  # when trials may be pruned
     return f"{first.id}, {often}, used with {inference(first.config)}"
 
 
 def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]:
-    """The runs of a trial with those values, seed by seed, the data prepared for them."""
+    """Return the runs of a trial with these values, a list of tasks for each seed; the data is prepared."""
     from memmlp.config.plan import tasks_of
 
     experiments = _experiments(setup, values)
@@ -138,7 +152,7 @@ def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]
 
 
 def _experiments(setup: Setup, values: Mapping[str, Value]) -> list[Experiment]:
-    """The checked experiments of a trial with those values: the config's seed, and those that follow it."""
+    """Build the checked experiments of a trial: one with the config's seed, and one for each that follows."""
     from memmlp.config.build import build_experiment
     from memmlp.config.compose import composed
 
@@ -153,7 +167,7 @@ def _experiments(setup: Setup, values: Mapping[str, Value]) -> list[Experiment]:
 
 
 def show(setup: Setup) -> None:
-    """How far the search is."""
+    """Print how far the search is."""
     from rich.console import Console
 
     from memmlp.search.board import render
@@ -177,7 +191,7 @@ def search(setup: Setup, study: Study, engine: str, options: dict[str, object], 
 
 
 def leave(setup: Setup, study: Study) -> None:
-    """Write what the search found, and show its runs where they are tracked."""
+    """Write what the search found into its folder."""
     from memmlp.config.shipped import shipped
     from memmlp.search import results
 
@@ -190,7 +204,10 @@ def leave(setup: Setup, study: Study) -> None:
 
 
 def summary(setup: Setup, study: Study) -> None:
-    """The best trials, what mattered, where all of it lies, and the next command."""
+    """Print the best trials, what mattered, where everything lies, and the next command.
+
+    Exits with 1 where no trial is complete.
+    """
     from rich.console import Console
     from rich.text import Text
 

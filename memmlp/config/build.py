@@ -1,4 +1,4 @@
-"""From a composed config to built objects."""
+"""Build the objects that a composed config describes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ COORDINATES: dict[str, type[World]] = {"head_relative": HeadRelative, "world": W
 
 
 def build_experiment(cfg: DictConfig) -> Experiment:
-    """The experiment of a checked config."""
+    """Build the experiment of a checked config."""
     outputs = Path(cfg.paths.outputs)
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     return Experiment(
@@ -80,7 +80,7 @@ def build_experiment(cfg: DictConfig) -> Experiment:
 
 
 def untrained(overrides: Sequence[str]) -> WindowModel:
-    """The network of a command line's overrides with random weights, on the built-in body."""
+    """Build the network of a command line's overrides, with random weights, on the built-in body."""
     architecture = build_architecture(composed(list(overrides)))
     torch.manual_seed(0)
     codes = architecture.vqvae() if architecture.uses_codes else None
@@ -89,20 +89,20 @@ def untrained(overrides: Sequence[str]) -> WindowModel:
 
 
 def build_tracking(cfg: DictConfig) -> Tracking:
-    """What shows the config's runs elsewhere."""
+    """Build what shows the config's runs elsewhere, in MLflow or nowhere."""
     places = {"outputs": Path(cfg.paths.outputs)} if "uri" in cfg.tracking else {}
     return built(cfg.tracking, **places)
 
 
 def device(name: str) -> torch.device:
-    """The device of a config's word."""
+    """Return the torch device for "auto", "cpu" or "cuda". Raises InputError where CUDA is missing."""
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("device=cuda: there is no CUDA device; allowed here is device=cpu or device=auto")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 def build_architecture(cfg: DictConfig) -> Architecture:
-    """What builds the network of a checked config."""
+    """Build the architecture of a checked config, which makes and loads its network."""
     space = {"coordinates": COORDINATES[cfg.frame.coordinates](), "normalize": cfg.frame.normalize}
     vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in VQVAE_SETTINGS})
     if "_target_" in cfg.model:
@@ -121,12 +121,16 @@ def build_architecture(cfg: DictConfig) -> Architecture:
 
 
 def memory_class(cfg: DictConfig) -> type[Memory]:
-    """The class in the memory slot."""
+    """Return the class in the memory slot."""
     return get_class(cfg.memory._target_)
 
 
 def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
-    """What makes the loss over a network's branches: of Mem-MLP weighting and hand term, else as it is."""
+    """Return a function that makes the loss for the branches that a network has.
+
+    Mem-MLP's loss is put together from the weighting, the hand term and the branches. A baseline's loss is
+    complete and ignores the branches.
+    """
     loss = built(cfg.loss)
     if isinstance(loss, Loss):
         return lambda branches: loss
@@ -134,23 +138,32 @@ def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
 
 
 def build_ik(cfg: DictConfig) -> IK:
-    """The inverse kinematics of a checked config."""
+    """Build the inverse kinematics of a checked config."""
     if cfg.evaluation.ik == "off":
         return NoIK()
     return LBFGS(cfg.evaluation.ik_iterations)
 
 
 def build_vqvae_optim(cfg: DictConfig, frames: int) -> Optim:
-    """The VQ-VAE's training; an epoch is as many frames as there are in the training split."""
+    """Build the optimisation of the VQ-VAE, whose length may be given in epochs.
+
+    An epoch is as many training frames as there are in the training split (`frames`).
+    """
     own, often = cfg.vqvae, {name: cfg.optim[name] for name in ("checkpoint_every", "log_every")}
     steps = own.steps or math.ceil(own.epochs * frames / own.batch)
     return vqvae_optim(steps, own.batch, own.lr, own.weight_decay, **often)
 
 
 def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
-    """The typed and checked config of a finished run of a motion network, with overrides of its keys.
+    """Return the typed and checked config of a finished run of a motion network.
 
-    Raises InputError where it is none of this version's, or an override is wrong.
+    Args:
+        run: the run.
+        overrides: KEY=VALUE words that replace keys of its config.
+
+    Raises:
+        InputError: where the run is not finished, its config does not fit this version, or an override is
+            wrong.
     """
     if not run.done or run.manifest.get("kind") != "memmlp":
         raise InputError(f"run {run.id}: not a finished Mem-MLP run")
@@ -168,17 +181,17 @@ def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
 
 
 def _targets(tree: Mapping[str, Any]) -> list[str]:
-    """The paths of all classes that a config names."""
+    """Return the paths of all classes that a config names."""
     return [str(value) for key, value in flatten(tree).items() if key.rsplit(".", 1)[-1] == "_target_"]
 
 
 def _override(cfg: DictConfig, word: str) -> None:
-    """Set a key of a typed config to the value of a word KEY=VALUE."""
+    """Set a key of a typed config as a word KEY=VALUE says."""
     key, equals, _ = word.partition("=")
     if not equals:
         raise InputError(f"{word}: allowed is KEY=VALUE")
     try:
-        override = OverridesParser.create().parse_override(word)  # as `memmlp train` reads it: off is a word
+        override = OverridesParser.create().parse_override(word)  # a bare off is text, not false
         OmegaConf.update(cfg, key, override.value(), merge=True)
     except (OmegaConfBaseException, HydraException) as error:
         raise InputError(f"{key}: {str(error).splitlines()[0]}") from None

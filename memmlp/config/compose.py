@@ -1,4 +1,4 @@
-"""Configs composed from a command line's overrides, checked, their errors one line each."""
+"""Compose and check configs from the overrides of a command line; every error is explained in one line."""
 
 from __future__ import annotations
 
@@ -27,7 +27,11 @@ CONFIG = "train"
 
 
 def parse(argv: Sequence[str]) -> tuple[argparse.Namespace, argparse.ArgumentParser]:
-    """Hydra's arguments, its flags anywhere among the overrides."""
+    """Parse Hydra's command line, whose flags may stand anywhere among the overrides.
+
+    Raises:
+        InputError: for flags that Hydra does not know or that are not allowed here.
+    """
     parser = get_args_parser()
     parser.error = _refuse  # type: ignore[method-assign]
     args = parser.parse_intermixed_args(list(argv))
@@ -41,7 +45,7 @@ def _refuse(message: str) -> NoReturn:
 
 
 def composed(overrides: Sequence[str]) -> DictConfig:
-    """The checked config of the overrides of one job."""
+    """Compose and check the config of one job from its overrides."""
     args, _ = parse(overrides)
     register()
     version.setbase(VERSION_BASE)
@@ -50,7 +54,13 @@ def composed(overrides: Sequence[str]) -> DictConfig:
 
 
 def composed_plain(name: str, overrides: Sequence[str], folder: Path | None = None) -> dict[str, Any]:
-    """The content of a config of another command; folder: of configs of the user's, searched first."""
+    """Compose a config that is not `memmlp train`'s and return it as plain dictionaries.
+
+    Args:
+        name: the config's name.
+        overrides: the command line's overrides.
+        folder: a folder of the user's own configs, searched first.
+    """
     args, _ = parse([*(["--config-dir", str(folder)] if folder else []), *overrides])
     version.setbase(VERSION_BASE)
     with _hydra(args), _explained(overrides):
@@ -58,7 +68,7 @@ def composed_plain(name: str, overrides: Sequence[str], folder: Path | None = No
 
 
 def preflight(args: argparse.Namespace) -> list[DictConfig]:
-    """Compose and check the config of every job, so that a bad one is known before the first starts."""
+    """Compose and check the config of every job, so that a bad one is known before the first job starts."""
     configs = []
     with _hydra(args):
         for overrides in _jobs(args):
@@ -70,7 +80,7 @@ def preflight(args: argparse.Namespace) -> list[DictConfig]:
 
 @contextmanager
 def _hydra(args: argparse.Namespace) -> Iterator[None]:
-    """Hydra with the search path that the arguments ask for, as it will be when the jobs run."""
+    """Initialise Hydra with the search path that the arguments ask for, the same as when the jobs run."""
     path = create_config_search_path(str(_folder(args.config_path or shipped("conf"), "--config-path")))
     if args.config_dir:
         own = f"file://{_folder(args.config_dir, '--config-dir')}"
@@ -83,14 +93,14 @@ def _hydra(args: argparse.Namespace) -> Iterator[None]:
 
 
 def _folder(name: str | Path, option: str) -> Path:
-    """The absolute path of an option's folder."""
+    """Return the absolute path of the folder that an option names. Raises InputError where there is none."""
     if not Path(name).is_dir():
         raise InputError(f"{option} {name}: allowed is an existing folder")
     return Path(name).absolute()
 
 
 def _jobs(args: argparse.Namespace) -> list[list[str]]:
-    """The overrides of each job: one, or those of a sweep."""
+    """Return the overrides of each job: of the single one, or of all jobs of a multirun."""
     with _explained(args.overrides):
         overrides = OverridesParser.create().parse_overrides(args.overrides)
         if not args.multirun and "hydra.mode=MULTIRUN" not in args.overrides:
@@ -100,7 +110,7 @@ def _jobs(args: argparse.Namespace) -> list[list[str]]:
 
 @contextmanager
 def _explained(overrides: Sequence[str]) -> Iterator[None]:
-    """Turn what composing raises into an InputError of one line."""
+    """Turn whatever composing raises into an InputError of one line."""
     try:
         yield
     except InputError:

@@ -1,4 +1,4 @@
-"""What Hydra and OmegaConf raise over a command line, as one line that names the key and what is allowed."""
+"""Explain what Hydra and OmegaConf raise in one line that names the key and says what is allowed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ WORDS = {int: "an integer", float: "a number", bool: "true or false", str: "text
 
 
 def explain(error: Exception, overrides: Sequence[str]) -> str:
-    """The line for an error that composing these overrides raised."""
+    """Return the line for an error that composing these overrides raised."""
     if isinstance(error, OverrideParseException):
         return f"{error.override}: cannot be read; allowed is KEY=VALUE, +KEY=VALUE or ~KEY"
     if isinstance(error, MissingConfigException):
@@ -42,7 +42,7 @@ def explain(error: Exception, overrides: Sequence[str]) -> str:
 
 
 def _missing_option(error: MissingConfigException) -> str:
-    """A group has no such option, or there is no such config."""
+    """Explain that a group has no such option, or that there is no such config."""
     group, _, option = (error.missing_cfg_file or "").rpartition("/")
     if not error.options:
         return _first_line(error)
@@ -52,13 +52,13 @@ def _missing_option(error: MissingConfigException) -> str:
 
 
 def _offender(error: Exception) -> str | None:
-    """The override that Hydra was merging."""
+    """Return the override that Hydra was merging when it failed; None where it does not say."""
     match = re.match(r"Error merging override (.*)", str(error), re.DOTALL)
     return match[1] if match else None
 
 
 def _typed(error: OmegaConfBaseException, override: str | None) -> str:
-    """What the schema refused: an unknown key, a wrong type, a removal."""
+    """Explain what the schema refused: an unknown key, a value of the wrong type, or the removal of a key."""
     name = str(error.full_key or override)
     schema = error.object_type
     if isinstance(error, ConfigAttributeError | ConfigKeyError) and not isinstance(
@@ -77,7 +77,7 @@ def _typed(error: OmegaConfBaseException, override: str | None) -> str:
 
 
 def _expected(name: str, schema: Any, error: OmegaConfBaseException) -> str:
-    """The type that the schema wants for a key, and its limits."""
+    """Return the type that the schema wants for a key, with its limits, in words."""
     if not dataclasses.is_dataclass(schema):
         return f"{_words(error.ref_type)} ({_first_line(error)})"
     own = name.split(".")[-1]
@@ -89,7 +89,7 @@ def _expected(name: str, schema: Any, error: OmegaConfBaseException) -> str:
 
 
 def _words(hint: Any) -> str:
-    """A type in words."""
+    """Return a type in words."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
         return " or ".join(dict.fromkeys(_words(part) for part in parts))
@@ -101,7 +101,7 @@ def _words(hint: Any) -> str:
 
 
 def _composition(text: str) -> str:
-    """Hydra's own complaint, without its recipes for other ways."""
+    """Return Hydra's own complaint without its advice on other ways to write the command."""
     ambiguous = re.match(r"Ambiguous value for argument '(.*)'", text)
     if ambiguous:
         return f"{ambiguous[1]}: more than one value; allowed is one, a list [a,b], or several with -m"

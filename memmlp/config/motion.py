@@ -1,4 +1,4 @@
-"""From a config's `data` to its motion; torch-free, so that finished work is found quickly."""
+"""Build the motion source of a config's `data`. It needs no torch, so that finished work is found quickly."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from memmlp.motion.source import MotionSource
 
 
 def build_motion(cfg: DictConfig) -> MotionSource:
-    """Where the motion is; a synthetic folder's name has its length and seed, so it is never stale."""
+    """Build the source of an experiment's motion.
+
+    A synthetic folder's name holds its length and seed, so that other settings never find stale files.
+    """
     data, root = cfg.data, Path(cfg.data.root)
     generate = None
     if data.synth is not None:

@@ -1,4 +1,4 @@
-"""A finished run with its experiment and data, for the commands that look at it again."""
+"""Open a finished run with its experiment and data, for the commands that look at it again."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from memmlp.runs.run import Run
 
 
 class OpenedRun(NamedTuple):
-    """A finished run, what it was built of, and its prepared data."""
+    """A finished run, the experiment that its config describes, and its prepared data."""
 
     run: Run
     experiment: Experiment
@@ -33,14 +33,17 @@ class OpenedRun(NamedTuple):
 
 
 def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequence[str] = ()) -> OpenedRun:
-    """The finished run of an id, of the beginning of one, or of a folder.
+    """Open a finished run.
 
     Args:
-        overrides: of keys of the evaluation and the deployment, KEY=VALUE.
+        outputs: the folder of runs and caches.
+        name: the run's id, the beginning of one, or the run's folder.
+        device_name: the device to compute on: "auto", "cpu" or "cuda".
+        overrides: KEY=VALUE for keys of the evaluation and the export.
 
     Raises:
-        InputError: where there is none, an override is of its training, or its data is not what it was
-            trained and tested on.
+        InputError: where there is no such run, an override would change its training, or its data is no
+            longer what it was trained and tested on.
     """
     run = find_run(outputs, name)
     experiment = replace(build_experiment(config_of(run, overrides)), device=device(device_name))
@@ -55,12 +58,12 @@ def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequ
 
 
 def clip_of(test: MotionDataset, name: str) -> Tensor:
-    """All frames (N, 252) of a test clip. Raises InputError where there is none of that name."""
+    """Return all frames (N, 252) of a test clip. Raises InputError where no clip has that name."""
     return test.clip(clip_index(test, name))
 
 
 def clip_index(test: MotionDataset, name: str) -> int:
-    """The place of a test clip. Raises InputError, which lists them, where there is none of that name."""
+    """Return the index of a test clip. Raises InputError, which lists all clips, where none has that name."""
     if name not in test.names:
         raise InputError(f"--clip {name}: no such test clip; allowed are {', '.join(test.names)}")
     return test.names.index(name)

@@ -1,7 +1,7 @@
-"""From a sweep file to its plan: every arm composed, checked and given its run's identity.
+"""Make the plan of a sweep file: every arm is composed, checked and given its run's identity.
 
-Composing takes a moment an arm, so a plan is kept and found again while the sweep, the configs and the
-data are what they were.
+Composing takes a moment for each arm. So a plan is kept, and used again as long as the sweep, the configs,
+the code and the data are unchanged.
 """
 
 from __future__ import annotations
@@ -26,7 +26,11 @@ if TYPE_CHECKING:
 
 
 def find_sweep(name: str) -> Sweep:
-    """The sweep of a path, of a shipped file's name, or of a table's number."""
+    """Load the sweep of a path, of a shipped file's name, or of a table's number.
+
+    Raises:
+        InputError: where there is none, or the file is wrong.
+    """
     if is_path(name):
         return load_sweep(Path(name))
     folder = shipped("sweeps")
@@ -39,21 +43,27 @@ def find_sweep(name: str) -> Sweep:
 
 
 def is_path(name: str) -> bool:
-    """Whether a sweep's name is the path of a file."""
+    """Return whether a sweep's name is the path of a file."""
     return name.endswith((".yaml", ".yml")) or "/" in name
 
 
 def sweep_folder(sweep: Sweep, outputs: Path) -> Path:
-    """Where a sweep with its command line's overrides keeps its plan and its workers' logs."""
+    """Return the folder of a sweep with its overrides, where its plan and its workers' logs are kept."""
     key = f"-{digest(sweep.extra)[:8]}" if sweep.extra else ""
     return outputs / "sweeps" / f"{sweep.name}{key}"
 
 
 def planned(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
-    """The plan of a sweep; with `prepare` its data is brought into being first.
+    """Return the plan of a sweep, the kept one where it still holds.
 
-    Entries whose data is not prepared have no identity yet and are left out. Raises InputError, naming arm
-    and key, where a config is wrong.
+    Args:
+        sweep: the sweep with the command line's overrides.
+        outputs: the folder of runs and caches.
+        prepare: whether to prepare data that is not prepared yet. Without it, entries with such data have no
+            identity and are left out.
+
+    Raises:
+        InputError: naming arm and key, where a config is wrong.
     """
     path = sweep_folder(sweep, outputs) / "planned.json"
     stamp = _stamp(sweep, outputs)
@@ -68,7 +78,10 @@ def planned(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
 
 
 def orphans(sweep: Sweep, plan: Plan) -> list[Entry]:
-    """Runs of earlier versions of the sweep that were begun: of labels gone, or with another config now."""
+    """Return the begun runs of earlier versions of the sweep that it no longer has.
+
+    Their arm's label is gone, or the arm has another config now.
+    """
     recorded = read_json(sweep_folder(sweep, plan.outputs) / "entries.json").get("entries", [])
     labels = {arm.label for arm in sweep.arms}
     now = {(entry.label, entry.seed): entry.id for entry in plan.entries}
@@ -84,7 +97,7 @@ def orphans(sweep: Sweep, plan: Plan) -> list[Entry]:
 
 
 def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[str, Any]] | None]:
-    """The plan, and what it relies on of the data; None where some is not prepared."""
+    """Make the plan, and list the data that it relies on; None for the list where some is not prepared."""
     cells: list[tuple[Entry, list[RunTask]]] = []
     data: dict[str, dict[str, Any]] = {}
     complete = True
@@ -95,14 +108,14 @@ def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[s
             if known is not None:
                 found = tasks_of(experiment, known)
                 cells.append((Entry(arm.label, seed, found[-1].id, found[-1].stages), found))
-    cells.sort(key=lambda cell: sweep.seeds.index(cell[0].seed))  # a half-done sweep has every arm
+    cells.sort(key=lambda cell: sweep.seeds.index(cell[0].seed))  # a half-done sweep then has every arm
     tasks = unique(task for _, found in cells for task in found)
     plan = Plan(sweep.name, outputs, tuple(entry for entry, _ in cells), tasks)
     return plan, list(data.values()) if complete else None
 
 
 def _experiments(sweep: Sweep, arm: Arm, outputs: Path) -> Iterable[tuple[int, Experiment]]:
-    """The checked experiments of an arm, seed by seed."""
+    """Yield the checked experiments of an arm with their seeds."""
     from memmlp.config.build import build_experiment
     from memmlp.config.compose import composed
 
@@ -118,7 +131,7 @@ def _experiments(sweep: Sweep, arm: Arm, outputs: Path) -> Iterable[tuple[int, E
 
 
 def tasks_of(experiment: Experiment, data: str) -> list[RunTask]:
-    """The runs of an experiment on prepared data of that digest, the last one its own."""
+    """Return the runs that an experiment needs on prepared data with this digest, its own run last."""
     own = experiment.identity(data)
     above = own.upstream.id if own.upstream else None
     upstream = [RunTask(above, "vqvae", experiment.config)] if above else []
@@ -126,7 +139,10 @@ def tasks_of(experiment: Experiment, data: str) -> list[RunTask]:
 
 
 def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[str, Any]]) -> str | None:
-    """The digest of the experiment's prepared data; None where it isn't prepared."""
+    """Return the digest of the experiment's prepared data; None where it is not prepared.
+
+    The digest is looked up once for each data config and kept in `known`.
+    """
     config = {"data": experiment.config["data"], "paths": experiment.config["paths"]}
     key = digest(config)
     if key not in known:
@@ -138,7 +154,7 @@ def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[st
 
 
 def _fresh(data: dict[str, Any]) -> bool:
-    """Whether the data of a kept plan is what it was."""
+    """Return whether the data that a kept plan relies on is unchanged."""
     from omegaconf import OmegaConf
 
     from memmlp.config.motion import build_motion
@@ -151,7 +167,10 @@ def _fresh(data: dict[str, Any]) -> bool:
 
 
 def _stamp(sweep: Sweep, outputs: Path) -> str:
-    """Digest of all that a plan follows from but the data: sweep, outputs, configs, the package's code."""
+    """Return a digest of everything but the data that a plan follows from.
+
+    That is the sweep, the outputs folder, the configs, and the package's code.
+    """
     package = Path(__file__).parent.parent
     files = [*shipped("conf").rglob("*.yaml"), *package.rglob("*.py")]
     texts = [(str(file), file.read_text(encoding="utf-8")) for file in sorted(files)]
@@ -159,12 +178,15 @@ def _stamp(sweep: Sweep, outputs: Path) -> str:
 
 
 def _remember(sweep: Sweep, plan: Plan, path: Path) -> None:
-    """Add the plan's entries to those that the sweep ever had."""
+    """Add the plan's entries to the record of all entries that the sweep ever had."""
     before = read_json(path).get("entries", [])
     every = {(e["label"], e["seed"], e["id"]): e for e in [*before, *map(asdict, plan.entries)]}
     write_json(path, {"entries": list(every.values())})
 
 
 def digest(value: Any) -> str:
-    """Of a value made of what JSON holds; of a tree of dataclasses its `asdict`."""
+    """Return the SHA-256 digest (hex) of a value that JSON can hold.
+
+    What JSON can't hold enters as its text, so a dataclass has to be given as its `asdict`.
+    """
     return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()

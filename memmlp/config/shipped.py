@@ -1,4 +1,4 @@
-"""The folders that travel with the package: conf and sweeps, of the checkout or inside the wheel."""
+"""The folders that travel with the package: conf and sweeps."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ import memmlp
 
 
 def shipped(name: str) -> Path:
-    """The folder `conf` or `sweeps`: beside the package in a checkout, in it, with `_`, when installed."""
+    """Return the folder `conf` or `sweeps`.
+
+    In a checkout it lies beside the package. In an installed package it lies inside, named `_conf` or
+    `_sweeps`.
+    """
     package = Path(memmlp.__file__).resolve().parent
     installed = package / f"_{name}"
     return installed if installed.is_dir() else package.parent / name

@@ -1,4 +1,4 @@
-"""What a worker of a sweep does with a task: build its experiment and bring its run to its end."""
+"""What a worker of a sweep does with a task: it builds the experiment and brings its run to its end."""
 
 from __future__ import annotations
 
@@ -16,19 +16,35 @@ if TYPE_CHECKING:
 
 
 def work(path: str, threads: int, controller: str) -> None:
-    """Take tasks of the plan in that file while its controller's process lives."""
+    """Work on the tasks of the plan in that file for as long as the process of its controller lives.
+
+    Args:
+        path: the plan's file.
+        threads: torch's threads where the config leaves them open; 0 leaves the choice to torch.
+        controller: the lock file that the controller's process holds (`Presence`).
+    """
     work_on(Path(path), partial(perform, Path(path), threads), lambda: Presence.of(Path(controller)))
 
 
 def work_alone(path: str) -> None:
-    """Take tasks of the plan in that file until none is left, whether or not a sweep's controller stays."""
+    """Work on the tasks of the plan in that file until none is left, on a machine apart from the controller.
+
+    A worker on a cluster outlives the process that started it: a closed plan (a sweep's) is worked to its
+    end, an open one (a search's) while its controller still shows signs of life.
+    """
     work_on(Path(path), partial(perform, Path(path), 0), lambda: directed(Path(path)))
 
 
 def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
-    """Bring the task's run to its end; Cancelled if the plan no longer wants it.
+    """Bring the task's run to its end.
 
-    threads: of torch, where the config leaves them open; 0 for torch's choice.
+    Args:
+        path: the plan's file, read again on the way to see whether the run is still wanted.
+        threads: torch's threads where the config leaves them open; 0 leaves the choice to torch.
+
+    Raises:
+        Cancelled: when the plan no longer wants the run.
+        InputError: when data or code changed since the plan was made.
     """
     import torch
     from omegaconf import OmegaConf
@@ -47,7 +63,7 @@ def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
 
 
 def check_identity(experiment: Experiment, task: RunTask) -> None:
-    """Raise InputError where this code takes the task's config for another run than the plan does."""
+    """Raise InputError where this code and data give the task's config another identity than the plan has."""
     from memmlp.config.plan import tasks_of
 
     digest = experiment.data.prepare().digest
@@ -56,7 +72,7 @@ def check_identity(experiment: Experiment, task: RunTask) -> None:
 
 
 def check_wanted(path: Path, run_id: str, step: int, values: dict[str, float]) -> None:
-    """Raise Cancelled once the plan in that file has given the run up, or all of its runs."""
+    """Raise Cancelled once the plan in that file no longer wants this run, or was stopped as a whole."""
     plan = Plan.load(path)
     if run_id in plan.cancelled or plan.stopped:
         raise Cancelled(f"run {run_id} was cancelled at step {step}")

@@ -1,4 +1,4 @@
-"""An exported network and what its file tells of it."""
+"""An exported network, and what its file says about it."""
 
 from __future__ import annotations
 
@@ -17,12 +17,18 @@ AGAIN = "export it again with memmlp export RUN --out FILE.onnx"
 
 
 class ExportedNetwork(OnnxStream):
-    """An ONNX file of scope `network`. Raises InputError where a file is none, or lacks what must be known.
+    """An ONNX file of scope `network`.
 
     Attributes:
-        sparse: input (1, 54), to be written before a step.
+        sparse: the input (1, 54), to be written before a step.
         rotation6d, position: outputs (22, 6) and (22, 3) of the last step, overwritten by the next.
-        skeleton, fps, frames, branches: joints, tree and rest pose; frames per second; T; what is learned.
+        skeleton: joints, tree and rest pose.
+        fps: frames per second.
+        frames: the window's length T.
+        branches: what the network learned to predict: rotations, and perhaps positions.
+
+    Raises:
+        InputError: where the file is no such network, or lacks what must be known of it.
     """
 
     def __init__(self, path: Path):
@@ -32,7 +38,7 @@ class ExportedNetwork(OnnxStream):
         self.rotation6d, self.position = self.outputs["rotation6d"][0], self.outputs["position"][0]
 
     def _read(self, meta: dict[str, str]) -> None:
-        """What the metadata tell."""
+        """Read and check the file's metadata."""
         if "tracker_positions" in self.inputs:
             raise InputError(f"{self.path}: an ONNX file of scope full; allowed here is one of scope network")
         if "sparse" not in self.inputs or "fps" not in meta:

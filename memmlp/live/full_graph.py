@@ -1,11 +1,14 @@
 """The whole way from trackers to a body as one ONNX file, for programs without Python (`--scope full`).
 
-Inputs: `tracker_positions` (1, 3, 3), metres, and `tracker_rotations` (1, 3, 3, 3), matrices, of head, left
-and right wrist, one frame at 60 Hz; and `state.*`, all zeros for a fresh start. Outputs: `rotations`
-(1, 22, 3, 3), local matrices, the root's global; `positions` (1, 22, 3), metres, by forward kinematics, the
-head on its tracker; `joints` (1, 22, 3), metres, the network's own positions; and the new `state.*` under the
-same names with the suffix `.next`. All in the frame of reference that was chosen (memmlp.live.spaces).
-Trackers that are lost, other rates and gaps (memmlp.live.trackers) are the caller's: NaN in is NaN out.
+Inputs are one frame at 60 Hz: `tracker_positions` (1, 3, 3), metres, and `tracker_rotations` (1, 3, 3, 3),
+matrices, of head, left and right wrist; and the states `state.*`, all zeros for a fresh start.
+
+Outputs are `rotations` (1, 22, 3, 3), local matrices, the root's global; `positions` (1, 22, 3), metres, by
+forward kinematics with the head on its tracker; `joints` (1, 22, 3), metres, the network's own positions; and
+the new states, under the same names with the suffix `.next`.
+
+All are in the frame of reference that was chosen (memmlp.live.spaces). Lost trackers, other rates and gaps
+(memmlp.live.trackers) are left to the caller: NaN in is NaN out.
 """
 
 from __future__ import annotations
@@ -43,15 +46,15 @@ from memmlp.networks.window_model import WindowModel
 TRACKERS = ("tracker_positions", "tracker_rotations")
 OUTPUTS = ("rotations", "positions", "joints")
 OWN = {"seen": (1, 1), "positions": (1, 3, 3), "rotations": (1, 3, 3, 3)}
-"""States beside the network's: whether there was a frame, and its trackers in AMASS' world."""
+"""States beside the network's: whether there was a frame before, and its trackers in AMASS' world."""
 
 
 class FullStep(nn.Module):
     """One frame, from trackers to joints, with flat inputs and outputs.
 
     Args:
-        model: the network, as it was trained or as its live stream.
-        space: of what goes in and comes out.
+        model: the network, as it was trained or as its streaming graph.
+        space: the frame of reference of what goes in and comes out.
     """
 
     world: Tensor
@@ -69,12 +72,12 @@ class FullStep(nn.Module):
         self.register_buffer("offsets", torch.tensor(skeleton.offsets, dtype=torch.float32)[None, ..., None])
 
     def initial_state(self) -> dict[str, Tensor]:
-        """A fresh start: zeros."""
+        """Return the states of a fresh start, which are zeros."""
         own = {f"trackers.{name}": torch.zeros(shape) for name, shape in OWN.items()}
         return own | self.model.initial_state(1)
 
     def forward(self, positions: Tensor, rotations: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        """The inputs of the module's docstring in their order -> its outputs in theirs."""
+        """Compute the outputs of the module's docstring from its inputs, both in that order."""
         seen, last_positions, last_rotations = state[: len(OWN)]
         positions = positions @ self.world.T
         rotations = self.world @ rotations * self.body
@@ -90,7 +93,12 @@ class FullStep(nn.Module):
         return *self.posed(motion[:, -1], positions[:, 0]), seen.clamp_min(1), positions, rotations, *kept
 
     def posed(self, motion: Tensor, head: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Rotations, positions and joints, in the space, of world motion (1, 198) with the head at (1, 3)."""
+        """Return rotations, positions and joints in the space.
+
+        Args:
+            motion: world motion (1, 198).
+            head: the head tracker's position (1, 3), metres, AMASS' world.
+        """
         local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6)))
         reached = self.reached(local)
         positions = reached + (head - reached[:, HEAD])[:, None]
@@ -100,7 +108,10 @@ class FullStep(nn.Module):
         return turned, positions @ self.world, joints @ self.world
 
     def reached(self, local: Tensor) -> Tensor:
-        """Positions (1, 22, 3) relative to the root, as `Skeleton.positions`: few operations, large ones."""
+        """Return positions (1, 22, 3) relative to the root, as `BodyTree.positions` computes them.
+
+        It takes few operations on large arrays, which are quicker in a graph than many small ones.
+        """
         bottom = torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(1, N_JOINTS, 1, 4)
         transforms = torch.cat([torch.cat([local, self.offsets], -1), bottom], -2)
         transforms = torch.cat([transforms, torch.eye(4).expand(1, 1, 4, 4)], 1)
@@ -112,7 +123,8 @@ class FullStep(nn.Module):
 def export_full(model: WindowModel | StreamingGraph, path: Path, run_id: str, space: str = "amass") -> None:
     """Write the whole step, on the CPU in float32, as one ONNX file with its metadata.
 
-    Raises InputError for an unknown space.
+    Raises:
+        InputError: for an unknown space.
     """
     step = FullStep(model.cpu().eval(), space_of(space)).eval()
     state = step.initial_state()
@@ -128,9 +140,9 @@ def export_full(model: WindowModel | StreamingGraph, path: Path, run_id: str, sp
 
 
 def trackers_of(frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions (N + 1, 3, 3) and rotations (N + 1, 3, 3, 3) of the trackers of frames (N, 252 or 54).
+    """Return the trackers of frames (N, 252 or 54): positions (N + 1, 3, 3) and rotations (N + 1, 3, 3, 3).
 
-    The first is the one before the first frame, by that frame's velocities.
+    The first of them is the moment before the first frame, which follows from that frame's velocities.
     """
     sixd = frames[:, SPARSE_ROTATION].unflatten(-1, (3, 6))
     turned = sixd_to_matrix(frames[:1, SPARSE_ANGULAR_VELOCITY].unflatten(-1, (3, 6)))
@@ -141,9 +153,10 @@ def trackers_of(frames: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def full_parity(model: WindowModel, path: Path, clip: Tensor, space: str = "amass") -> float:
-    """Largest difference between torch and the file, each with its own history, over a clip (N, 252).
+    """Return the largest difference between torch and the file over a clip (N, 252).
 
-    Torch goes the way of evaluation: the features of the same trackers, the network, `Frame.pose`.
+    Each of them has its own history. Torch goes the way of evaluation: the features of the same trackers, the
+    network, and `Normalizer.pose`.
     """
     model, there, stream = model.cpu().eval(), space_of(space), OnnxStream(path)
     positions, rotations = trackers_of(clip[:, :SPARSE_DIM].cpu())
@@ -156,7 +169,7 @@ def full_parity(model: WindowModel, path: Path, clip: Tensor, space: str = "amas
 
 
 def _expected(normalizer: Normalizer, motion: Tensor, sparse: Tensor, space: Space) -> list[np.ndarray]:
-    """Rotations, positions and joints in a space, of world motion (N, 198) at inputs (N, 54)."""
+    """Return rotations, positions and joints in a space, of world motion (N, 198) at inputs (N, 54)."""
     local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6))).numpy()
     positions = [normalizer.pose(motion, sparse), motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))]
     return [space.pose_out(local), *(space.positions_out(part.numpy()) for part in positions)]

@@ -1,6 +1,6 @@
-"""Rotations and forward kinematics on NumPy arrays, for one frame at a time. Quaternions are x, y, z, w.
+"""Rotations and forward kinematics on NumPy arrays, one frame at a time. Quaternions are x, y, z, w.
 
-`memmlp.motion.geometry` has the same on torch tensors; here is what a live stream needs, without torch.
+`memmlp.motion.geometry` has the same on torch tensors; this is what a live stream needs without torch.
 """
 
 from __future__ import annotations
@@ -9,8 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-# With q the outer product of a quaternion (x, y, z, w) with itself, flattened, its matrix is q @ _MATRIX,
-# flattened, and back q is (m @ _MATRIX.T + identity) / 4.
+# Let q be the outer product of a quaternion (x, y, z, w) with itself, flattened to (16,). The rotation matrix
+# m, flattened to (9,), is linear in it: m = q @ _MATRIX, and back q = (m @ _MATRIX.T + identity) / 4. So a
+# conversion is a single product, which is quick for one frame.
 _MATRIX: np.ndarray = np.zeros((4, 4, 3, 3))
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _MATRIX[_i, _i, [0, 1, 2], [0, 1, 2]] = -1
@@ -23,16 +24,16 @@ _IDENTITY = np.eye(4).reshape(16)
 
 
 def quaternion_to_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Unit quaternions (..., 4) xyzw -> (..., 3, 3)."""
+    """Convert unit quaternions (..., 4), xyzw, to matrices (..., 3, 3)."""
     outer = quaternion[..., :, None] * quaternion[..., None, :]
     return (outer.reshape(*quaternion.shape[:-1], 16) @ _MATRIX).reshape(*quaternion.shape[:-1], 3, 3)
 
 
 def matrix_to_quaternion(matrix: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) -> unit quaternions (n, 4) xyzw, w not negative; accurate at every angle.
+    """Convert matrices (n, 3, 3) to unit quaternions (n, 4), xyzw, w not negative; accurate at every angle.
 
-    A row of the quaternion's outer product with itself is the quaternion, scaled; the row of the largest
-    component is well conditioned.
+    Each row of a quaternion's outer product with itself is the quaternion, scaled by one of its components.
+    The row of the largest component is well conditioned.
     """
     outer = (matrix.reshape(-1, 9) @ _MATRIX.T + _IDENTITY).reshape(-1, 4, 4)
     pivot = np.einsum("nii->ni", outer).argmax(1)
@@ -43,7 +44,7 @@ def matrix_to_quaternion(matrix: np.ndarray) -> np.ndarray:
 
 
 def turned_by(matrix: np.ndarray, share: np.ndarray | float) -> np.ndarray:
-    """Rotations (n, 3, 3) about the same axes by a share (n,) or one of their angles (0 to pi)."""
+    """Return rotations (n, 3, 3) about the same axes by a share, (n,) or one, of their angles (0 to pi)."""
     quaternion = matrix_to_quaternion(matrix)
     vector, w = quaternion[:, :3], quaternion[:, 3]
     sine = np.sqrt(np.einsum("ni,ni->n", vector, vector))
@@ -53,12 +54,15 @@ def turned_by(matrix: np.ndarray, share: np.ndarray | float) -> np.ndarray:
 
 
 def slerp(a: np.ndarray, b: np.ndarray, weight: float) -> np.ndarray:
-    """Rotations (n, 3, 3) on the shortest way from a (weight 0) to b (1); beyond 1 it goes on."""
+    """Interpolate between rotations (n, 3, 3) on the shortest way from a (weight 0) to b (weight 1).
+
+    Weights beyond 1 extrapolate.
+    """
     return a @ turned_by(a.swapaxes(-1, -2) @ b, weight)
 
 
 def sixd_to_matrix(sixd: np.ndarray) -> np.ndarray:
-    """(n, 6) -> (n, 3, 3) by Gram-Schmidt, as `memmlp.motion.geometry.sixd_to_matrix`."""
+    """Convert (n, 6) to matrices (n, 3, 3) by Gram-Schmidt, as `memmlp.motion.geometry.sixd_to_matrix`."""
     columns = np.empty((3, 5, len(sixd)), sixd.dtype)  # x y z x y, so that a cross product takes slices
     columns[:2, :3] = sixd.T.reshape(2, 3, -1)
     first, second = columns[:2, :3]
@@ -72,23 +76,26 @@ def sixd_to_matrix(sixd: np.ndarray) -> np.ndarray:
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(3, n) and (3, n) -> (n,)."""
+    """Return the dot products (n,) of the columns of (3, n) and (3, n)."""
     return np.add.reduce(a * b, 0)
 
 
 class BodyTree:
     """Joints, their tree and their rest pose; forward kinematics of one frame.
 
-    Every joint's transform is multiplied by that of its ancestor 1, 2, 4, ... joints above, so that a tree of
-    depth 8 takes three batched products.
+    Every joint's transform is multiplied by that of its ancestor 1, 2, 4, ... joints above. So a tree of
+    depth 8 takes three batched products instead of eight.
 
     Args:
-        joints: names (J). parents: indices (J), -1 of the root, which is the first.
-        rest: rest positions (J, 3), metres, SMPL's body frame.
+        joints: the joints' names (J).
+        parents: the indices of their parents (J); -1 for the root, which is the first.
+        rest: the joints' positions in the rest pose (J, 3), metres, SMPL's body frame.
 
     Attributes:
-        tracked: indices of head, left and right wrist. offsets: (J, 3) metres from the parent, 0 of the root.
-        ancestors: for each joint and one more above the root (J + 1), who is 1, 2, 4, ... above it.
+        tracked: the indices of head, left and right wrist.
+        offsets: (J, 3), metres, from the parent to the joint; 0 for the root.
+        ancestors: for 1, 2, 4, ... the index of the ancestor so far above, for each joint and for one more
+            above the root (J + 1), which stands for the identity.
     """
 
     def __init__(self, joints: Sequence[str], parents: Sequence[int], rest: np.ndarray):
@@ -107,7 +114,11 @@ class BodyTree:
         self._transforms[:count, :3, 3] = self.offsets
 
     def positions(self, local: np.ndarray) -> np.ndarray:
-        """Positions (J, 3), metres, relative to the head, of local rotations (J, 3, 3), the root's global."""
+        """Return the positions (J, 3), metres, relative to the head.
+
+        Args:
+            local: local rotations (J, 3, 3), the root's global.
+        """
         transforms = self._transforms
         transforms[:-1, :3, :3] = local
         for ancestor in self.ancestors:

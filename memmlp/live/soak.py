@@ -1,4 +1,4 @@
-"""A long stream: does it stay finite, as good as it was, and as small."""
+"""A long stream: whether it stays finite, as accurate as it was, and no larger in memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,13 @@ TENTHS = 10
 
 
 class TrackedMotion(NamedTuple):
-    """Trackers and the truth: (N, 3, 3) metres, (N, 3, 3, 3), and joints (N, 22, 3), AMASS' world."""
+    """Trackers and truth of a motion, in AMASS' world.
+
+    Attributes:
+        positions: of head, left and right wrist (N, 3, 3), metres.
+        rotations: of head, left and right wrist (N, 3, 3, 3).
+        joints: the true joints (N, 22, 3), metres.
+    """
 
     positions: np.ndarray
     rotations: np.ndarray
@@ -25,12 +31,13 @@ class TrackedMotion(NamedTuple):
 
 
 class Soaked(NamedTuple):
-    """What came of it.
+    """What a long stream showed.
 
     Attributes:
-        frames: how many. finite: whether every number of every pose was.
-        errors: mean distance of the joints from the truth, cm, in each tenth.
-        growth: of the process' memory from the end of the first tenth to the end, bytes.
+        frames: how many there were.
+        finite: whether every number of every pose was finite.
+        errors: the joints' mean distance from the truth in each tenth, cm.
+        growth: of the process's memory, from the end of the first tenth to the end, bytes.
     """
 
     frames: int
@@ -40,15 +47,18 @@ class Soaked(NamedTuple):
 
 
 def repetitions(length: int, least: int) -> int:
-    """How often a motion of `length` frames makes at least `least`, with the same frames in every tenth."""
+    """Return how often to repeat a motion of `length` frames for at least `least` frames.
+
+    It is a multiple of ten, so that every tenth has the same frames.
+    """
     return TENTHS * -(-least // (TENTHS * length))
 
 
 def soak(stream: Stream, motion: TrackedMotion, times: int) -> Soaked:
     """Stream a motion `times` times in a row, a multiple of ten, without a reset or a gap in between.
 
-    Each tenth holds the same frames. What is not the same is how the first of all begins: fresh, while every
-    later repetition begins with a jump from the motion's end.
+    Each tenth holds the same frames. Only their beginnings differ: the first repetition begins fresh, every
+    later one with a jump from the motion's end.
     """
     length, finite, errors, size = len(motion.joints), True, np.zeros(TENTHS), 0
     total = length * times
@@ -65,7 +75,7 @@ def soak(stream: Stream, motion: TrackedMotion, times: int) -> Soaked:
 
 
 def memory() -> int:
-    """Bytes of memory that the process has; where the system does not tell, the most that it had."""
+    """Return the bytes of memory that the process has; where the system doesn't tell, the most it had."""
     statm = Path("/proc/self/statm")
     if statm.exists():
         return int(statm.read_text().split()[1]) * resource.getpagesize()

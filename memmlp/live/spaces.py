@@ -6,8 +6,8 @@
 | openxr | right-handed, Y up, -Z forward, +X right | upright in the world, faces -Z, left is -X          |
 | unity  | left-handed, Y up, +Z forward, +X right  | upright in the world, faces +Z, left is -X          |
 
-All are in metres. Positions: (x, y, z) of openxr is (x, -z, y) of amass and (x, y, -z) of unity, so that
-forward is +Y of amass. A global rotation turns the T-pose of the third column into the world: in openxr and
+All are in metres. A position (x, y, z) of openxr is (x, -z, y) of amass and (x, y, -z) of unity, so that
+forward is +Y of amass. A global rotation turns the T-pose of the third column into the world. In openxr and
 unity it is the identity for a person who stands upright and looks forward, so that a headset's own pose is
 almost the head's. A local rotation (of a joint relative to its parent) has the T-pose's axes on both sides.
 """
@@ -26,9 +26,10 @@ class Space:
     """A frame of reference. Arrays may have any leading shape.
 
     Attributes:
-        name: by which users call it.
-        world: orthogonal (3, 3), its positions -> AMASS' world; mirrors where the space is left-handed.
-        body: signs (3,), the axes of its T-pose -> SMPL's body frame; they mirror where `world` does.
+        name: the name by which users call it.
+        world: orthogonal (3, 3), from its positions to AMASS' world; it mirrors where the space is
+            left-handed.
+        body: signs (3,), from the axes of its T-pose to SMPL's body frame; they mirror where `world` does.
     """
 
     name: str
@@ -36,31 +37,34 @@ class Space:
     body: np.ndarray
 
     def positions_in(self, positions: np.ndarray) -> np.ndarray:
-        """Positions (..., 3) of this space in AMASS' world."""
+        """Bring positions (..., 3) from this space to AMASS' world."""
         return positions @ self.world.T
 
     def positions_out(self, positions: np.ndarray) -> np.ndarray:
-        """Positions (..., 3) of AMASS' world in this space."""
+        """Bring positions (..., 3) from AMASS' world to this space."""
         return positions @ self.world.astype(positions.dtype)
 
     def rotations_in(self, rotations: np.ndarray) -> np.ndarray:
-        """Global rotations (..., 3, 3) of this space in AMASS' world."""
+        """Bring global rotations (..., 3, 3) from this space to AMASS' world."""
         return self.world @ rotations * self.body
 
     def rotations_out(self, rotations: np.ndarray) -> np.ndarray:
-        """Global rotations (..., 3, 3) of AMASS' world in this space."""
+        """Bring global rotations (..., 3, 3) from AMASS' world to this space."""
         return self.world.T.astype(rotations.dtype) @ rotations * self.body.astype(rotations.dtype)
 
     def pose_in(self, local: np.ndarray) -> np.ndarray:
-        """Local rotations (..., J, 3, 3) of this space, the root's global, as AMASS has them."""
+        """Bring local rotations (..., J, 3, 3), the root's global, from this space to AMASS' conventions."""
         return self._posed(local, self.rotations_in(local[..., 0, :, :]))
 
     def pose_out(self, local: np.ndarray) -> np.ndarray:
-        """Local rotations (..., J, 3, 3) as AMASS has them, the root's global, in this space."""
+        """Bring local rotations (..., J, 3, 3), the root's global, from AMASS' conventions to this space."""
         return self._posed(local, self.rotations_out(local[..., 0, :, :]))
 
     def _posed(self, local: np.ndarray, root: np.ndarray) -> np.ndarray:
-        """The joints' rotations with the T-pose's other axes on both sides, which is the way in and out."""
+        """Put the other T-pose's axes on both sides of local rotations, and `root` in place of the root's.
+
+        The signs are their own inverse, so that this serves both directions.
+        """
         turned = local * np.outer(self.body, self.body).astype(local.dtype)
         turned[..., 0, :, :] = root
         return turned
@@ -77,7 +81,7 @@ SPACES = {
 
 
 def space_of(name: str) -> Space:
-    """The space of a name. Raises InputError for an unknown one."""
+    """Return the space of that name. Raises InputError for an unknown one."""
     if not isinstance(name, str) or name not in SPACES:
         raise InputError(f"space={name}: no such frame of reference; allowed: {', '.join(SPACES)}")
     return SPACES[name]

@@ -1,4 +1,4 @@
-"""A trained network live: three trackers' poses in, a body's out, in the caller's frame of reference."""
+"""A trained network live: three trackers' poses in, a body's pose out, in the caller's frame of reference."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ TRACKERS = ("head", "left", "right")
 IDENTITY = np.eye(3)
 NOTHING = np.full((3, 12), np.nan)
 NEUTRAL = np.concatenate([np.zeros(3), IDENTITY.reshape(9)])
-FARTHEST = 1e6  # metres
-LATEST = 1e10  # seconds; at much more frames of 1/60 s can't be told apart
-UNIT = 1e-2  # by how much a quaternion's norm, or a matrix' columns, may be off
+FARTHEST = 1e6  # metres; a tracker farther from the origin is taken as lost
+LATEST = 1e10  # seconds; at much later times floats can't tell frames of 1/60 s apart
+UNIT = 1e-2  # how far a quaternion's norm may be from 1, or a matrix from orthonormal
 
 Tracker = tuple[ArrayLike, ArrayLike] | None
 
@@ -36,14 +36,16 @@ class Pose(NamedTuple):
     """A person at a time, in the caller's frame of reference.
 
     Attributes:
-        time: of the frame, seconds of the caller's clock.
-        positions: of the joints (22, 3), metres: forward kinematics of the rotations, head on its tracker.
+        time: the frame's time, seconds of the caller's clock.
+        positions: the joints (22, 3), metres, by forward kinematics of the rotations, the head on its
+            tracker.
         rotations: local rotations (22, 3, 3), or quaternions xyzw (22, 4); the root's is global.
-        joints: (22, 3), metres, from the network's position branch; where it has none, they follow from its
-            rotations.
+        joints: the joints (22, 3), metres, from the network's position branch; where it has none, they follow
+            from its rotations.
         held: which of "head", "left", "right" are lost at this sample, and held.
         fresh: whether this call made a frame; if not, the pose is the last frame's.
-        restarted: whether the network began anew at this frame: the first, and those after `reset` or a gap.
+        restarted: whether the network began anew at this frame, as it does at the first one, and after
+            `reset` or a gap.
     """
 
     time: float
@@ -56,10 +58,11 @@ class Pose(NamedTuple):
 
 
 class Offsets(NamedTuple):
-    """Where the joints are on the devices, in the axes of the caller's space: joint = device @ offset.
+    """Where the joints are on the devices: joint = device @ offset, for head, left and right wrist.
 
     Attributes:
-        positions: (3, 3) metres in the devices' axes. rotations: (3, 3, 3). Head, left and right wrist.
+        positions: (3, 3), metres, in each device's own axes.
+        rotations: (3, 3, 3), in each device's own axes.
     """
 
     positions: np.ndarray
@@ -73,22 +76,23 @@ OUTPUTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 class Stream:
-    """A trained network, fed live.
+    """A trained network that is fed live.
 
     A tracker's rotation is that of SMPL's joint (head, wrists): the turn from a T-pose, see
-    `memmlp.live.spaces`. Devices that sit otherwise on the body differ by a constant offset, which
-    `calibrate` finds or `offsets` gives. What happens at other rates than 60 Hz, to lost trackers and in gaps
-    is said in `memmlp.live.trackers`.
+    `memmlp.live.spaces`. Devices that sit otherwise on the body differ from the joints by constant offsets,
+    which `calibrate` finds or `offsets` gives. `memmlp.live.trackers` says what happens at other rates than
+    60 Hz, to lost trackers and after gaps.
 
     Args:
         source: a finished run or its folder, or an ONNX file as `memmlp export` writes it (--scope network).
-        space: frame of reference of what goes in and comes out: amass, openxr or unity.
-        rotations: how they come out: matrix or quaternion (xyzw).
-        offsets: of the joints from the devices; none by default.
-        ik: inverse kinematics towards the position branch (`memmlp.evaluation.ik.LBFGS()`); needs torch.
+        space: the frame of reference of what goes in and comes out: amass, openxr or unity.
+        rotations: what rotations come out as: matrix or quaternion (xyzw).
+        offsets: the offsets of the joints from the devices; None for none.
+        ik: inverse kinematics towards the position branch (`memmlp.evaluation.ik.LBFGS()`), which needs
+            torch; None for none.
 
     Raises:
-        InputError: for anything else in these, in one line.
+        InputError: for any other argument, in one line.
     """
 
     def __init__(
@@ -115,23 +119,25 @@ class Stream:
         self._last: Pose | None = None
 
     def reset(self) -> None:
-        """A fresh start: the next sample is the first."""
+        """Begin anew: the next sample is the first."""
         self._trackers.reset()
         self._restart()
 
     def step(self, head: Tracker, left: Tracker, right: Tracker, time: float | None = None) -> Pose:
-        """Take one sample of the trackers in.
+        """Take in one sample of the trackers.
 
         Args:
             head, left, right: (position (3,) in metres, rotation (4,) xyzw or (3, 3)), or None for a lost
-                tracker; so is one with NaN in it, with a quaternion of zeros, or more than 1,000 km away.
-            time: of the sample, seconds of any clock; None for exactly one frame after the last.
+                tracker. A tracker is also lost with NaN in it, a quaternion of zeros, or a number above 1e6
+                (1,000 km).
+            time: the sample's time, seconds of any clock; None for exactly one frame after the last.
 
         Returns:
             The newest frame's pose.
 
         Raises:
-            InputError: for other shapes, what is no rotation, a time that is no number of seconds.
+            InputError: for arrays of other shapes, a rotation that is none, or a time that is no number of
+                seconds.
         """
         _check_time(time)
         positions, rotations, lost = read_trackers((head, left, right))
@@ -149,7 +155,7 @@ class Stream:
         for frame in frames:
             first = self._features.last is None
             self._features.write(frame, self._sparse)
-            if first:  # it has no velocity: shown, but not part of the network's past, as in its training
+            if first:  # it has no velocity, so it is shown but kept out of the past, as in training
                 self.network.peek()
             else:
                 self.network.advance()
@@ -157,14 +163,18 @@ class Stream:
         return self._last
 
     def calibrate(self, head: Tracker, left: Tracker, right: Tracker) -> Offsets:
-        """Learn the joints' offsets from a person who stands upright in T-pose, and use them from now on.
+        """Learn the offsets from a person who stands upright in T-pose, and use them from now on.
 
-        The person's left is where the left tracker is from the right one; every joint's rotation is then
-        known. The joints' positions are those of the network's body in that pose, where the devices are
-        nearest (least squares), so that a person of other proportions moves a body of the network's.
+        The line from the right to the left tracker tells which way the person looks, and so every joint's
+        rotation is known. The joints' positions are those of the network's body in that pose, placed as near
+        to the devices as possible (least squares). So a person of other proportions moves a body with the
+        network's proportions.
+
+        Args:
+            head, left, right: the devices' poses, as in `step`.
 
         Returns:
-            The offsets, to be given to later streams.
+            The offsets, which later streams can be given.
 
         Raises:
             InputError: for a lost tracker, or hands that are not apart.
@@ -191,12 +201,12 @@ class Stream:
         self._last = None
 
     def _again(self, lost: Lost) -> Pose:
-        """The last frame's pose, where none was due."""
+        """Return the last frame's pose, for a sample with which no frame is due."""
         assert self._last is not None  # the first sample always makes a frame
         return self._last._replace(held=_names(lost), fresh=False, restarted=False)
 
     def _pose(self, time: float, head: np.ndarray, held: tuple[str, ...], restarted: bool) -> Pose:
-        """The network's last outputs as a pose of the caller's space."""
+        """Return the network's last outputs as a pose in the caller's space."""
         network, space = self.network, self.space
         sixd = network.rotation6d
         if self.solve is not None:
@@ -208,7 +218,7 @@ class Stream:
 
 
 class Solver:
-    """Inverse kinematics of one frame; imports torch."""
+    """Inverse kinematics of one frame. It imports torch."""
 
     def __init__(self, ik: LBFGS, rest: np.ndarray):
         import torch
@@ -219,7 +229,10 @@ class Solver:
         self.ik, self.normalizer = ik, Normalizer.raw(World(), torch.tensor(rest))
 
     def __call__(self, rotation6d: np.ndarray, position: np.ndarray, sparse: np.ndarray) -> np.ndarray:
-        """Rotations (22, 6) nearest to positions (22, 3), from rotations (22, 6), at inputs (54,)."""
+        """Return rotations (22, 6) whose joints are brought near to positions (22, 3).
+
+        It starts from the rotations (22, 6); `sparse` (54,) are the frame's inputs, for the head's position.
+        """
         import torch
 
         motion = torch.from_numpy(np.concatenate([rotation6d.reshape(1, -1), position.reshape(1, -1)], 1))
@@ -227,7 +240,10 @@ class Solver:
 
 
 def read_trackers(trackers: Sequence[Tracker]) -> tuple[np.ndarray, np.ndarray, Lost]:
-    """Positions (3, 3), rotations (3, 3, 3) and which are lost, of trackers as users give them."""
+    """Return positions (3, 3), rotations (3, 3, 3) and who is lost, of trackers as users give them.
+
+    A lost tracker has the identity in place of its pose. Raises InputError where a tracker is malformed.
+    """
     read, quaternions = NOTHING.copy(), {}
     for index, (name, tracker) in enumerate(zip(TRACKERS, trackers, strict=True)):
         if tracker is not None:
@@ -247,7 +263,7 @@ def read_trackers(trackers: Sequence[Tracker]) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _arrays(name: str, tracker: tuple[ArrayLike, ArrayLike]) -> tuple[np.ndarray, np.ndarray]:
-    """Position (3,) and rotation (4,) or (3, 3) of a tracker."""
+    """Return the position (3,) and rotation (4,) or (3, 3) of a tracker. Raises InputError otherwise."""
     try:
         position, rotation = (np.asarray(part, np.float64) for part in tracker)
     except (TypeError, ValueError) as error:
@@ -260,7 +276,10 @@ def _arrays(name: str, tracker: tuple[ArrayLike, ArrayLike]) -> tuple[np.ndarray
 
 
 def _matrices(quaternions: dict[int, np.ndarray]) -> np.ndarray:
-    """Quaternions (4,) xyzw of trackers as matrices (n, 3, 3); NaN for zeros, as runtimes give if lost."""
+    """Convert trackers' quaternions (4,), xyzw, to matrices (n, 3, 3).
+
+    Zeros, which runtimes give for a lost tracker, become NaN. Raises InputError for another norm than 1.
+    """
     array = np.array(list(quaternions.values()))
     norms = np.sqrt(np.einsum("ni,ni->n", array, array))
     for index, norm in zip(quaternions, norms.tolist(), strict=True):
@@ -283,7 +302,7 @@ def _check_rotations(names: Sequence[str], rotations: np.ndarray) -> None:
 
 
 def _check_time(time: float | None) -> None:
-    """Refuse what is no time."""
+    """Refuse what is no time in seconds."""
     if time is None:
         return
     if not isinstance(time, (int, float, np.integer, np.floating)) or not abs(time) <= LATEST:
@@ -293,7 +312,7 @@ def _check_time(time: float | None) -> None:
 
 
 def checked_offsets(offsets: Offsets) -> Offsets:
-    """Offsets as float64 arrays. Raises InputError where they are none."""
+    """Return the offsets as float64 arrays. Raises InputError where they are malformed."""
     try:
         positions, rotations = (np.asarray(part, np.float64) for part in offsets)
     except (TypeError, ValueError):
@@ -310,12 +329,12 @@ def checked_offsets(offsets: Offsets) -> Offsets:
 
 
 def _names(lost: Lost) -> tuple[str, ...]:
-    """The names of the trackers that are lost."""
+    """Return the names of the lost trackers."""
     return tuple(name for name, gone in zip(TRACKERS, lost, strict=True) if gone)
 
 
 def _file(source: str | PathLike[str] | Run) -> Path:
-    """The ONNX file of a run, of its folder, or itself."""
+    """Return the ONNX file of a run or of its folder; an ONNX file is returned as it is."""
     if not isinstance(source, Run | str | PathLike) or not str(source):
         raise InputError(f"source={source!r}: allowed are a run, its folder, or an ONNX file")
     run = source if isinstance(source, Run) else Run(Path(source))

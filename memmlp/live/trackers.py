@@ -1,15 +1,16 @@
-"""Samples of three trackers, each at its own time -> frames at the network's rate, and their features.
+"""From samples of three trackers, each at its own time, to frames at the network's rate and their features.
 
-The policy, in this order:
+The rules apply in this order:
 
-- A **lost** hand is held at its last pose as seen from the head: it goes with it and turns with its heading.
-  A lost head stays where it was. Before its first sample a tracker is held at the T-pose of a person under
-  the head (at the origin before the head's first). When it returns, the difference is let go over `RECOVERY`
-  seconds instead of at once, which the network would take for a fast movement.
-- **Frames** lie on a grid of 1 / fps from the first sample on. One is made as soon as a sample at or after
-  its time is in, between the samples beside it (positions linearly, rotations by slerp): no sample of the
-  future is waited for, and a pose is at most one frame older than the newest sample. A slower tracker gives
-  several frames at once, a faster one none at some samples; the rate may change at any time.
+- A **lost** hand is held at its last pose as seen from the head: it moves with the head and turns with its
+  heading. A lost head stays where it was. Before its first sample a tracker is held at the T-pose of a person
+  under the head (standing at the origin before the head's first). When a tracker returns, it is led to its
+  true pose over `RECOVERY` seconds, because the network would take a jump for a fast movement.
+- **Frames** lie on a grid of 1 / fps from the first sample on. A frame is made as soon as there is a sample
+  at or after its time, by interpolation between the samples beside it (positions linearly, rotations by
+  slerp). No sample of the future is waited for, and a pose is at most one frame older than the newest sample.
+  A slow tracker gives several frames at once, a fast one none at some samples, and the rate may change at any
+  time.
 - A sample that is not newer than the last one is **ignored**.
 - After a **gap** (no sample for longer than `GAP` seconds, or a clock that was set back by more) everything
   begins anew.
@@ -30,20 +31,26 @@ from memmlp.motion.body import (
     SPARSE_VELOCITY,
 )
 
-GAP = 0.5  # seconds
-RECOVERY = 0.2  # seconds
-EARLY = 5e-4  # seconds by which a frame may be ahead of its sample: times rounded to milliseconds still count
-SAME = 1e-6  # seconds: a sample this near to a frame is the frame
+GAP = 0.5  # seconds without a sample after which everything begins anew
+RECOVERY = 0.2  # seconds over which a tracker that returns is led to its true pose
+EARLY = 5e-4  # seconds that a frame may be ahead of its sample, for times that are rounded to milliseconds
+SAME = 1e-6  # seconds; a sample this near to a frame is taken as the frame
 
 NOBODY = (False, False, False)
-UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # SMPL's body frame (Y up) stands in AMASS' world
+UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # SMPL's body frame (Y up) to AMASS' (Z up)
 
 
-Lost = tuple[bool, ...]  # of head, left and right wrist
+Lost = tuple[bool, ...]  # whether head, left and right wrist are lost
 
 
 class Tracked(NamedTuple):
-    """Head, left and right wrist at a time: positions (3, 3), metres, rotations (3, 3, 3), AMASS' world."""
+    """Head, left and right wrist at a time, in AMASS' world.
+
+    Attributes:
+        time: seconds.
+        positions: (3, 3), metres.
+        rotations: (3, 3, 3).
+    """
 
     time: float
     positions: np.ndarray
@@ -51,16 +58,19 @@ class Tracked(NamedTuple):
 
 
 def between(a: Tracked, b: Tracked, time: float) -> Tracked:
-    """The trackers at a time, from the samples before and after it."""
+    """Return the trackers at a time, interpolated between the samples before and after it."""
     weight = (time - a.time) / (b.time - a.time)
     positions = a.positions + weight * (b.positions - a.positions)
     return Tracked(time, positions, slerp(a.rotations, b.rotations, weight))
 
 
 def t_pose(skeleton: BodyTree, place: np.ndarray, heading: float) -> Tracked:
-    """The three joints of a person in T-pose whose head is at `place` (3,), in AMASS' world.
+    """Return head and wrists of a person in T-pose whose head is at `place` (3,), metres, AMASS' world.
 
-    heading: radians to the left of looking along -Y, where the person's left is +X.
+    Args:
+        skeleton: the person's rest pose.
+        place: the head's position.
+        heading: radians to the left of looking along -Y, where the person's left is +X.
     """
     turn = about_vertical(heading) @ UPRIGHT
     rest = skeleton.rest[skeleton.tracked]
@@ -68,23 +78,26 @@ def t_pose(skeleton: BodyTree, place: np.ndarray, heading: float) -> Tracked:
 
 
 def about_vertical(angle: float) -> np.ndarray:
-    """The rotation (3, 3) about AMASS' Z by an angle, radians."""
+    """Return the rotation (3, 3) about AMASS' Z axis by an angle, radians."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def heading_of(rotation: np.ndarray) -> float:
-    """Heading (radians, as in `t_pose`) of a joint's global rotation (3, 3): the twist about the vertical."""
+    """Return the heading (radians, as in `t_pose`) of a joint's global rotation (3, 3).
+
+    It is the rotation's twist about the vertical, so that looking up or down does not matter.
+    """
     upright = rotation @ UPRIGHT.T
     return float(np.arctan2(upright[1, 0] - upright[0, 1], upright[0, 0] + upright[1, 1]))
 
 
 class Hold:
-    """Lost trackers at their last poses, and their smooth return.
+    """Holds lost trackers at their last poses, and leads them smoothly to their true poses on their return.
 
     Args:
-        skeleton: whose T-pose stands for a tracker that was never there.
-        recovery: seconds in which a tracker that returns is brought to where it is; 0 to jump.
+        skeleton: the body whose T-pose stands for a tracker that was never seen.
+        recovery: seconds over which a tracker that returns is led to its true pose; 0 for a jump.
     """
 
     def __init__(self, skeleton: BodyTree, recovery: float = RECOVERY):
@@ -92,15 +105,15 @@ class Hold:
         self.reset()
 
     def reset(self) -> None:
-        """Nothing was seen yet."""
+        """Forget everything: no tracker was seen yet."""
         self.last: Tracked | None = None
         self.lost: Lost = NOBODY
-        self.settled = -np.inf  # when the last one that returned is where it is
-        self.returned = np.full(3, -np.inf)  # when, each; the difference is let go from there on
+        self.settled = -np.inf  # time from which all trackers that returned are at their true poses
+        self.returned = np.full(3, -np.inf)  # time from which each tracker's difference shrinks
         self.shift, self.turn = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1))
 
     def __call__(self, sample: Tracked, lost: Lost) -> Tracked:
-        """The sample with the lost trackers filled in, and those that return on their way."""
+        """Return the sample with lost trackers filled in, and with returning ones on their way."""
         last = self.last or self._first(sample, lost)
         returning = [was and not is_lost for was, is_lost in zip(self.lost, lost, strict=True)]
         self.last, self.lost = sample, lost
@@ -113,7 +126,10 @@ class Hold:
         return self.last
 
     def _first(self, sample: Tracked, lost: Lost) -> Tracked:
-        """The T-pose under the head where it is seen, else at the origin, standing."""
+        """Return what stands in for the last sample when the first one comes: itself, if nothing is lost.
+
+        Else it is the T-pose under the head; without a head, that of a person who stands at the origin.
+        """
         if not any(lost):
             return sample
         if lost[0]:
@@ -122,20 +138,20 @@ class Hold:
         return t_pose(self.skeleton, sample.positions[0], heading_of(sample.rotations[0]))
 
     def _return(self, which: list[bool], last: Tracked, sample: Tracked) -> None:
-        """Remember how far those that return are from where they were held."""
+        """Remember how far the returning trackers are from where they were held."""
         self.returned[which], self.settled = last.time, last.time + self.recovery
         self.shift[which] = (last.positions - sample.positions)[which]
         self.turn[which] = (last.rotations @ sample.rotations.swapaxes(1, 2))[which]
 
     def _on_their_way(self, sample: Tracked) -> Tracked:
-        """The sample with what is left of the differences."""
+        """Return the sample with what is left of these differences added."""
         left = np.clip(1 - (sample.time - self.returned) / self.recovery, 0, 1)
         positions = sample.positions + left[:, None] * self.shift
         return Tracked(sample.time, positions, turned_by(self.turn, left) @ sample.rotations)
 
 
 def held(sample: Tracked, lost: Lost, last: Tracked) -> Tracked:
-    """The sample with the lost trackers where they last were as seen from the head."""
+    """Return the sample with the lost trackers where they last were, as seen from the head."""
     positions, rotations = sample.positions.copy(), sample.rotations.copy()
     if lost[0]:
         positions[0], rotations[0] = last.positions[0], last.rotations[0]
@@ -147,17 +163,18 @@ def held(sample: Tracked, lost: Lost, last: Tracked) -> Tracked:
 
 
 class Taken(NamedTuple):
-    """What a sample brought: the frames that are due, and whether they begin anew."""
+    """What a sample brought: the frames that are due, and whether everything began anew with it."""
 
     frames: list[Tracked]
     restarted: bool
 
 
 class Resampler:
-    """Samples -> frames at 1 / fps from the first sample on.
+    """Turns samples into frames at times 1 / fps apart, from the first sample on.
 
     Args:
-        fps: frames per second. gap: seconds without a sample after which frames begin anew.
+        fps: frames per second.
+        gap: seconds without a sample after which frames begin anew.
     """
 
     def __init__(self, fps: float, gap: float = GAP):
@@ -165,25 +182,25 @@ class Resampler:
         self.reset()
 
     def reset(self) -> None:
-        """The next sample is the first."""
+        """Forget everything: the next sample is the first."""
         self.last: Tracked | None = None
         self.origin, self.count = 0.0, 0
 
     @property
     def next(self) -> float:
-        """The time of the next frame."""
+        """The time of the next frame, seconds."""
         return self.origin + self.count / self.fps
 
     def restarts(self, time: float) -> bool:
-        """Whether a sample at that time begins anew."""
+        """Return whether frames begin anew with a sample at that time."""
         return self.last is None or abs(time - self.last.time) > self.gap
 
     def is_old(self, time: float) -> bool:
-        """Whether a sample at that time is not newer than the last one."""
+        """Return whether a sample at that time is not newer than the last one."""
         return self.last is not None and -self.gap <= time - self.last.time <= 0
 
     def take(self, sample: Tracked) -> list[Tracked]:
-        """The frames that are due with a sample newer than the last one."""
+        """Return the frames that are due with a sample, which must be newer than the last one."""
         if self.last is None:
             self.origin, self.last = sample.time, sample
         frames = []
@@ -196,26 +213,29 @@ class Resampler:
 
 
 class Trackers:
-    """Samples of three trackers -> frames at the network's rate, by the policy above.
+    """Turns samples of three trackers into frames at the network's rate, by the rules of the module's text.
 
     Args:
-        skeleton: the network's. fps: its frames per second.
+        skeleton: the network's body.
+        fps: the network's frames per second.
     """
 
     def __init__(self, skeleton: BodyTree, fps: float):
         self.hold, self.grid = Hold(skeleton), Resampler(fps)
 
     def reset(self) -> None:
-        """A fresh start."""
+        """Begin anew."""
         self.hold.reset()
         self.grid.reset()
 
     def take(self, time: float | None, positions: np.ndarray, rotations: np.ndarray, lost: Lost) -> Taken:
-        """The frames that are due with a sample.
+        """Return the frames that are due with a sample.
 
         Args:
-            time: seconds; None for that of the next frame, which is then exactly this sample.
-            positions, rotations: (3, 3) and (3, 3, 3), AMASS' world. lost: which of them do not count.
+            time: seconds; None for the time of the next frame, which is then exactly this sample.
+            positions: (3, 3), metres, AMASS' world.
+            rotations: (3, 3, 3), AMASS' world.
+            lost: which of the trackers do not count.
         """
         if time is None:
             time = self.grid.next
@@ -229,13 +249,13 @@ class Trackers:
 
 
 class Features:
-    """The network's 54 inputs, frame by frame, as `memmlp.motion.features.sparse_features`."""
+    """Computes the network's 54 inputs frame by frame, as `memmlp.motion.features.sparse_features` does."""
 
     def __init__(self) -> None:
         self.last: Tracked | None = None
 
     def reset(self) -> None:
-        """The next frame has no velocity."""
+        """Forget the last frame: the next one has no velocity."""
         self.last = None
 
     def write(self, frame: Tracked, sparse: np.ndarray) -> None:

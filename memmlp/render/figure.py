@@ -1,4 +1,4 @@
-"""Heat-map figures, as the paper's Figs. 6 and 9 to 13: rows of truth and predictions, columns of poses."""
+"""Heat-map figures like the paper's Figs. 6 and 9 to 13: rows of truth and predictions, columns of poses."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from memmlp.render.sheet import FAINT, Sheet, png
 from memmlp.render.take import Take
 
 POSES = 6
-WIDTH, HEIGHT = 230, 330  # of a panel, pixels
+WIDTH, HEIGHT = 230, 330  # size of a panel, pixels
 TOP, LEFT, RIGHT, CAPTION = 84, 40, 110, 26
 
 
 def heatmap_png(path: Path, take: Take, poses: int = POSES) -> None:
-    """Write a PNG: the truth's poses in a row, below it each prediction's, coloured by error.
+    """Write a PNG: the truth's poses in a row, and below it a row for each prediction, coloured by error.
 
-    Each pose is seen from the person's front and all rows from one camera; under a prediction stands the
+    Each pose is seen from the person's front, by the same camera in all rows. Under a prediction stands the
     mean error of its 22 joints.
     """
     rows = 1 + len(take.predictions)
@@ -44,12 +44,12 @@ def heatmap_png(path: Path, take: Take, poses: int = POSES) -> None:
 
 
 def views(take: Take, frame: int) -> list[np.ndarray]:
-    """The rows of one column."""
+    """Return the pictures of one column, the truth's first."""
     centre = take.truth[frame, 0, :2]
     camera = take.camera(take.azimuth(frame), centre, WIDTH, HEIGHT)
     return [draw(camera, joints, errors, take.floor) for joints, errors in take.rows(frame)]
 
 
 def poses_png(path: Path, truth: np.ndarray, predicted: np.ndarray, title: str) -> None:
-    """Write a PNG of truth and prediction, joint positions (N, 22, 3), metres, world (Z up)."""
+    """Write a PNG of truth and prediction: joint positions (N, 22, 3), metres, world (Z up)."""
     heatmap_png(path, Take(title, truth, {"prediction": predicted}))

@@ -20,15 +20,16 @@ from memmlp.render.take import Take
 
 RATE = 30  # pictures a second
 EVERY = FPS // RATE
-WIDTH, HEIGHT = 340, 480  # of a panel, pixels
+WIDTH, HEIGHT = 340, 480  # size of a panel, pixels
 TOP, RIGHT, BOTTOM = 88, 112, 44
-TICKS = (30, 30, 40)  # milliseconds of a GIF's pictures, which count in hundredths: 30 a second on average
+TICKS = (30, 30, 40)  # milliseconds of a GIF's pictures in turn, multiples of 10: 30 a second on average
 
 
 def film(path: Path, take: Take) -> None:
-    """Write a film at 30 pictures a second, whole or not at all: MP4 or GIF, by the path's suffix.
+    """Write a film at 30 pictures a second, as a whole or not at all: MP4 or GIF, by the path's suffix.
 
-    Raises InputError where MP4 is asked for and PyAV is not installed.
+    Raises:
+        InputError: where MP4 is asked for and PyAV is not installed.
     """
     encode = {".mp4": mp4, ".gif": gif}[path.suffix.lower()]
     if path.suffix.lower() == ".mp4":
@@ -37,7 +38,7 @@ def film(path: Path, take: Take) -> None:
 
 
 def pictures(take: Take) -> Iterator[np.ndarray]:
-    """The film's pictures (H, W, 3), uint8, with a progress bar."""
+    """Yield the film's pictures (H, W, 3), uint8, with a progress bar."""
     labels = ["truth", *take.predictions]
     width = len(labels) * WIDTH + RIGHT
     sheet = Sheet(width + width % 2, TOP + HEIGHT + BOTTOM)
@@ -64,7 +65,7 @@ def pictures(take: Take) -> Iterator[np.ndarray]:
 
 
 def gif(pictures: Iterable[np.ndarray]) -> bytes:
-    """Pictures as an endless GIF."""
+    """Encode pictures as a GIF that repeats endlessly."""
     first, *rest = (indexed(picture) for picture in pictures)
     buffer, ticks = BytesIO(), cycle(TICKS)
     durations = [next(ticks) for _ in range(1 + len(rest))]
@@ -73,20 +74,20 @@ def gif(pictures: Iterable[np.ndarray]) -> bytes:
 
 
 def mp4(pictures: Iterable[np.ndarray]) -> bytes:
-    """Pictures of even sides as H.264 in MP4."""
+    """Encode pictures as H.264 in MP4; width and height must be even."""
     av, buffer = pyav(), BytesIO()
     frames = (av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), "rgb24") for picture in pictures)
     with av.open(buffer, "w", format="mp4") as container:
         first = next(frames)
         stream = container.add_stream("libx264", rate=RATE, options={"crf": "20"})
         stream.width, stream.height, stream.pix_fmt = first.width, first.height, "yuv420p"
-        for frame in chain([first], frames, [None]):  # None: what the encoder still holds
+        for frame in chain([first], frames, [None]):  # None makes the encoder give out what it still holds
             container.mux(stream.encode(frame))
     return buffer.getvalue()
 
 
 def pyav() -> Any:
-    """The module `av`. Raises InputError where it is not installed."""
+    """Import and return the module `av`. Raises InputError where it is not installed."""
     try:
         import av
     except ImportError:

@@ -1,4 +1,4 @@
-"""How a skeleton is drawn, in pictures and on the live page: its limbs, and the colours of errors."""
+"""How a skeleton looks in pictures and on the live page: its limbs, and the colours of errors."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ _RADII = {
     "elbow": 0.041, "wrist": 0.031,
 }  # fmt: skip
 RADII = tuple(_RADII[name.split("_")[-1]] for name in JOINTS)
-"""Radius of the body at each joint, metres."""
+"""The body's radius at each joint, metres."""
 
 
 class Limb(NamedTuple):
-    """A round limb from a joint to another, or to a tip that no joint marks.
+    """A round limb, from a joint to another, or from a joint to a tip that no joint marks.
 
     Attributes:
-        start, end: the joints whose errors colour its ends.
-        radii: at its ends, metres.
-        tip: metres beyond `end`, in the direction from `start`, where it goes on from `end`; 0 without.
+        start, end: the joints whose errors colour its two ends.
+        radii: the radii at its ends, metres.
+        tip: 0 for a limb between the joints. Else the limb goes on from `end`, by this many metres, in the
+            direction from `start` to `end`.
     """
 
     start: int
@@ -33,7 +34,7 @@ class Limb(NamedTuple):
 
     @property
     def first(self) -> int:
-        """The joint where it begins."""
+        """The joint where the limb begins."""
         return self.end if self.tip else self.start
 
 
@@ -42,15 +43,15 @@ LIMBS = (
     Limb(PARENTS[HEAD], HEAD, (0.085, 0.095), 0.085),
     *(Limb(PARENTS[hand], hand, (0.031, 0.038), 0.085) for hand in (LEFT_WRIST, RIGHT_WRIST)),
 )
-NEUTRAL = (0.66, 0.70, 0.74)  # of what has no error: the truth
+NEUTRAL = (0.66, 0.70, 0.74)  # the truth's colour, which has no error
 HEAT = ("#2b5fd9", "#27a9e1", "#3fc380", "#f2d43d", "#f28c28", "#c4161c")
 """Colours from no error to the top of the scale, evenly spaced."""
 
-SCALES = (10, 15, 20, 30, 40, 50, 75, 100)  # cm at the top of a scale
+SCALES = (10, 15, 20, 30, 40, 50, 75, 100)  # the tops that a scale may have, cm
 
 
 def ends(limb: Limb, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where a limb of joints (22, 3) begins and ends, each (3,), metres."""
+    """Return where a limb of joints (22, 3) begins and ends, each (3,), metres."""
     start, end = joints[limb.start], joints[limb.end]
     if not limb.tip:
         return start, end
@@ -59,13 +60,19 @@ def ends(limb: Limb, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def heat(parts: np.ndarray) -> np.ndarray:
-    """Colours (..., 3), 0 to 1, of errors (...) as parts of the scale; above 1 they are as at 1."""
+    """Return colours (..., 3), 0 to 1, of errors (...) given as fractions of the scale's top.
+
+    Fractions above 1 have the colour of 1.
+    """
     anchors = np.array([[int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)] for colour in HEAT])
     place = np.clip(parts, 0, 1) * (len(anchors) - 1)
     return np.stack([np.interp(place, range(len(anchors)), channel) for channel in anchors.T], -1)
 
 
 def scale(errors: np.ndarray) -> float:
-    """The top of a scale for errors in cm: a round number that all but the largest 2 % stay below."""
+    """Return the top of a scale for errors in cm: a round number that 98 % of them stay below.
+
+    Errors may be larger than the largest top.
+    """
     high = float(np.percentile(errors, 98))
     return float(next((top for top in SCALES if high <= top), SCALES[-1]))

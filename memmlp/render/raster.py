@@ -1,4 +1,8 @@
-"""Skeletons as shaded bodies on a floor, in NumPy: rows of spheres, a depth buffer, parallel projection."""
+"""Draw skeletons as shaded bodies on a floor, in NumPy.
+
+A limb is a row of spheres, a depth buffer decides what is in front, and the projection is parallel. For
+smooth edges the picture is drawn with SAMPLES x SAMPLES samples a pixel and averaged at the end.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +12,13 @@ import numpy as np
 
 from memmlp.render.mannequin import LIMBS, NEUTRAL, Limb, ends, heat
 
-SAMPLES = 2  # a pixel's side, for smooth edges
-SPHERES = 18  # of a limb
-LIGHT = np.array([-0.45, 0.65, 0.62]) / np.linalg.norm([-0.45, 0.65, 0.62])  # in the camera's axes
+SAMPLES = 2  # samples along a pixel's side
+SPHERES = 18  # spheres of a limb
+LIGHT = np.array([-0.45, 0.65, 0.62]) / np.linalg.norm([-0.45, 0.65, 0.62])  # to the light, camera's axes
 AMBIENT = 0.46
 GRID = 0.5  # metres between the floor's lines
-FLOOR = 0.56  # of a picture's width around its centre in which the floor is seen; it fades out
-SHADOW = 0.13  # metres of a shadow's blur
+FLOOR = 0.56  # radius of the visible floor, of a picture's width; it fades out towards it
+SHADOW = 0.13  # metres over which a shadow is blurred
 
 
 @dataclass(frozen=True)
@@ -24,8 +28,9 @@ class Camera:
     Attributes:
         centre: the point (3,) in the middle of the picture, metres.
         azimuth: radians about the vertical; at 0 the camera looks along +Y.
-        elevation: radians by which it looks down.
-        width, height: pixels. scale: pixels a metre.
+        width, height: the picture's size, pixels.
+        scale: pixels a metre.
+        elevation: radians by which the camera looks down.
     """
 
     centre: np.ndarray
@@ -37,16 +42,16 @@ class Camera:
 
     @property
     def axes(self) -> np.ndarray:
-        """Unit vectors (3, 3), rows: to the right, up, and towards the viewer."""
+        """Unit vectors as rows (3, 3): to the right, up, and towards the viewer."""
         (c, s), (ce, se) = ((np.cos(angle), np.sin(angle)) for angle in (self.azimuth, self.elevation))
         return np.array([[c, s, 0], [-s * se, c * se, ce], [s * ce, -c * ce, se]])
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """World points (..., 3) -> to the right, up and towards the viewer of the centre (..., 3), metres."""
+        """Project world points (..., 3) to metres (..., 3) right, up and towards the viewer of the centre."""
         return (points - self.centre) @ self.axes.T
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
-        """Metres to the right (1, W) and up (H, 1) of the samples, `SAMPLES` a pixel's side."""
+        """Return the metres to the right (1, W) and up (H, 1) of all samples, SAMPLES to a pixel's side."""
         width, height, scale = SAMPLES * self.width, SAMPLES * self.height, SAMPLES * self.scale
         right = (np.arange(width, dtype=np.float32) + 0.5 - width / 2) / scale
         up = (height / 2 - np.arange(height, dtype=np.float32) - 0.5) / scale
@@ -54,12 +59,13 @@ class Camera:
 
 
 def draw(camera: Camera, joints: np.ndarray, errors: np.ndarray | None, floor: float) -> np.ndarray:
-    """A picture (height, width, 3), uint8, of one skeleton on white.
+    """Draw one skeleton on white, as a picture (height, width, 3), uint8.
 
     Args:
+        camera: the projection.
         joints: positions (22, 3), metres, world.
-        errors: of the joints (22,), as parts of the colour scale; None for the truth.
-        floor: its height, metres.
+        errors: the joints' errors (22,) as fractions of the colour scale's top; None for the truth.
+        floor: the floor's height, metres.
     """
     right, up = camera.grid()
     picture = ground(camera, joints, floor)
@@ -72,11 +78,16 @@ def draw(camera: Camera, joints: np.ndarray, errors: np.ndarray | None, floor: f
 
 
 def ground(camera: Camera, joints: np.ndarray, floor: float) -> np.ndarray:
-    """White with the floor's grid and the skeleton's shadow, (height, width, 3) in samples."""
+    """Draw the floor's grid and the skeleton's shadow on white: (H, W, 3) samples, 0 to 1.
+
+    They are smooth, so they are computed once for each pixel and repeated for its samples.
+    """
     x, y = on_floor(camera, floor)
+    # The floor has no horizon in a parallel projection: it fades out around the person instead.
     far = np.hypot(x - camera.centre[0], y - camera.centre[1]) / (FLOOR * camera.width / camera.scale)
     fade = np.clip(1.8 * (1 - far), 0, 1)
     lines = np.maximum(*(grid_lines(v, camera) for v in (x, y)))
+    # The shadow is a soft spot under each end of a limb; where spots overlap the darkest counts.
     shadow = np.zeros_like(fade)
     for px, py, pz in np.concatenate([ends(limb, joints) for limb in LIMBS]).tolist():
         spread = SHADOW + 0.25 * max(pz - floor, 0.0)  # higher up, wider and fainter
@@ -87,17 +98,21 @@ def ground(camera: Camera, joints: np.ndarray, floor: float) -> np.ndarray:
 
 
 def on_floor(camera: Camera, floor: float) -> tuple[np.ndarray, np.ndarray]:
-    """World X and Y (height, width), metres, of the floor behind each pixel."""
+    """Return world X and Y (height, width), metres, of the floor behind each pixel."""
     right, up = camera.grid()
     right, up = right[:, ::SAMPLES], up[::SAMPLES]
     axes = camera.axes.astype(np.float32)
+    # How far towards the viewer each pixel's ray meets the floor, from the plane through the centre.
     away = (floor - camera.centre[2] - right * axes[0, 2] - up * axes[1, 2]) / axes[2, 2]
     x, y = (camera.centre[i] + right * axes[0, i] + up * axes[1, i] + away * axes[2, i] for i in (0, 1))
     return x.astype(np.float32), y.astype(np.float32)
 
 
 def grid_lines(along: np.ndarray, camera: Camera) -> np.ndarray:
-    """How much (height, width), 0 to 1, of each pixel lies on the grid's lines of a coordinate."""
+    """Return how much (height, width), 0 to 1, of each pixel lies on the grid lines of a floor coordinate.
+
+    Lines are a pixel or two wide at any scale, since distances are divided by what a pixel covers.
+    """
     off = np.abs((along / GRID + 0.5) % 1 - 0.5) * GRID
     pixel = np.hypot(*np.gradient(along))  # metres of the floor that a pixel covers
     return np.clip(1.2 - off / np.maximum(pixel, 1e-6), 0, 1)
@@ -113,24 +128,31 @@ def shade(
     picture: np.ndarray,
     depth: np.ndarray,
 ) -> None:
-    """Draw a limb into a picture (H, W, 3) where it is nearer than the depth (H, W) so far."""
+    """Draw a limb into a picture (H, W, 3), wherever it is nearer than the depth buffer (H, W).
+
+    Both are changed in place. Metres to the `right` (1, W) and `up` (H, 1) are those of `Camera.grid`.
+    """
     a, b = (camera.project(point).astype(np.float32) for point in ends(limb, joints))
     part = np.linspace(0, 1, SPHERES, dtype=np.float32)[:, None, None]
+    # The axes are (sphere, row, column). Only the rectangle of samples that the limb can cover is computed.
     centre = [a[i] + part * (b[i] - a[i]) for i in range(3)]
     radius = limb.radii[0] + part * (limb.radii[1] - limb.radii[0])
     rows, columns = box(centre, radius, right, up)
     x, y = right[:, columns] - centre[0], up[rows] - centre[1]
     inside = radius**2 - x**2 - y**2
+    # A sphere's surface towards the viewer; the nearest sphere at each sample is what is seen of the limb.
     surface = np.where(inside > 0, centre[2] + np.sqrt(np.maximum(inside, 0)), -np.inf)
     best = surface.argmax(0)[None]
     near = np.take_along_axis(surface, best, 0)[0]
     seen = near > depth[rows, columns]
+    # How far along the limb that sphere is, for the colour, and its normal there, for the light.
     t = part[best[0], 0, 0]
     normal = np.stack(
         [np.take_along_axis(v, best, 0)[0] / radius[best[0], 0, 0] for v in np.broadcast_arrays(x, y)], -1
     )
     normal = np.concatenate([normal, np.sqrt(np.clip(1 - (normal**2).sum(-1, keepdims=True), 0, 1))], -1)
     normal = along_tube(normal, b - a, (t > 0) & (t < 1))
+    # Diffuse light from LIGHT, and a little more where the surface faces the viewer.
     light = AMBIENT + (1 - AMBIENT) * np.clip(normal @ LIGHT, 0, 1) + 0.12 * normal[..., 2] - 0.06
     colour = (
         np.array(NEUTRAL) if errors is None else heat(np.interp(t, (0, 1), errors[[limb.first, limb.end]]))
@@ -142,14 +164,18 @@ def shade(
 def box(
     centre: list[np.ndarray], radius: np.ndarray, right: np.ndarray, up: np.ndarray
 ) -> tuple[slice, slice]:
-    """Rows and columns of the samples that spheres can cover."""
+    """Return the rows and columns of the samples that a row of spheres can cover."""
     columns = np.searchsorted(right[0], [(centre[0] - radius).min(), (centre[0] + radius).max()])
     rows = np.searchsorted(-up[:, 0], [(-centre[1] - radius).min(), (-centre[1] + radius).max()])
     return slice(*rows), slice(*columns)
 
 
 def along_tube(normal: np.ndarray, axis: np.ndarray, side: np.ndarray) -> np.ndarray:
-    """Normals (H, W, 3) of a row of spheres as a tube along the axis (3,) has them on its side (H, W)."""
+    """Return the normals (H, W, 3) of a row of spheres as those of a smooth tube along the axis (3,).
+
+    Bumps between the spheres would show in the light otherwise. The normals change on the tube's side alone
+    (H, W), where `side` is true, and stay those of spheres at its round ends.
+    """
     axis = axis / max(float(np.linalg.norm(axis)), 1e-6)
     flat = normal - (normal @ axis)[..., None] * axis
     flat /= np.maximum(np.linalg.norm(flat, axis=-1, keepdims=True), 1e-6)

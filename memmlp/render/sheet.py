@@ -1,4 +1,4 @@
-"""A sheet of panels with words and a colour bar, exact to the pixel."""
+"""A sheet of panels with words and a colour bar, exact to the pixel; the colours of a GIF."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ INK, FAINT = "#1b1f24", "#5c6670"
 
 
 class Sheet:
-    """A white picture of width x height pixels; places are in pixels from the upper left corner."""
+    """A white picture of width x height pixels; positions are in pixels from the upper left corner."""
 
     def __init__(self, width: int, height: int):
         self.height = height
@@ -28,18 +28,18 @@ class Sheet:
         self.canvas = FigureCanvasAgg(self.figure)
 
     def panel(self, x: int, y: int, width: int, height: int) -> FigureImage:
-        """A place for pictures (height, width, 3); fill it with `set_data`."""
+        """Add a panel for pictures (height, width, 3), uint8, which `set_data` puts into it."""
         empty = np.full((height, width, 3), 255, np.uint8)
         return self.figure.figimage(empty, x, self.height - y - height)
 
     def text(self, x: float, y: float, text: str, size: float, **style: object) -> Text:
-        """Words whose anchor is at a place; size in pixels."""
+        """Add words, anchored at a position; `size` is in pixels."""
         width = self.figure.get_figwidth() * DPI
         style = {"color": INK, "va": "center", "ha": "center"} | style
         return self.figure.text(x / width, 1 - y / self.height, text, fontsize=0.72 * size, **style)  # type: ignore[arg-type]
 
     def colour_bar(self, x: int, y: int, width: int, height: int, top: float) -> None:
-        """The scale of errors from 0 to `top` cm."""
+        """Add the scale of errors from 0 to `top` cm."""
         whole = self.figure.get_figwidth() * DPI
         place = (x / whole, 1 - (y + height) / self.height, width / whole, height / self.height)
         axes = self.figure.add_axes(place)
@@ -51,13 +51,16 @@ class Sheet:
         axes.tick_params(labelsize=9, color=FAINT, labelcolor=INK)
 
     def pixels(self) -> np.ndarray:
-        """The sheet (height, width, 3), uint8."""
+        """Return the sheet (height, width, 3), uint8."""
         self.canvas.draw()
         return np.asarray(self.canvas.buffer_rgba())[..., :3]
 
 
 def palette() -> Image.Image:
-    """The 256 colours of all pictures: the heat-map and the truth in light and shadow, and greys."""
+    """Return the 256 colours of all GIF pictures: heat-map and truth in light and shadow, and greys.
+
+    A palette that is the same in all pictures does not flicker.
+    """
     heats = shades(heat(np.linspace(0, 1, 28)), 7)
     colours = np.concatenate([heats, shades(np.array([NEUTRAL]), 36), shades(np.ones((1, 3)), 24)])
     image = Image.new("P", (1, 1))
@@ -66,17 +69,17 @@ def palette() -> Image.Image:
 
 
 def shades(colours: np.ndarray, count: int) -> np.ndarray:
-    """Colours (n, 3) from dark to light (n * count, 3)."""
+    """Return each colour of (n, 3) from dark to light, as (n * count, 3)."""
     return (np.linspace(0.3, 1, count)[:, None, None] * colours).reshape(-1, 3)
 
 
 def indexed(picture: np.ndarray) -> Image.Image:
-    """A picture (H, W, 3), uint8, in the colours of `palette`."""
+    """Return a picture (H, W, 3), uint8, in the colours of `palette`."""
     return Image.fromarray(picture).quantize(palette=palette(), dither=Image.Dither.NONE)
 
 
 def png(picture: np.ndarray) -> bytes:
-    """A picture (H, W, 3), uint8, as a PNG file."""
+    """Encode a picture (H, W, 3), uint8, as PNG."""
     buffer = BytesIO()
     Image.fromarray(picture).save(buffer, "PNG", optimize=True)
     return buffer.getvalue()

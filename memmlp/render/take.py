@@ -1,4 +1,4 @@
-"""What a picture or a film shows."""
+"""What a picture or a film shows: a piece of a clip, and the camera that looks at it."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from memmlp.motion.body import FPS, ROOT
 from memmlp.render.mannequin import RADII, scale
 from memmlp.render.raster import Camera
 
-MIDDLE = 0.88  # metres above the floor, in the middle of a picture
-SIDE = np.deg2rad(25)  # from the front, a little from the side
-METRES = 2.15  # of a picture's height
+MIDDLE = 0.88  # height of a picture's middle above the floor, metres
+SIDE = np.deg2rad(25)  # the camera's angle from the person's front, radians
+METRES = 2.15  # height that a picture covers, metres
 FOLLOW = 0.4  # seconds over which the camera's way is smoothed
 
 
 @dataclass(frozen=True)
 class Take:
-    """A piece of a clip: truth and predictions by their labels.
+    """A piece of a clip: the truth, and predictions by their labels.
 
     Attributes:
         title: the clip's name.
         truth: joint positions (N, 22, 3), metres, world (Z up), at 60 Hz.
-        predictions: the same of each label.
-        start: the clip's frame that comes first.
+        predictions: the same for each label.
+        start: the index in the clip of the piece's first frame.
     """
 
     title: str
@@ -36,36 +36,39 @@ class Take:
 
     @cached_property
     def errors(self) -> dict[str, np.ndarray]:
-        """Distance of each joint (N, 22) from the truth, cm."""
+        """Each joint's distance (N, 22) from the truth, cm, by label."""
         return {k: 100 * np.linalg.norm(p - self.truth, axis=-1) for k, p in self.predictions.items()}
 
     @cached_property
     def top(self) -> float:
-        """The top of the one colour scale, cm."""
+        """The top of the colour scale, cm, which all predictions share."""
         return scale(np.stack(list(self.errors.values())))
 
     @cached_property
     def floor(self) -> float:
-        """Height of the floor, metres: where the truth's lowest joints are."""
+        """The floor's height, metres: where the truth's lowest joints are."""
         return float(np.percentile(self.truth[..., 2].min(1), 5)) - min(RADII)
 
     def rows(self, frame: int) -> list[tuple[np.ndarray, np.ndarray | None]]:
-        """Joints (22, 3) and their errors (22,) as parts of the scale; None for the truth, which is first."""
+        """Return joints (22, 3) and their errors (22,) as fractions of the scale's top, for each row.
+
+        The truth is first; its errors are None.
+        """
         predicted = [(p[frame], self.errors[k][frame] / self.top) for k, p in self.predictions.items()]
         return [(self.truth[frame], None), *predicted]
 
     def camera(self, azimuth: float, place: np.ndarray, width: int, height: int) -> Camera:
-        """A camera on a person at a place (2,) of the floor."""
+        """Return a camera that looks at a person who stands at a point (2,) of the floor, metres."""
         point = np.array([*place, self.floor + MIDDLE])
         return Camera(point, azimuth, width, height, height / METRES)
 
     def azimuth(self, frame: int) -> float:
-        """From where (radians) the person of the truth is seen from the front and a little from the side."""
+        """Return the azimuth, radians, that shows the true person from the front, a little from the side."""
         left = self.truth[frame, 1] - self.truth[frame, 2]  # from right to left hip
         return float(np.arctan2(left[1], left[0])) + SIDE
 
     def path(self) -> np.ndarray:
-        """Where the camera is (N, 2): over the truth's root, smoothed."""
+        """Return where the camera is over time (N, 2): over the truth's root, smoothed."""
         width = round(FOLLOW * FPS)
         window = np.hanning(2 * width + 3)[1:-1]
         padded = np.pad(self.truth[:, ROOT, :2], ((width, width), (0, 0)), mode="edge")
@@ -73,5 +76,5 @@ class Take:
         return np.stack(columns, -1)
 
     def seconds(self, frame: int) -> float:
-        """The time of a frame in the clip."""
+        """Return the time of a frame in the clip, seconds."""
         return (self.start + frame) / FPS

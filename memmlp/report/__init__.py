@@ -1,1 +1,1 @@
-"""One HTML page of a project's tables, figures and runs."""
+"""Tables and figures for readers: an HTML page of a project, and pages of results kept with the code."""

@@ -1,12 +1,12 @@
-"""Hand-written claims of effects in prose, which only the computation may make.
+"""Find claims of effects that prose makes by hand, which only the computation may make.
 
-The rule, for each sentence (cells of tables and items of lists are sentences too), once code, addresses and
-comments are taken out of it; a placeholder counts as a number:
+The rules hold for each sentence (cells of tables and items of lists are sentences, too), once code, addresses
+and comments are taken out of it. A placeholder counts as a number.
 
 1. No number has a star or an interval: `1.47*`, `0.3 [0.1, 0.5]`.
 2. No sentence has a word of comparison or of verdict (`WORDS`) beside a number or the name of a metric.
    References such as "Table 4" or "Eq. 5" are no numbers.
-3. None has one of `NEVER`, with or without a number.
+3. No sentence has one of the words `NEVER`, with or without a number.
 
 What is measured is written by a placeholder, which brings the verdict along.
 """
@@ -56,7 +56,7 @@ class Claim(NamedTuple):
 
 
 def claims(text: str) -> list[Claim]:
-    """The claims of a Markdown text or template."""
+    """Return the claims of a Markdown text or template."""
     bare = OUTSIDE.sub(_blank, PLACEHOLDER.sub(lambda found: f"0{_blank(found)[1:]}", text))
     found = []
     for start, sentence in _sentences(bare):
@@ -68,12 +68,12 @@ def claims(text: str) -> list[Claim]:
 
 
 def _blank(found: re.Match[str]) -> str:
-    """As many spaces as the match is long, its lines kept."""
+    """Return as many spaces as the match is long, with its line breaks kept."""
     return re.sub(r"[^\n]", " ", found[0])
 
 
 def _sentences(text: str) -> list[tuple[int, str]]:
-    """The sentences with the places where they begin."""
+    """Return the sentences, each with the index where it begins."""
     ends = [(found.start(), found.end()) for found in SENTENCE.finditer(text)]
     starts = [0, *(end for _, end in ends)]
     stops = [*(start for start, _ in ends), len(text)]
@@ -81,7 +81,7 @@ def _sentences(text: str) -> list[tuple[int, str]]:
 
 
 def _reason(sentence: str) -> str | None:
-    """What is wrong with a sentence; None for nothing."""
+    """Return what is wrong with a sentence; None where nothing is."""
     for pattern, what in ((STAR, "a number with a star"), (INTERVAL, "an interval")):
         if pattern.search(sentence):
             return what

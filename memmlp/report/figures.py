@@ -1,4 +1,4 @@
-"""Figures of the page, as inline SVG that takes its colours from the page."""
+"""The figures of the page, as inline SVG that takes its colours from the page."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from memmlp.tables.distributions import Distribution
 from memmlp.tables.grid import heading
 from memmlp.tables.table import Cell, Table
 
+# Placeholder colours for matplotlib, which `_svg` replaces by the page's, so that it has a dark mode.
 INK, FAINT = "#010203", "#010204"
 SERIES = tuple(f"#0102{number:02x}" for number in range(0x10, 0x18))
 COLOURS = {INK: "currentColor", FAINT: "var(--line)"}
@@ -33,13 +34,13 @@ STYLE: Any = {
     "axes.spines.right": False, "legend.labelcolor": INK, "lines.linewidth": 1.4,
 }  # fmt: skip
 WIDTH = 10.5  # inches
-LABEL = 34  # characters of an arm's label in a figure
-PANELS = 4  # side by side
-NAMED = 12  # points of ours whose names have room in one figure
+LABEL = 34  # the longest label of an arm in a figure, characters
+PANELS = 4  # the largest number of panels side by side
+NAMED = 12  # the largest number of our points that are named in a figure
 
 
 class Point(NamedTuple):
-    """A system's frames a second and error."""
+    """A system's frames a second and its error."""
 
     label: str
     fps: float
@@ -47,7 +48,7 @@ class Point(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """A run's values by step."""
+    """The values of a run by training step."""
 
     steps: Sequence[int]
     values: Sequence[float]
@@ -55,7 +56,10 @@ class Curve(NamedTuple):
 
 @mpl.rc_context(STYLE)
 def forest(table: Table) -> str | None:
-    """Differences from the control with their intervals, by arm and metric; None where there are none."""
+    """Draw the differences from the control with their intervals, by arm and metric.
+
+    None where there are no differences.
+    """
     metrics = [metric for metric in table.metrics if metric not in COSTS]
     rows = [
         row for row in table.rows if any(c.effect for cells in row.cells.values() for c in cells.values())
@@ -89,7 +93,7 @@ def forest(table: Table) -> str | None:
 
 @mpl.rc_context(STYLE)
 def profiles(name: str, found: Mapping[str, Sequence[Distribution]]) -> str:
-    """Performance profiles: a panel a metric, a curve an arm."""
+    """Draw performance profiles: a panel for each metric, a curve for each arm."""
     figure, axes = _panels(len(found), 2.8 * -(-len(found) // PANELS))
     for axis, (metric, arms) in zip(axes, found.items(), strict=True):
         every = np.concatenate([arm.errors for arm in arms if arm.errors.size])
@@ -108,7 +112,13 @@ def profiles(name: str, found: Mapping[str, Sequence[Distribution]]) -> str:
 
 @mpl.rc_context(STYLE)
 def accuracy(ours: Mapping[str, Sequence[Point]], paper: Sequence[Point], error: str) -> str:
-    """Error against frames a second (Fig. 1): ours by table, named if few, and the paper's systems."""
+    """Draw errors against frames a second (Fig. 1).
+
+    Args:
+        ours: our points by table; they are named where they are few.
+        paper: the points of the paper's systems.
+        error: the metric.
+    """
     figure = Figure(figsize=(WIDTH, 5))
     axis = figure.add_subplot()
     axis.plot(
@@ -134,7 +144,7 @@ def accuracy(ours: Mapping[str, Sequence[Point]], paper: Sequence[Point], error:
 
 
 def _names(axis: Axes, points: Iterable[Point]) -> None:
-    """The points' names, neighbours' below and above."""
+    """Write the points' names, alternately above and below, so that neighbours don't overlap."""
     for number, point in enumerate(sorted(points, key=lambda point: (point.fps, point.error))):
         place = (6, -11 if number % 2 else 5)
         axis.annotate(point.label, (point.fps, point.error), place, textcoords="offset points", fontsize=8)
@@ -142,7 +152,7 @@ def _names(axis: Axes, points: Iterable[Point]) -> None:
 
 @mpl.rc_context(STYLE)
 def curves(name: str, panels: Mapping[str, Mapping[str, Sequence[Curve]]]) -> str:
-    """Values by training step: a panel a metric, a colour an arm, a line a run."""
+    """Draw values by training step: a panel for each metric, a colour for each arm, a line for each run."""
     figure, axes = _panels(len(panels), 2.6 * -(-len(panels) // PANELS), sharey=False)
     for axis, (metric, arms) in zip(axes, panels.items(), strict=True):
         for number, runs in enumerate(arms.values()):
@@ -162,7 +172,7 @@ def curves(name: str, panels: Mapping[str, Mapping[str, Sequence[Curve]]]) -> st
 
 
 def _panels(count: int, height: float, sharey: bool = True) -> tuple[Figure, list[Axes]]:
-    """A figure with that many axes, a few side by side."""
+    """Make a figure with that many axes, up to PANELS side by side."""
     columns = min(count, PANELS)
     figure = Figure(figsize=(WIDTH, height + 0.5))
     axes = figure.subplots(-(-count // columns), columns, squeeze=False, sharey=sharey).ravel().tolist()
@@ -172,7 +182,7 @@ def _panels(count: int, height: float, sharey: bool = True) -> tuple[Figure, lis
 
 
 def _bar(axis: Axes, cell: Cell, place: float, number: int) -> None:
-    """A difference with its interval; filled where it is significant."""
+    """Draw a difference with its interval; its mark is filled where the difference is significant."""
     effect = cell.effect
     if effect is None:
         return
@@ -183,7 +193,7 @@ def _bar(axis: Axes, cell: Cell, place: float, number: int) -> None:
 
 
 def _legend(figure: Figure, labels: Sequence[str], marks: Sequence[str]) -> None:
-    """A legend above all panels."""
+    """Draw one legend above all panels."""
     handles = [
         mpl.lines.Line2D(
             [], [],
@@ -204,7 +214,11 @@ def _short(label: str) -> str:
 
 
 def _svg(figure: Figure, name: str, description: str) -> str:
-    """The figure as an element for a page: no ids twice, no metadata, colours of the page."""
+    """Return the figure as an SVG element for the page.
+
+    It has no ids that occur twice in the page, no metadata that changes from day to day, and the page's
+    colours.
+    """
     figure.set_layout_engine("constrained")
     file = io.StringIO()
     with mpl.rc_context({"svg.hashsalt": name}):

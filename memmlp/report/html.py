@@ -22,13 +22,13 @@ from memmlp.tables.grid import caption
 from memmlp.tables.measured import Measured
 from memmlp.tables.table import Table
 
-ERROR = "MPJRE"  # of Fig. 1, as Sec. 4.3 has it
-MOST_POINTS = 200  # of a curve
+ERROR = "MPJRE"  # the error in Fig. 1, by Sec. 4.3
+MOST_POINTS = 200  # about how many points a curve has at most
 
 
 @dataclass(frozen=True)
 class Chapter:
-    """A sweep's table and the finished runs behind it, by arm and seed."""
+    """A sweep's table, and the finished runs behind it by arm and seed."""
 
     sweep: Sweep
     table: Table
@@ -41,7 +41,7 @@ class Chapter:
 
 
 class ReportedRun:
-    """A finished run, and the rows it stands in."""
+    """A finished run, and the rows of tables in which it stands."""
 
     def __init__(self, measured: Measured):
         self.measured = measured
@@ -49,16 +49,18 @@ class ReportedRun:
 
     @cached_property
     def config(self) -> dict[str, Any]:
-        """The dotted keys of its config that can change a result."""
+        """The keys of its config, dotted, that can change a result."""
         return trained_by(self.measured.run.config) if self.measured.run else {}
 
 
 def page(chapters: Sequence[Chapter], published: Sequence[Point], generated: str, commit: str) -> str:
-    """The page's HTML.
+    """Return the HTML of the page.
 
     Args:
+        chapters: the tables with their runs.
         published: the paper's systems with frames a second and MPJRE.
-        generated: when, in words. commit: of the code that makes the page.
+        generated: when the page is made, in words.
+        commit: the commit of the code that makes it.
     """
     entries = _entries(chapters)
     sections = [
@@ -83,7 +85,10 @@ def page(chapters: Sequence[Chapter], published: Sequence[Point], generated: str
 
 
 def published(accuracies: Sweep, latencies: Sweep) -> list[Point]:
-    """The systems that the paper gives an error and frames a second of; FPS by the beginning of the name."""
+    """Return the systems for which the paper gives both an error and frames a second.
+
+    The two stand in different tables, whose names for a system agree in their beginnings alone.
+    """
     errors = {arm.label.casefold(): (arm.paper or {}).get(ERROR) for arm in accuracies.arms}
     points = []
     for arm in latencies.arms:
@@ -95,7 +100,7 @@ def published(accuracies: Sweep, latencies: Sweep) -> list[Point]:
 
 
 def _entries(chapters: Sequence[Chapter]) -> list[ReportedRun]:
-    """Each finished run once."""
+    """Return each finished run once, with all rows in which it stands."""
     entries: dict[str, ReportedRun] = {}
     for chapter in chapters:
         for label, runs in chapter.runs.items():
@@ -111,7 +116,7 @@ def _section(name: str, title: str, parts: Sequence[str]) -> str:
 
 
 def _contents(sections: Sequence[tuple[str, str, Sequence[str]]], chapters: Sequence[Chapter]) -> str:
-    """The table of contents."""
+    """Return the HTML of the table of contents."""
     tables = "".join(f'<li><a href="#{_text(c.sweep.name)}">{_text(c.title)}</a></li>' for c in chapters)
     items = [
         f'<li><a href="#{name}">{title}</a>{f"<ol>{tables}</ol>" if name == "tables" else ""}</li>'
@@ -121,7 +126,7 @@ def _contents(sections: Sequence[tuple[str, str, Sequence[str]]], chapters: Sequ
 
 
 def _effects(chapters: Iterable[Chapter]) -> list[str]:
-    """Forest plots."""
+    """Return the forest plots."""
     parts = []
     for chapter in chapters:
         svg = figures.forest(chapter.table)
@@ -136,7 +141,7 @@ def _effects(chapters: Iterable[Chapter]) -> list[str]:
 
 
 def _distributions(chapters: Iterable[Chapter]) -> list[str]:
-    """Performance profiles, and what a few clips cannot carry away."""
+    """Return the performance profiles, and the tables of numbers that a few clips can't dominate."""
     parts = []
     for chapter in chapters:
         found = distributions(chapter.sweep, chapter.runs, chapter.table.modes[0])
@@ -151,7 +156,7 @@ def _distributions(chapters: Iterable[Chapter]) -> list[str]:
 
 
 def _robust(found: Mapping[str, Sequence[Distribution]]) -> str:
-    """Interquartile means and probabilities of improvement, an arm a row."""
+    """Return a table of interquartile means and probabilities of improvement, with a row for each arm."""
     metrics = list(found)
     head = ["arm", *(f"{metric}: {what}" for metric in metrics for what in ("IQM", "P(better)"))]
     rows = [
@@ -171,7 +176,7 @@ def _robust_words(one: Distribution) -> tuple[str, str]:
 
 
 def _accuracy(chapters: Iterable[Chapter], paper: Sequence[Point]) -> list[str]:
-    """Fig. 1 with what was measured."""
+    """Return the paper's Fig. 1 with what was measured."""
     ours = {chapter.title: _points(chapter) for chapter in chapters}
     ours = {title: points for title, points in ours.items() if points}
     if not ours:
@@ -187,7 +192,7 @@ def _accuracy(chapters: Iterable[Chapter], paper: Sequence[Point]) -> list[str]:
 
 
 def _points(chapter: Chapter) -> list[Point]:
-    """An arm's mean frames a second and error."""
+    """Return each arm's mean frames a second and mean error."""
     points = []
     for label, runs in chapter.runs.items():
         values = [(run.costs.get("FPS"), run.value("stream", "rotation", ERROR)) for run in runs.values()]
@@ -199,7 +204,7 @@ def _points(chapter: Chapter) -> list[Point]:
 
 
 def _training(chapters: Iterable[Chapter]) -> list[str]:
-    """Loss and validation metrics by step."""
+    """Return the curves of loss and validation metrics by step."""
     parts = []
     for chapter in chapters:
         panels = _curves(chapter)
@@ -211,7 +216,10 @@ def _training(chapters: Iterable[Chapter]) -> list[str]:
 
 
 def _curves(chapter: Chapter) -> dict[str, dict[str, list[Curve]]]:
-    """Panels of curves: the loss, and the table's metrics of the rotation branch in validation."""
+    """Return the panels of curves: the training loss, and the table's metrics in validation.
+
+    The metrics are those of the rotation branch.
+    """
     names = [f"rotation {metric}" for metric in chapter.table.metrics if metric not in COSTS]
     wanted = {("train", "loss"): "training loss"}
     wanted |= {("val", name): f"validation: {name}" for name in names}
@@ -229,7 +237,7 @@ def _curves(chapter: Chapter) -> dict[str, dict[str, list[Curve]]]:
 
 
 def _curve(log: Sequence[Metrics], phase: str, name: str) -> Curve:
-    """A value's course, thinned out evenly where it is long."""
+    """Return the course of a value, thinned out evenly where it is long; the last point stays."""
     points = [
         (entry.step, entry.values[name]) for entry in log if entry.phase == phase and name in entry.values
     ]
@@ -239,7 +247,7 @@ def _curve(log: Sequence[Metrics], phase: str, name: str) -> Curve:
 
 
 def _latency(entries: Sequence[ReportedRun]) -> str:
-    """Time, work and size of each run's streaming step."""
+    """Return a table of the time, work and size of each run's streaming step."""
     if not entries:
         return ""
     head = (
@@ -274,7 +282,7 @@ def _number(values: Mapping[str, float], key: str, scale: float, form: str) -> s
 
 
 def _runs(entries: Sequence[ReportedRun]) -> str:
-    """The runs, and what their configs differ in from the commonest value of each key."""
+    """Return a table of the runs, with the keys of their configs that differ from the commonest value."""
     if not entries:
         return ""
     common = _common([entry.config for entry in entries])
@@ -303,7 +311,7 @@ def _runs(entries: Sequence[ReportedRun]) -> str:
 
 
 def _common(configs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The commonest value of every key."""
+    """Return the commonest value of every key."""
     common = {}
     for key in {key for config in configs for key in config}:
         values = Counter(repr(config.get(key)) for config in configs)
@@ -313,7 +321,7 @@ def _common(configs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _rows(head: Sequence[str], rows: Sequence[Sequence[str]], note: str) -> str:
-    """A plain table of words, with a note above."""
+    """Return a plain table of words, with a note above it."""
     top = "".join(f'<th scope="col">{_text(word)}</th>' for word in head)
     body = "".join(f"<tr>{_row(row)}</tr>" for row in rows)
     table = f'<table class="plain"><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>'

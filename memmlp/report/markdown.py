@@ -1,4 +1,4 @@
-"""Pages of results: one a table, and templates that take numbers and verdicts from the tables."""
+"""Pages of results: one for each table, and templates that take numbers and verdicts from the tables."""
 
 from __future__ import annotations
 
@@ -24,23 +24,25 @@ ORIGIN = {
 
 
 TURNED = {Verdict.HIGHER: Verdict.LOWER, Verdict.LOWER: Verdict.HIGHER}
-"""The verdict on a difference that is turned round; the others stay."""
+"""The verdicts that change when a difference is turned round."""
 
 
 class KeptTable(NamedTuple):
-    """What a page is made of: results that were kept, and the table that they come to today."""
+    """What a page is made of: results that were kept, and the table that is computed of them today."""
 
     kept: Kept
     table: Table
 
 
 def pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -> dict[str, str]:
-    """The texts of all pages by file name.
+    """Return the texts of all pages by file name.
 
     Args:
-        sources: by name of the table's page, without ending. templates: texts by file name.
+        sources: the tables by the names of their pages, without the ending.
+        templates: the templates' texts by file name.
 
-    Raises InputError for a template that has a hand-written claim of an effect, or names what is not there.
+    Raises:
+        InputError: for a template that claims an effect by hand, or names what does not exist.
     """
     made = {f"{name}.md": _table_page(source) for name, source in sorted(sources.items())}
     twice = sorted(made.keys() & templates.keys())
@@ -53,7 +55,7 @@ def pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -> dic
 
 
 def check_claims(name: str, text: str) -> None:
-    """Refuse prose with hand-written claims of effects (see `memmlp.report.claims`)."""
+    """Refuse prose that claims effects by hand (see `memmlp.report.claims`). Raises InputError."""
     for claim in claims(text):
         raise InputError(
             f"{name}, line {claim.line}: {claim.reason} in '{claim.sentence[:80]}'; allowed for effects are "
@@ -62,6 +64,7 @@ def check_claims(name: str, text: str) -> None:
 
 
 def _filled(name: str, text: str, words: Words) -> str:
+    """Return a page: its template with the placeholders filled in. Raises InputError, naming the template."""
     check_claims(name, text)
     environment = Environment(undefined=StrictUndefined, keep_trailing_newline=True, trim_blocks=True)
     environment.globals = words.functions()
@@ -78,7 +81,7 @@ def _table_page(source: KeptTable) -> str:
 
 
 def origin_words(kept: Kept) -> str:
-    """Where the runs come from, and what makes them again."""
+    """Say where the runs come from, and which command makes them again."""
     parts = [f"{len(kept.every)} runs"]
     for attribute, what in ORIGIN.items():
         values = sorted({str(getattr(run.origin, attribute)) for run in kept.every} - {UNKNOWN})
@@ -89,19 +92,19 @@ def origin_words(kept: Kept) -> str:
 
 
 def _recipes(runs: Iterable[Measured]) -> str:
-    """The numbers of the components' recipes."""
+    """Return the recipe numbers of the components."""
     found = sorted({(name, number) for run in runs for name, number in run.origin.recipes.items()})
     return ", ".join(f"{escaped(name)} {number}" for name, number in found)
 
 
 class Words:
-    """What templates can say. Every method raises InputError, telling what is allowed, for a wrong name."""
+    """The placeholders of templates. For a wrong name each raises InputError, which says what is allowed."""
 
     def __init__(self, sources: Mapping[str, KeptTable]):
         self.sources = sources
 
     def functions(self) -> dict[str, object]:
-        """The placeholders by the name that templates call them by."""
+        """Return the placeholders by the names under which templates call them."""
         names = (
             "has",
             "effect",
@@ -118,50 +121,50 @@ class Words:
         return {"names": sorted(self.sources), **{name: getattr(self, name) for name in names}}
 
     def has(self, name: str) -> bool:
-        """Whether there are results of that name."""
+        """Return whether there are results of that name."""
         return name in self.sources
 
     def effect(self, name: str, arm: str, mode: str, metric: str) -> str:
-        """A measured difference with its interval and verdict: `+1.17 [0.40, 2.23], open`."""
+        """Return a measured difference with its interval and verdict: `+1.17 [0.40, 2.23], open`."""
         cell = self._cell(name, arm, mode, metric)
         words = effect_words(cell, metric)
         number = " ".join(word.replace("*", "") for word in words[:2])
         return f"{number}, {self.verdict(name, arm, mode, metric)}"
 
     def verdict(self, name: str, arm: str, mode: str, metric: str) -> str:
-        """The verdict on an arm's difference, in its word."""
+        """Return the verdict on an arm's difference in a word."""
         effect = self._cell(name, arm, mode, metric).effect
         return "not measured" if effect is None or effect.verdict is None else str(effect.verdict)
 
     def value(self, name: str, arm: str, mode: str, metric: str) -> str:
-        """An arm's mean and standard deviation over seeds."""
+        """Return an arm's mean and standard deviation over seeds."""
         return value_words(self._cell(name, arm, mode, metric), metric)
 
     def paper(self, name: str, arm: str, metric: str) -> str:
-        """The paper's difference."""
+        """Return the paper's difference."""
         printed = self._cell(name, arm, self._table(name).modes[0], metric).paper_effect
         return "not printed" if printed is None else f"{printed:+.2f}".replace("-", MINUS)
 
     def seen(self, name: str, mode: str, metric: str) -> str:
-        """The difference that a table could have seen in every arm with 80 % power."""
+        """Return the difference that a table could have seen in every arm with 80 % power."""
         least = self._table(name).detectable(mode, metric)
         return "unknown" if least is None else f"{number_words(least)} {unit(metric)}".rstrip()
 
     def table(self, name: str) -> str:
-        """The whole table."""
+        """Return the whole table in Markdown."""
         return markdown(self._table(name)).rstrip()
 
     def title(self, name: str) -> str:
-        """A table's title."""
+        """Return a table's title."""
         return escaped(caption(self._table(name)))
 
     def origin(self, name: str) -> str:
-        """Where a table's runs come from, and what makes them again."""
+        """Say where a table's runs come from, and which command makes them again."""
         self._table(name)
         return origin_words(self.sources[name].kept)
 
     def summary(self, name: str, mode: str = "stream") -> str:
-        """A line for each arm: the paper's differences, the measured ones and their verdicts."""
+        """Return a table with a line for each arm: measured differences, their verdicts, and the paper's."""
         table = self._table(name)
         metrics = table.measured_metrics
         lines = [
@@ -175,10 +178,10 @@ class Words:
         return "\n".join(lines)
 
     def way(self, name: str, mode: str = "stream") -> str:
-        """How each step of a table's chain of arms changes each metric, and its share of the whole way.
+        """Return a table of how each step of a chain of arms changes each metric, with its share of the way.
 
-        The chain leads from arm to control, from the table's control on; it is empty where that has none. A
-        share is shown where the interval of the whole way leaves 0 out.
+        The chain leads from arm to control, and ends at the table's control; without one the text is empty. A
+        share is shown where the interval of the whole way does not contain 0.
         """
         table = self._table(name)
         steps = _chain(table)
@@ -204,6 +207,7 @@ class Words:
         return self.sources[name].table
 
     def _cell(self, name: str, arm: str, mode: str, metric: str) -> Cell:
+        """Return a cell of a table. Raises InputError where any of the names is wrong."""
         table = self._table(name)
         rows = {row.label: row for row in table.rows}
         _allowed(f"arm of {name}", arm, rows)
@@ -213,7 +217,7 @@ class Words:
 
 
 def _chain(table: Table) -> list[Row]:
-    """The arms from the one after the chain's first to the table's control, each the control of the next."""
+    """Return the arms after the chain's first, to the table's control; each is the control of the next."""
     rows = {row.label: row for row in table.rows}
     found: list[Row] = []
     row = rows[table.control]
@@ -224,7 +228,7 @@ def _chain(table: Table) -> list[Row]:
 
 
 def _share(cell: Cell, way: Cell, metric: str) -> str:
-    """A step's difference, its share of the way to the control, and its verdict."""
+    """Return a step's difference, its share of the whole way, and its verdict."""
     if cell.effect is None:
         return MISSING
     words = [effect_words(cell, metric)[0].replace("*", "")]
@@ -234,7 +238,7 @@ def _share(cell: Cell, way: Cell, metric: str) -> str:
 
 
 def _whole(cell: Cell) -> str:
-    """The way from an arm to its control: the difference turned round, its verdict, and the paper's."""
+    """Return the way from an arm to its control: the difference turned round, its verdict, the paper's."""
     if cell.effect is None:
         return MISSING
     verdict = TURNED.get(cell.effect.verdict, cell.effect.verdict) if cell.effect.verdict else "no verdict"

@@ -1,7 +1,7 @@
 """A sweep's finished runs in compact form: per-clip errors, costs and origins, in one JSON file.
 
-Whoever has the file can recompute every interval without training. Its bytes depend on what it holds alone:
-runs stand in the order of their ids, numbers have six digits.
+Whoever has the file can compute every interval again without training. Its bytes depend on its content alone:
+runs stand in the order of their ids, and numbers have six digits.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from memmlp.tables.effects import Runs
 from memmlp.tables.measured import Errors, Measured, Origin
 
 DIGITS = 6
-SCALES = re.compile(r"\[\s+([^\[\]{}]*?)\s+\]")  # a list of plain values
+SCALES = re.compile(r"\[\s+([^\[\]{}]*?)\s+\]")  # a list of plain values, which is written on one line
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,11 @@ class Kept:
     """What is kept of a sweep.
 
     Attributes:
-        sweep: its name, as the commands take it. overrides: those of the command line.
+        sweep: the sweep's name, as commands take it.
+        overrides: the command line's overrides.
         runs: the finished runs by the arm's label and the seed.
-        arms: the overrides of each arm that the runs were made with.
-        rounds: of seeds that were spent in rounds, as JSON holds them; None where they were not.
+        arms: the overrides of each arm with which the runs were made.
+        rounds: the rounds in which seeds were spent, as JSON holds them; None where they were not.
         flags: what a reader has to know of how the seeds came about.
     """
 
@@ -48,20 +49,21 @@ class Kept:
 
     @property
     def command(self) -> str:
-        """What makes the runs again."""
+        """The command that makes the runs again."""
         return " ".join(["memmlp sweep", self.sweep, *self.overrides])
 
     @property
     def every(self) -> list[Measured]:
-        """The runs, each once, by id."""
+        """The runs, each once, in the order of their ids."""
         found = {run.id: run for runs in self.runs.values() for run in runs.values()}
         return [found[name] for name in sorted(found)]
 
     def merged(self, other: Kept) -> Kept:
-        """With another's runs added; where both have a cell, the other's stands.
+        """Return the results with another's runs added; where both have a cell, the other's stands.
 
-        Raises InputError where they are not of one sweep and the same overrides, or would join seeds of a
-        fixed number to such as were spent in rounds: no verdict would keep its level.
+        Raises:
+            InputError: where the two are not of one sweep with the same overrides, or a fixed number of seeds
+                would join seeds that were spent in rounds, so that no verdict would keep its level.
         """
         if (self.sweep, self.overrides) != (other.sweep, other.overrides):
             raise InputError(f"holds the results of '{self.command}', not of '{other.command}'")
@@ -74,14 +76,22 @@ class Kept:
         return replace(self, runs=runs, arms=arms, rounds=other.rounds, flags=flags)
 
     def check(self, arms: Mapping[str, tuple[str, ...]]) -> None:
-        """Raise InputError where an arm has other overrides: the runs are of another arm of that name."""
+        """Check that the arms have the overrides with which their runs were made.
+
+        Raises:
+            InputError: where one has others, so that the runs are of another arm with the same label.
+        """
         for label, words in arms.items():
             if label in self.arms and self.arms[label] != words:
                 before, now = ", ".join(self.arms[label]) or "none", ", ".join(words) or "none"
                 raise InputError(f"arm '{label}' was made with the overrides {before}, and has {now}")
 
     def of(self, sweep: Sweep) -> dict[str, Runs]:
-        """The runs of the arms and seeds that the sweep has today. Raises InputError as `check` does."""
+        """Return the runs of the arms and seeds that the sweep has today.
+
+        Raises:
+            InputError: as `check` does.
+        """
         self.check(overrides_of(sweep))
         return {
             arm.label: {
@@ -94,18 +104,18 @@ class Kept:
 
 
 def overrides_of(sweep: Sweep) -> dict[str, tuple[str, ...]]:
-    """The overrides that the file of a sweep gives each arm, its base's among them."""
+    """Return the overrides that a sweep's file gives each arm, the base's included."""
     bare = replace(sweep, extra=())
     return {arm.label: without_paths(bare.overrides(arm)) for arm in sweep.runnable()}
 
 
 def without_paths(overrides: Iterable[str]) -> tuple[str, ...]:
-    """Overrides, their absolute paths shortened to the last part: they are each machine's own."""
+    """Return the overrides with absolute paths shortened to their last part, for they differ by machine."""
     return tuple(re.sub(r"(?<==)/\S*", lambda found: f".../{PurePath(found[0]).name}", w) for w in overrides)
 
 
 def save(path: Path, kept: Kept) -> None:
-    """Write a file of results, atomically. Raises InputError where it cannot be written."""
+    """Write a file of results, as a whole or not at all. Raises InputError where that can't be done."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         atomic_write(path, dumps(kept))
@@ -114,7 +124,7 @@ def save(path: Path, kept: Kept) -> None:
 
 
 def dumps(kept: Kept) -> str:
-    """The file's text."""
+    """Return the text of a file of results."""
     clips = {_clips_key(run): _clips(run) for run in kept.every}
     content = {
         "sweep": kept.sweep,
@@ -137,10 +147,10 @@ def dumps(kept: Kept) -> str:
 
 
 def load_kept(path: Path) -> Kept:
-    """Read a file of results. Raises InputError where it is none, or was edited since."""
+    """Read a file of results. Raises InputError where it holds none, or was edited since it was saved."""
     try:
         content = json.loads(path.read_bytes())
-        if content.pop("digest", None) not in (None, _digest(content)):  # None: before there was one
+        if content.pop("digest", None) not in (None, _digest(content)):  # None: an older file
             raise ValueError("edited since it was saved")
         measured = {
             name: _measured(name, record, content["clips"][record["clips"]])
@@ -162,7 +172,7 @@ def _digest(content: Mapping[str, Any]) -> str:
 
 
 def _record(run: Measured) -> dict[str, Any]:
-    """What is kept of a run."""
+    """Return what is kept of a run."""
     names = list(run.clips)
     errors = {
         mode: {
@@ -179,7 +189,7 @@ def _record(run: Measured) -> dict[str, Any]:
 
 
 def _clips(run: Measured) -> list[list[str]]:
-    """The test clips, each with its group."""
+    """Return the names of the test clips, each with its group."""
     return [[name, run.group(name)] for name in run.clips]
 
 
@@ -188,6 +198,7 @@ def _clips_key(run: Measured) -> str:
 
 
 def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str]]) -> Measured:
+    """Return a run from what is kept of it."""
     names, errors = [clip for clip, _ in clips], record["errors"]
     if any(len(values) != len(names) for values in _every(errors)):
         raise ValueError(f"run {name} has not as many errors as clips")
@@ -202,7 +213,7 @@ def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str
 
 
 def _each(errors: Mapping[str, Any], what: Any) -> Errors:
-    """The errors with each metric's list of values made one."""
+    """Return the errors with `what` applied to each metric's list of values."""
     return {
         mode: {
             branch: {metric: what(values) for metric, values in metrics.items()}
@@ -213,18 +224,18 @@ def _each(errors: Mapping[str, Any], what: Any) -> Errors:
 
 
 def _every(errors: Mapping[str, Any]) -> list[Sequence[Any]]:
-    """Each metric's list of values."""
+    """Return each metric's list of values."""
     return [
         values for branches in errors.values() for metrics in branches.values() for values in metrics.values()
     ]
 
 
 def _mean(values: Sequence[float | str | None]) -> float:
-    """Of the clips that have a number, as the evaluation does it; NaN where none has."""
+    """Return the mean over the clips that have a number, as the evaluation does; NaN where none has."""
     known = [float(value) for value in values if value is not None]
     return float(np.mean(known)) if known else math.nan
 
 
 def _short(value: float) -> float | str | None:
-    """A number of six digits; None for what is none, infinity as a word."""
+    """Return a number rounded to six digits; None for NaN, and infinity as a word."""
     return None if math.isnan(value) else plain(float(f"{value:.{DIGITS}g}"))

@@ -1,4 +1,4 @@
-"""The live table of a search: what runs, the best so far, and how many ended how."""
+"""The live table of a search: what runs, the best trials so far, and how many ended in which way."""
 
 from __future__ import annotations
 
@@ -17,12 +17,16 @@ from memmlp.search.spec import Search
 from memmlp.search.study import Study, deviations
 from memmlp.sweep.board import Screen, progress
 
-SHOWN = 5  # of the best trials
+SHOWN = 5  # how many of the best trials are shown
 WORDS = {TrialState.COMPLETE: "complete", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
 
 
 class SearchBoard(Screen):
-    """Shows a search while it goes on; outputs: folder of the runs' folder."""
+    """Shows a search while it goes on.
+
+    Args:
+        outputs: the folder of runs and caches.
+    """
 
     def __init__(self, outputs: Path):
         super().__init__()
@@ -30,7 +34,7 @@ class SearchBoard(Screen):
         self.told: set[int] | None = None
 
     def update(self, study: Study) -> None:
-        """Show the study and the runs of its trials as they are now."""
+        """Show the study, and the runs of its trials, as they are now."""
         ended = [trial for trial in study.trials if trial.state in WORDS]
         told = {trial.number for trial in ended} if self.told is None else self.told
         new = [trial for trial in ended if trial.number not in told]
@@ -39,14 +43,14 @@ class SearchBoard(Screen):
 
 
 def line(search: Search, trial: FrozenTrial, ended: int) -> str:
-    """How a trial ended."""
+    """Say how a trial ended."""
     what = trial.user_attrs.get("reason") if trial.state == TrialState.FAIL else figures(trial)
     params = ", ".join(f"{key}={trial.params[key]:.4g}" for key in trial.params)
     return f"{ended} of {search.n_trials}; trial {trial.number} {WORDS[trial.state]}: {what} ({params})"
 
 
 def figures(trial: FrozenTrial) -> str:
-    """A trial's objective values, of several seeds with their standard deviations."""
+    """Return a trial's objective values as text, with standard deviations where it has several seeds."""
     shown = [f"{value:.3f}" for value in trial.values or []]
     if spread := deviations(trial):
         shown = [f"{value} ± {sd:.3f}" for value, sd in zip(shown, spread, strict=True)]
@@ -54,7 +58,7 @@ def figures(trial: FrozenTrial) -> str:
 
 
 def render(study: Study, outputs: Path) -> Group:
-    """The trials under way, the best ones, and the counts."""
+    """Draw the trials under way, the best ones, and the counts."""
     table = trials_table(study.search, f"search {study.search.name}")
     for trial in study.trials:
         if trial.state not in WORDS:
@@ -66,7 +70,7 @@ def render(study: Study, outputs: Path) -> Group:
 
 
 def _going(trial: FrozenTrial, outputs: Path) -> Text:
-    """How far a trial's runs are."""
+    """Say how far a trial's runs are."""
     runs = [Run.of(outputs, run_id) for run_id in trial.user_attrs.get("runs", ())]
     states = [run.status for run in runs]
     done = f"{states.count('done')} seeds done, " if "done" in states else ""
@@ -76,7 +80,7 @@ def _going(trial: FrozenTrial, outputs: Path) -> Text:
 
 
 def trials_table(search: Search, title: str) -> Table:
-    """An empty table of trials."""
+    """Make an empty table of trials, with a column for each searched key."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=title, title_justify="left")
     table.add_column("trial", justify="right")
     table.add_column(", ".join(objective.text for objective in search.objectives))
@@ -86,14 +90,14 @@ def trials_table(search: Search, title: str) -> Table:
 
 
 def short(keys: Iterable[str]) -> list[str]:
-    """Keys without the group that all have in common."""
+    """Return the keys without their group, where all have the same one."""
     every = list(keys)
     groups = {key.rpartition(".")[0] for key in every}
     return [key.rpartition(".")[2] for key in every] if len(groups) == 1 else every
 
 
 def row(table: Table, search: Search, trial: FrozenTrial, state: Text) -> None:
-    """A trial's row."""
+    """Add a trial's row to a table."""
     table.add_row(str(trial.number), state, *_shown(search, trial))
 
 
@@ -104,7 +108,7 @@ def _shown(search: Search, trial: FrozenTrial) -> Iterable[str]:
 
 
 def counts(study: Study) -> str:
-    """How many trials there are in which state, of how many."""
+    """Say how many trials are in which state, and how many are wanted."""
     found = Counter(WORDS.get(trial.state, "running") for trial in study.trials)
     listed = ", ".join(f"{count} {state}" for state, count in found.items())
     return f"{len(study.trials)} of {study.search.n_trials} trials: {listed or 'none yet'}"

@@ -1,6 +1,7 @@
-"""The director of a search: asks the study for trials, has their runs made, and tells how they ended.
+"""The director of a search: it asks the study for trials, has their runs made, and tells how they ended.
 
-A trial has a run for each seed. The first seed's decides whether it is pruned; the others' are made after it.
+A trial has a run for each seed. The first seed's run decides whether the trial is pruned; the runs of the
+other seeds are made after it.
 """
 
 from __future__ import annotations
@@ -24,11 +25,14 @@ from memmlp.sweep.board import total_steps
 from memmlp.sweep.controller import LOOK, Fleet
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 
-HOPELESS = 5  # trials that fail before any other ends
+HOPELESS = 5  # so many trials that all fail end the search
 DROPPED = (TrialState.PRUNED, TrialState.FAIL)  # states of trials whose runs nobody wants any more
 
 Compose = Callable[[Mapping[str, Value]], Sequence[Sequence[RunTask]]]
-"""From a trial's values to each seed's tasks, its run's the last; InputError where they make no sense."""
+"""Makes a list of tasks for each seed from a trial's values; the last task of a list is the seed's run.
+
+Raises InputError where the config refuses the values.
+"""
 
 
 @dataclass
@@ -36,7 +40,9 @@ class Going:
     """A trial under way.
 
     Attributes:
-        seeds: each seed's tasks, its run's the last. wanted: of how many seeds runs are to be made by now.
+        trial: the trial.
+        seeds: the tasks of each seed, the last of which is the seed's run.
+        wanted: for how many seeds the runs are to be made by now.
     """
 
     trial: Trial
@@ -54,18 +60,19 @@ class Going:
         return [tasks[-1].id for tasks in self.seeds[: self.wanted]]
 
     def want(self, count: int) -> None:
-        """Have the runs of that many seeds made; the study keeps which those are."""
+        """Have the runs of that many seeds made, and record their ids with the trial."""
         if count != self.wanted:
             self.wanted = count
             self.trial.set_user_attr("runs", self.runs)
 
 
 class Director:
-    """The trials under way and the plan of their runs.
+    """The trials under way, and the plan of their runs.
 
     Args:
-        study: owns the trials. compose: see above.
-        plan: an empty one, open; its tasks become those of the trials under way.
+        study: owns the trials.
+        compose: makes the tasks of a trial.
+        plan: an empty, open plan; plans with the tasks of the trials under way are made from it.
     """
 
     def __init__(self, study: Study, compose: Compose, plan: Plan):
@@ -75,9 +82,10 @@ class Director:
             self._begin(trial)
 
     def look(self, capacity: int) -> Plan:
-        """Tell what ended, ask for trials up to `capacity` runs at once, and give the plan as it is now.
+        """Record what ended, ask for trials until `capacity` runs go on at once, and return the plan.
 
-        Raises InputError when the first trials all failed.
+        Raises:
+            InputError: when the first trials all failed.
         """
         for number in list(self.going):
             if self._ended(self.going[number]):
@@ -88,7 +96,7 @@ class Director:
         return self._planned()
 
     def _begin(self, trial: Trial) -> None:
-        """Take a trial's first run into the plan; a trial whose values make no sense fails."""
+        """Take a trial's first run into the plan. A trial whose values the config refuses fails at once."""
         try:
             going = Going(trial, self.compose(values(trial, self.study.search)))
         except InputError as error:
@@ -99,7 +107,10 @@ class Director:
         self.going[trial.number] = going
 
     def _ended(self, going: Going) -> bool:
-        """Whether the trial has ended; the study is told. With its first run done it wants the others."""
+        """Return whether the trial has ended, and record it with the study if so.
+
+        Once its first run is done, the trial wants the runs of the other seeds.
+        """
         runs = [self.plan.run_of(tasks[-1]) for tasks in going.seeds]
         done = [self.plan.complete(tasks[-1]) for tasks in going.seeds]
         if other := next((reason for tasks in going.seeds if (reason := self._otherwise(tasks[-1]))), None):
@@ -119,22 +130,32 @@ class Director:
         return going.wanted == 1 and 0 < news < total and self.study.prune(going.trial)
 
     def _otherwise(self, task: RunTask) -> str | None:
-        """Why a finished run's validations are not the task's: its network was used otherwise."""
+        """Say why a finished run's validations are not the task's: they used its network in another way.
+
+        None where they are.
+        """
         run, wanted = self.plan.run_of(task), inference(task.config)
         if not run.done or inference(run.config) == wanted:
             return None
         return f"run {run.id} was validated with {inference(run.config)}, not {wanted}; it has no others"
 
     def _busy(self) -> int:
-        """How many workers the trials under way can use: for each, one a run that is wanted and not done."""
+        """Return how many workers the trials under way can use: one for each wanted run that is not done.
+
+        A trial whose runs are all done still counts as one until it is recorded as ended.
+        """
         return sum(max(1, sum(not run.done for run in self._runs(going))) for going in self.going.values())
 
     def _runs(self, going: Going) -> list[Run]:
-        """A trial's runs that are to be made by now."""
+        """Return a trial's runs that are to be made by now."""
         return [Run.of(self.plan.outputs, run_id) for run_id in going.runs]
 
     def _report(self, trial: Trial, run: Run) -> int:
-        """Report the run's new validations, where there is one objective; the last one's step, 0 for none."""
+        """Report the run's new validations to the study, where there is one objective.
+
+        Returns:
+            The step of the last new validation; 0 where there is none.
+        """
         (objective, *others) = self.study.search.objectives
         if others:
             return 0
@@ -145,7 +166,7 @@ class Director:
         return max(news, default=0)
 
     def _planned(self) -> Plan:
-        """The plan of the trials under way; runs of pruned and of failed trials are cancelled."""
+        """Return the plan of the trials under way, which cancels the runs of pruned and failed trials."""
         entries = tuple(
             Entry(f"trial {number}", seed, run_id)
             for number, going in self.going.items()
@@ -161,7 +182,7 @@ class Director:
         )
 
     def _check_hope(self) -> None:
-        """Raise InputError when all trials so far failed, and they are not few."""
+        """Raise InputError when all trials so far failed, and there are at least HOPELESS of them."""
         ended = [trial for trial in self.study.trials if trial.state.is_finished()]
         if len(ended) >= HOPELESS and all(trial.state == TrialState.FAIL for trial in ended):
             reason = ended[-1].user_attrs.get("reason", "no reason is known")
@@ -169,20 +190,21 @@ class Director:
 
 
 def validations(run: Run) -> list[Metrics]:
-    """What a run logged of its validation split."""
+    """Return what a run logged on its validation split."""
     return [entry for entry in run.metrics() if entry.phase == "val"]
 
 
 def objectives(wanted: Sequence[Objective], run: Run) -> list[float]:
-    """The objectives' values at a finished run's last validation."""
+    """Return the objectives' values at a finished run's last validation."""
     last = validations(run)[-1].values
     return [objective.value(last) for objective in wanted]
 
 
 def direct(director: Director, fleet: Fleet, board: SearchBoard, path: Path) -> None:
-    """Keep the fleet at the trials' runs until the study has all it wants.
+    """Keep the fleet at the trials' runs until the study has all the trials it wants.
 
-    path: the plan's file, which the workers read; it is touched while there is a director.
+    `path` is the file of the plan, which the workers read. It is touched all the time, as a sign that the
+    director lives.
     """
     plan = None
     try:

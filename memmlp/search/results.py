@@ -1,4 +1,4 @@
-"""What a search leaves: its trials as CSV, the best as experiments, Table 5 with it, plots."""
+"""What a search leaves behind: its trials as CSV, the best as experiments, Table 5 with it, and plots."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ from memmlp.common.files import atomic_write
 from memmlp.search.spec import Search
 from memmlp.search.study import Study, deviations, values
 
-TABLE = 5  # of the paper: manual weights against learned ones
+TABLE = 5  # the paper's table of manual weights against learned ones
 
 
 def write_trials(study: Study, path: Path) -> None:
-    """All trials: number, state, objectives, values, runs, and the reason of a failure.
+    """Write all trials to a CSV file: number, state, objectives, values, runs, and the reason of a failure.
 
-    Of several seeds the objectives are means, with each one's standard deviation and the seeds' own values.
+    With several seeds the objectives are means, followed by the standard deviation of each and by the seeds'
+    own values.
     """
     names = [objective.text for objective in study.search.objectives]
     keys = [one.key for one in study.search.space]
@@ -42,7 +43,7 @@ def write_trials(study: Study, path: Path) -> None:
 
 
 def _seed_columns(search: Search) -> list[str]:
-    """The heads of what `_seed_values` gives."""
+    """Return the heads of the columns that `_seed_values` fills."""
     if search.seeds == 1:
         return []
     names = [objective.text for objective in search.objectives]
@@ -51,7 +52,7 @@ def _seed_columns(search: Search) -> list[str]:
 
 
 def _seed_values(search: Search, trial: FrozenTrial) -> list[float | str]:
-    """Each objective's standard deviation over seeds, then the seeds' own values, ordered as the runs."""
+    """Return each objective's standard deviation over seeds, then the objectives of each seed's run."""
     if search.seeds == 1:
         return []
     found = [*deviations(trial), *(value for seed in trial.user_attrs.get("values", ()) for value in seed)]
@@ -59,9 +60,15 @@ def _seed_values(search: Search, trial: FrozenTrial) -> list[float | str]:
 
 
 def write_experiments(study: Study, folder: Path, groups: Collection[str]) -> list[Path]:
-    """The best trial as best.yaml, and each one of a Pareto front as trial-N.yaml; the files, best first.
+    """Write the best trial to experiment/best.yaml, and the others of a Pareto front to trial-N.yaml.
 
-    groups: names of the config groups, whose values are options.
+    Args:
+        study: the study.
+        folder: the search's folder.
+        groups: the names of the config groups, whose values are options rather than numbers.
+
+    Returns:
+        The files, the best trial's first.
     """
     (folder / "experiment").mkdir(parents=True, exist_ok=True)
     best = study.best()
@@ -73,7 +80,7 @@ def write_experiments(study: Study, folder: Path, groups: Collection[str]) -> li
 
 
 def experiment(study: Study, trial: FrozenTrial, groups: Collection[str]) -> str:
-    """A trial as a file of the config group `experiment`."""
+    """Return a trial as the text of a file for the config group `experiment`."""
     search = study.search
     tree: dict[str, Any] = {}
     options: list[dict[str, str]] = []
@@ -91,7 +98,7 @@ def experiment(study: Study, trial: FrozenTrial, groups: Collection[str]) -> str
 
 
 def _words(search: Search, trial: FrozenTrial) -> Iterator[tuple[str, str]]:
-    """The keys of the search's base and of the trial, with their values as they are typed."""
+    """Yield the keys of the search's base and of the trial, with their values as they are typed."""
     for override in (*search.base, *search.overrides(values(trial, search))):
         key, _, value = override.partition("=")
         yield key.lstrip("+"), value
@@ -104,7 +111,11 @@ def _put(tree: dict[str, Any], keys: Sequence[str], value: Any) -> None:
 
 
 def write_table(study: Study, shipped: Path, path: Path) -> bool:
-    """The paper's Table 5 with the best trial as one more arm, where loss weights were searched."""
+    """Write the paper's Table 5 with the best trial as one more arm, where only loss weights were searched.
+
+    Returns:
+        Whether the table was written.
+    """
     best = study.best()
     if not best or not all(one.key.startswith("loss.") for one in study.search.space):
         return False
@@ -116,7 +127,10 @@ def write_table(study: Study, shipped: Path, path: Path) -> bool:
 
 
 def importances(study: Study) -> list[tuple[str, float]]:
-    """The share of each key in the first objective's variation (PED-ANOVA); none for too few trials."""
+    """Return each key's share in the variation of the first objective, the largest first (PED-ANOVA).
+
+    Empty with fewer than four complete trials or a single key.
+    """
     complete = [trial for trial in study.trials if trial.state == TrialState.COMPLETE]
     if len(complete) < 4 or len(study.search.space) < 2:
         return []
@@ -133,7 +147,7 @@ def _first(trial: FrozenTrial) -> float:
 
 
 def plots(study: Study) -> dict[str, dict[str, Any]]:
-    """Which plots a study can have, with what makes them beside the study, by the name of the plot."""
+    """Return the plots that a study can have, by name, with their arguments beside the study."""
     complete = [trial for trial in study.trials if trial.state == TrialState.COMPLETE]
     names = [objective.text for objective in study.search.objectives]
     if len(complete) < 2:
@@ -149,7 +163,7 @@ def plots(study: Study) -> dict[str, dict[str, Any]]:
 
 
 def write_plots(study: Study, folder: Path) -> list[Path]:
-    """The plots as PNG files, and all on one page study.html that needs no network."""
+    """Write the plots as PNG files, and all of them into study.html, which needs no network."""
     wanted = plots(study)
     files = [_png(study, name, keywords, folder / f"{name}.png") for name, keywords in wanted.items()]
     if wanted:
@@ -158,6 +172,7 @@ def write_plots(study: Study, folder: Path) -> list[Path]:
 
 
 def _png(study: Study, name: str, keywords: dict[str, Any], path: Path) -> Path:
+    """Draw a plot with matplotlib into a PNG file, and return the file."""
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
@@ -173,6 +188,7 @@ def _png(study: Study, name: str, keywords: dict[str, Any], path: Path) -> Path:
 
 
 def _page(study: Study, wanted: dict[str, dict[str, Any]], path: Path) -> Path:
+    """Draw all plots with plotly into one HTML page, and return its file."""
     parts: list[str] = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ExperimentalWarning)

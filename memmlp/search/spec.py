@@ -1,4 +1,4 @@
-"""What a search searches: config keys with their ranges, objectives on validation, how many trials.
+"""The file of a search: config keys with their ranges, objectives on validation, how many trials.
 
 name: loss_weights
 base: [loss=manual]                 # overrides of every trial
@@ -10,13 +10,13 @@ space:                              # a tree of config keys; its leaves are rang
   hand: {choices: ['off', fk]}
 objectives: [MPJPE]                 # on validation, to be lowered; [MPJPE, Jitter] gives a Pareto front
 n_trials: 30                        # in all, however often the search is started
-seeds: 1                            # of each trial, whose value is their mean; pruned on the first
+seeds: 1                            # runs of each trial, whose value is their mean; the first is pruned on
 sampler: tpe                        # or random
 startup: 10                         # random trials (after the first) before TPE learns from them
-seed: 0
+seed: 0                             # of the sampler
 pruner: median                      # stops a trial that is worse than the median of the others; or none
-prune_after: 5                      # finished trials before the first is stopped
-storage: null                       # a journal beside the search's results, or a storage URL of Optuna's
+prune_after: 5                      # so many trials are finished before one may be stopped
+storage: null                       # null: a journal in the search's folder; or a storage URL of Optuna's
 """
 
 from __future__ import annotations
@@ -44,12 +44,15 @@ Value = float | int | str | bool | None
 
 @dataclass(frozen=True)
 class Range:
-    """The values of one config key.
+    """The values that a search may give to one config key.
 
     Attributes:
-        key: dotted. low, high: inclusive; whole numbers where both are. log: uniform in the logarithm.
-        step: of a grid; None for none. choices: in place of a range; empty for none.
-        first: the value of the first trial; None to leave it to the sampler.
+        key: the dotted key.
+        low, high: the limits, inclusive; whole numbers alone are tried where both are whole.
+        log: whether values are uniform in their logarithm.
+        step: the step of a grid that starts at `low`; None for no grid.
+        choices: a list of values in place of a range; empty for a range.
+        first: the value in the first trial; None to leave it to the sampler.
     """
 
     key: str
@@ -61,13 +64,13 @@ class Range:
     first: Value | None = None
 
     def allows(self, value: Any) -> bool:
-        """Whether a value is one of the range's."""
+        """Return whether a value lies within the range or is one of the choices."""
         if self.choices:
             return value in self.choices
         return isinstance(value, int | float) and self.low <= value <= self.high
 
     def corners(self) -> tuple[Value, ...]:
-        """The values at the ends, or all choices."""
+        """Return the values at both ends, or all choices."""
         return self.choices or (self.low, self.high)
 
 
@@ -76,14 +79,15 @@ class Objective:
     """A weighted sum of validation metrics, to be lowered.
 
     Attributes:
-        text: as it was written. terms: weight and name as the metrics log has it ("rotation MPJPE").
+        text: the objective as it was written.
+        terms: pairs of a weight and a metric's name in the metrics log ("rotation MPJPE").
     """
 
     text: str
     terms: tuple[tuple[float, str], ...]
 
     def value(self, metrics: Mapping[str, float]) -> float:
-        """Of a validation's metrics. Raises InputError where one is not among them."""
+        """Return the objective's value for a validation's metrics. Raises InputError where one is missing."""
         for _, name in self.terms:
             if name not in metrics:
                 known = ", ".join(metrics)
@@ -93,7 +97,7 @@ class Objective:
 
 @dataclass(frozen=True)
 class Search:
-    """A search, checked; its keys are those of the config group `search` (see the module's text)."""
+    """A checked search; its fields are the keys of the config group `search` (see the module's text)."""
 
     name: str
     base: tuple[str, ...]
@@ -109,21 +113,21 @@ class Search:
     storage: str | None
 
     def first(self) -> dict[str, Value]:
-        """What is known of the first trial's values, by key."""
+        """Return the values that the first trial is given, by key; the sampler chooses the others."""
         return {one.key: one.first for one in self.space if one.first is not None}
 
     def overrides(self, values: Mapping[str, Value]) -> tuple[str, ...]:
-        """A trial's values as overrides of `memmlp train`."""
+        """Return a trial's values as overrides of `memmlp train`."""
         return tuple(f"{key}={word(value)}" for key, value in values.items())
 
 
 def word(value: Value) -> str:
-    """A value as an override has it."""
+    """Return a value as text in an override."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def parse_search(content: Mapping[str, Any]) -> Search:
-    """The search of a config. Raises InputError, naming the key."""
+    """Return the search that a config describes. Raises InputError, naming the key, where it is wrong."""
     for key in content:
         if key not in KEYS:
             raise InputError(f"search.{key}: no such key; allowed are {', '.join(KEYS)}")
@@ -167,7 +171,7 @@ def parse_search(content: Mapping[str, Any]) -> Search:
 
 
 def _ranges(node: Any, prefix: str) -> Iterator[Range]:
-    """The ranges of a tree of keys; what is null is left out."""
+    """Yield the ranges of a tree of keys; keys that are null are left out."""
     if node is None:
         return
     where = f"search.space{'.' if prefix else ''}{prefix}"
@@ -191,6 +195,7 @@ def _range(key: str, node: Mapping[str, Any], where: str) -> Range:
 
 
 def _choices(key: str, node: Mapping[str, Any], where: str) -> Range:
+    """Return the range of a node with `choices`. Raises InputError where it is wrong."""
     choices = node["choices"]
     if isinstance(choices, list):
         choices = [_listed(item) if isinstance(item, list) else item for item in choices]
@@ -203,11 +208,12 @@ def _choices(key: str, node: Mapping[str, Any], where: str) -> Range:
 
 
 def _listed(items: list[Any]) -> str:
-    """A list among choices, as an override has it."""
+    """Return a list among the choices as text in an override."""
     return f"[{','.join(word(item) for item in items)}]"
 
 
 def _interval(key: str, node: Mapping[str, Any], where: str) -> Range:
+    """Return the range of a node with `low` and `high`. Raises InputError where it is wrong."""
     low, high = (_number(node.get(end), f"{where}.{end}") for end in ("low", "high"))
     log, step, first = node.get("log", False), node.get("step"), node.get("first")
     if not isinstance(log, bool):
@@ -228,13 +234,13 @@ def _interval(key: str, node: Mapping[str, Any], where: str) -> Range:
 
 
 def _objective(text: str) -> Objective:
-    """The objective of a text such as "MPJPE", or "MPJPE + 0.1*position Jitter"."""
+    """Parse an objective such as "MPJPE", or "MPJPE + 0.1*position Jitter"."""
     terms = [_term(part.strip(), text) for part in text.split("+")]
     return Objective(text, tuple(terms))
 
 
 def _term(part: str, text: str) -> tuple[float, str]:
-    """Weight and metric of a term; the rotation branch where none is named."""
+    """Parse a term into its weight and metric; without a branch it is the rotation branch's."""
     match = re.fullmatch(r"(?:(\d+\.?\d*(?:[eE][+-]?\d+)?)\s*\*\s*)?(?:(\w+)\s+)??(\w+(?: PE)?)", part)
     branch, metric = (match[2] or BRANCHES[0], match[3]) if match else ("", "")
     if match is None or metric not in UNITS or branch not in BRANCHES:

@@ -1,9 +1,9 @@
-"""The Optuna study of a search. One process owns it: it asks for trials and tells how they ended.
+"""The Optuna study of a search. A single process owns it: it asks for trials and tells how they ended.
 
-Of a trial's user attributes, "runs" has the ids of its runs, a seed's each, as far as they were wanted, and
-"values" the objectives of each seed; the trial's own values are their means over seeds. Whatever moment the
-owner is killed at, the next one finds every trial either ended or running, and goes on with the running ones
-under their numbers.
+A trial has these user attributes: "runs" are the ids of its runs, one for each seed, as far as they were
+wanted; "values" are each seed's objectives, whose means over seeds are the trial's own values; "reason" says
+why it failed. At whatever moment the owner is killed, the next owner finds every trial either ended or
+running, and goes on with the running ones under their numbers.
 """
 
 from __future__ import annotations
@@ -27,20 +27,26 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import sync_folder
 from memmlp.search.spec import Range, Search, Value
 
-BEGINNING = b'{"op_code":'  # of every line of a journal
+BEGINNING = b'{"op_code":'  # how every line of a journal begins
 
 
 class Study:
-    """A search's trials, in a storage that survives its owner."""
+    """The trials of a search, in a storage that outlives its owner."""
 
     def __init__(self, search: Search, study: optuna.Study):
         self.search, self.study = search, study
 
     @classmethod
     def own(cls, search: Search, name: str, folder: Path) -> Study:
-        """The study of that name in the search's storage, begun or taken up; for its only owner.
+        """Return the study of that name, new or as it was left, for its only owner.
 
-        folder: of the journal, where the search names no storage.
+        Args:
+            search: the search.
+            name: the study's name in the storage.
+            folder: the folder of the journal, where the search names no storage.
+
+        Raises:
+            InputError: where the storage can't be opened.
         """
         if search.storage is None:
             mend(journal(folder))
@@ -61,7 +67,7 @@ class Study:
 
     @classmethod
     def view(cls, search: Search, name: str, folder: Path) -> Study | None:
-        """The study to look at while its owner works; None where there is none."""
+        """Return the study for looking at it while its owner works; None where there is none yet."""
         if search.storage is None and not journal(folder).exists():
             return None
         try:
@@ -76,13 +82,13 @@ class Study:
         return [trial for trial in trials if trial.state != TrialState.WAITING]
 
     def running(self) -> Iterator[Trial]:
-        """The trials that have not ended."""
+        """Yield the trials that have not ended, each with all its values."""
         for trial in self.trials:
             if trial.state == TrialState.RUNNING:
                 yield self._taken_up(trial)
 
     def ask(self) -> Trial | None:
-        """A new trial; None when there are as many as the search wants."""
+        """Return a new trial; None when there are as many as the search wants."""
         number = len(self.trials)
         if number >= self.search.n_trials:
             return None
@@ -90,31 +96,31 @@ class Study:
         return self._suggested(self.study.ask())
 
     def _taken_up(self, trial: FrozenTrial) -> Trial:
-        """A running trial whose owner may have been killed before it had all its values."""
+        """Return a running trial; its last owner may have been killed before it had all its values."""
         self.study.sampler = sampler(self.search, trial.number)
         return self._suggested(Trial(self.study, trial._trial_id))
 
     def _suggested(self, trial: Trial) -> Trial:
-        """The trial with a value for every key; those that it has already stay."""
+        """Return the trial with a value for every key; values that it already has stay."""
         for one in self.search.space:
             suggest(trial, one)
         return trial
 
     def report(self, trial: Trial, step: int, value: float) -> None:
-        """What the objective was at a validation on the way; for one objective only."""
+        """Report the objective's value at one of a trial's validations, where there is one objective."""
         trial.report(value, step)
 
     def prune(self, trial: Trial) -> bool:
-        """End the trial if others were better at its step; whether it was."""
+        """End the trial if others were better at its step, and return whether that was so."""
         if self.search.pruner == "none" or not trial.should_prune():
             return False
         self.study.tell(trial.number, state=TrialState.PRUNED)
         return True
 
     def complete(self, trial: Trial, values: Sequence[Sequence[float]]) -> None:
-        """End the trial with the means of its seeds' objectives; ones that are no numbers make it a failure.
+        """End the trial with the means over seeds of its objectives. A mean that is NaN makes it a failure.
 
-        values: of each seed, each objective's.
+        `values` has a list for each seed, with the value of each objective.
         """
         trial.set_user_attr("values", [list(seed) for seed in values])
         means = [fmean(of_seeds) for of_seeds in zip(*values, strict=True)]
@@ -123,12 +129,12 @@ class Study:
             self.study.tell(trial.number, means, skip_if_finished=True)
 
     def fail(self, trial: Trial, reason: str) -> None:
-        """End the trial without values."""
+        """End the trial as failed, without values."""
         trial.set_user_attr("reason", reason)
         self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
 
     def best(self) -> list[FrozenTrial]:
-        """The best trial; of two objectives the Pareto front, the best of the first objective first."""
+        """Return the best trial; with two objectives the Pareto front, sorted by the first objective."""
         complete = [trial for trial in self.trials if trial.state == TrialState.COMPLETE]
         if not complete:
             return []
@@ -138,7 +144,11 @@ class Study:
 
 
 def storage(search: Search, folder: Path) -> BaseStorage:
-    """The journal in a folder, or the storage of the search's URL. Raises InputError for a bad URL."""
+    """Return the journal in a folder, or the storage of the search's URL.
+
+    Raises:
+        InputError: for a bad URL or a damaged journal.
+    """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     if search.storage:
         try:
@@ -157,14 +167,15 @@ def storage(search: Search, folder: Path) -> BaseStorage:
 
 
 def journal(folder: Path) -> Path:
-    """The file of a search's study in its folder; `optuna-dashboard` reads it."""
+    """Return the file of a search's study in its folder, which `optuna-dashboard` can read."""
     return folder / "study.journal"
 
 
 def mend(path: Path) -> None:
-    """Cut a torn last line off a journal and free its lock; to be done by its only owner.
+    """Cut an incomplete last line off a journal and remove its locks; only for the owner of the study.
 
-    Optuna takes a line appended to a torn one for damage, and waits half a minute for a dead owner's lock.
+    A process that was killed may leave both behind. Optuna takes a line appended to an incomplete one for
+    damage, and waits half a minute for a dead owner's lock.
     """
     check_journal(path)
     for left in path.parent.glob(f"{path.name}.lock*"):
@@ -191,7 +202,10 @@ def _damaged(path: Path, reason: object) -> InputError:
 
 
 def sampler(search: Search, number: int) -> optuna.samplers.BaseSampler:
-    """The sampler of a trial: seeded by search and number, so that a resumed search repeats nothing."""
+    """Return the sampler of one trial, seeded by the search and the trial's number.
+
+    So a search that is resumed does not draw the random numbers of its earlier trials again.
+    """
     seed = int(np.random.SeedSequence([search.seed, number]).generate_state(1)[0])
     if search.sampler == "random":
         return optuna.samplers.RandomSampler(seed=seed)
@@ -203,7 +217,7 @@ def sampler(search: Search, number: int) -> optuna.samplers.BaseSampler:
 
 
 def suggest(trial: Trial, one: Range) -> Value:
-    """A trial's value for a key, the one that it has already or a new one."""
+    """Return a trial's value for a key: the one that it has already, or a new one."""
     if one.choices:
         return trial.suggest_categorical(one.key, one.choices)
     if isinstance(one.low, int) and isinstance(one.high, int):
@@ -212,11 +226,11 @@ def suggest(trial: Trial, one: Range) -> Value:
 
 
 def deviations(trial: FrozenTrial) -> list[float]:
-    """The standard deviation over seeds of each objective; empty for a trial of a single seed or none."""
+    """Return each objective's standard deviation over seeds; empty with fewer than two seeds."""
     by_seed = trial.user_attrs.get("values", [])
     return np.std(by_seed, axis=0, ddof=1).tolist() if len(by_seed) > 1 else []
 
 
 def values(trial: FrozenTrial | Trial, search: Search) -> Mapping[str, Value]:
-    """A trial's values by config key, in the order of the search's space."""
+    """Return a trial's values by config key, in the order of the search's space."""
     return {one.key: trial.params[one.key] for one in search.space}

@@ -1,15 +1,16 @@
-"""The error of a mean over seeds and groups of clips that were crossed: every seed saw every clip.
+"""The error of a mean over seeds and groups of clips that are crossed: every seed saw every clip.
 
-d[s, c] = mean + effect of seed s + effect of c's group + effect of clip c + noise, in unknown shares. Clips
-are first averaged within their groups (takes, subjects), which are what was replicated; the mean stays that
-over clips, so that a group weighs w[g], its share of the clips. The means m[s, g] give three variances,
+The model is d[s, c] = mean + effect of seed s + effect of c's group + effect of clip c + noise, with unknown
+variances. Clips are first averaged within their groups (takes, subjects), because the groups are what was
+replicated. The mean stays the one over clips, so that a group weighs w[g], its share of the clips. The means
+m[s, g] give three variances, with these degrees of freedom:
 
-    A = variance of the S seeds' means / S                                    S - 1 degrees of freedom
+    A = variance of the S seeds' means / S                                    S - 1
     B = variance of the G groups' means x sum of w^2                          G - 1
     E = variance of what neither explains x sum of w^2 / S                    (S - 1) (G - 1)
 
-and A + B - E estimates that of the mean, because the noise is in A and in B. (Where groups differ in size,
-and clips more than groups, B is larger than it should be; it is never smaller.)
+A + B - E estimates the variance of the mean, because the noise is in A and in B. (Where groups differ in
+size, and clips differ more than groups, B is larger than it should be; it is never smaller.)
 """
 
 from __future__ import annotations
@@ -21,11 +22,14 @@ import numpy as np
 from scipy.special import stdtr, stdtrit
 
 Groups = np.ndarray | Sequence[object] | None
-"""The group of each clip (C,), as integers or labels; None: each clip is its own."""
+"""The group of each clip (C,), as integers or labels; None if each clip is a group of its own."""
 
 
 TRUST = 5.0
-"""How much of the noise may be taken out of B as not skewed, by level: measured, see `Error.half`."""
+"""How much of B may be taken as noise that is not skewed: at most TRUST x level x E.
+
+It was measured by simulation; see `Error.half` and docs/statistics.md.
+"""
 
 
 @dataclass(frozen=True)
@@ -33,9 +37,11 @@ class Error:
     """What is known of the errors of K means.
 
     Args:
-        variances: A, B and E of the module's text, (3, K); a side with one member is 0, and so is E then.
-        seeds, groups: degrees of freedom of A and of B.
-        conditional: what has one member alone, so that nothing can be said of others: "seeds", "clips",
+        variances: A, B and E of the module's text, (3, K). Where there is a single seed or group, its
+            variance is 0, and so is E.
+        seeds: degrees of freedom of A.
+        groups: degrees of freedom of B.
+        conditional: what there is only one of, so that nothing can be said of others: "seeds", "clips",
             "seeds and clips", or "" where there are several of both.
     """
 
@@ -45,15 +51,17 @@ class Error:
     conditional: str = ""
 
     def half(self, level: float | np.ndarray) -> np.ndarray:
-        """Half the width (K,) of the intervals that miss with a probability of at most `level`, () or (K,).
+        """Return half the width (K,) of intervals that miss with at most the probability `level`, () or (K,).
 
-        Each side has Student's quantile of its own degrees of freedom, and then their squares add (Banerjee
-        1960): three seeds that happen to agree can't pass for many, as they do by Satterthwaite's. The noise,
-        which is in both sides, counts once, with the larger quantile, and no less than in either side alone.
+        Each side, seeds and groups, has Student's quantile of its own degrees of freedom, and the squares add
+        (Banerjee 1960). So three seeds that happen to agree can't pass for many, as they do with
+        Satterthwaite's degrees of freedom. The noise is in both sides. It counts once, with the larger
+        quantile, and the result is no less than either side alone.
 
-        Effects of groups may be `skewed`, noise is not. But B that is no more than noise may also be of few
-        skewed values that happen to be alike, and the smaller the level the more so; so the lighter quantile
-        is for that share of the noise alone which simulations allow (none with two groups).
+        Effects of groups may be `skewed`, noise is not. A value of B that is no larger than E may be noise,
+        or a few skewed values that happen to be alike; the smaller the level, the more this matters. So the
+        smaller quantile of noise is used for a part of B alone, which simulations showed to be safe: at most
+        TRUST x level x E, never more than E, and none with two groups.
         """
         level = np.asarray(level)
         a, b, e = self.variances
@@ -63,13 +71,16 @@ class Error:
         return np.sqrt(np.maximum(np.maximum(a, b), a + b - np.minimum(seeds, groups) * e))
 
     def level(self, distance: np.ndarray) -> np.ndarray:
-        """The level (K,) at which `half` is this distance (K,); 1 for 0 and below, NaN for what is no number.
+        """Return the level (K,) at which `half` is this distance (K,); 1 for distances of 0 and below.
 
-        An error without a number, of a network that diverged, is evidence of nothing.
+        It is NaN where distance or variances are no finite numbers: an error without a number, of a network
+        that diverged, is evidence of nothing.
         """
         from scipy.optimize.elementwise import find_root  # slow to import
 
-        # The wider side alone, at its lightest, is too narrow; twice its square, at its heaviest, too wide.
+        # There is no closed form, so the level is found between two bounds. An interval from the wider side
+        # alone, with the smaller quantile, is too narrow; one of sqrt(2) of its width, with the larger
+        # quantile, is too wide. Where the first bound is not the level itself, a root is sought between them.
         levels = np.where(distance > 0, self._wider(distance, self.groups), 1.0)
         most = self._wider(distance / 1.42, skewed(self.groups))
         unsure = np.flatnonzero((distance > 0) & (levels > 0))
@@ -82,7 +93,7 @@ class Error:
         return np.where(np.isfinite(distance + self.variances.sum(0)), levels, np.nan)
 
     def _wider(self, distance: np.ndarray, groups: float) -> np.ndarray:
-        """The larger of the p-values (K,) of the two sides by themselves."""
+        """Return the larger of the p-values (K,) that the two sides have by themselves."""
         sides = self.variances[:2]
         t = np.divide(distance, np.sqrt(sides), out=np.full(sides.shape, np.inf), where=sides > 0)
         return np.maximum(2 * stdtr(self.seeds, -t[0]), 2 * stdtr(groups, -t[1]))
@@ -93,22 +104,26 @@ class Error:
 
 
 def _squared(freedom: float, level: np.ndarray) -> np.ndarray:
-    """Student's two-sided quantile, squared."""
+    """Return the square of Student's two-sided quantile."""
     return stdtrit(freedom, level / 2) ** 2
 
 
 def skewed(freedom: float) -> float:
-    """Student's degrees of freedom whose tails are those of the t of values as skewed as exponential ones.
+    """Return the degrees of freedom with which Student's t has the tails of the t of skewed values.
 
-    A mean of few skewed values that all are small looks surer than it is. Measured for 2 to 536 of them, at
-    levels from 0.05 to 0.0005, it is 0.9 m^0.6 or a few more of m = n - 1 (docs/statistics.md). Clips may
-    be like that; an effect of a seed is a sum of many small ones, and taken as normal.
+    A mean of a few skewed values that all are small looks surer than it is. For 2 to 536 exponential values,
+    at levels from 0.05 to 0.0005, the degrees of freedom were measured to be 0.9 m^0.6 or a few more, with m
+    = n - 1 (docs/statistics.md). Clips may be like that. An effect of a seed is a sum of many small effects,
+    and is taken as normal.
+
+    Args:
+        freedom: m, the degrees of freedom of normal values.
     """
     return min(freedom, 0.9 * freedom**0.6)
 
 
 def error(differences: np.ndarray, groups: Groups = None) -> Error:
-    """The error of the means of differences (K, S, C) over seeds and clips."""
+    """Return the error of the means of differences (K, S, C) over seeds and clips."""
     means, weights = by_group(differences, groups)
     _, s, g = means.shape
     none = np.zeros(len(means))
@@ -120,7 +135,11 @@ def error(differences: np.ndarray, groups: Groups = None) -> Error:
 
 
 def by_group(differences: np.ndarray, groups: Groups = None) -> tuple[np.ndarray, np.ndarray]:
-    """Means of differences (K, S, C) over each group's clips (K, S, G), and its share of clips (G,)."""
+    """Average differences (K, S, C) over the clips of each group.
+
+    Returns:
+        The groups' means (K, S, G), and each group's share of the clips (G,).
+    """
     clips = differences.shape[2]
     if groups is None:
         return differences, np.full(clips, 1 / clips)
@@ -131,7 +150,7 @@ def by_group(differences: np.ndarray, groups: Groups = None) -> tuple[np.ndarray
 
 
 def noise(means: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """E (K,) of means of groups (K, S, G)."""
+    """Return the variance E (K,) of the groups' means (K, S, G), whose weights are (G,)."""
     seeds = means.shape[1]
     rest = means - means.mean(1, keepdims=True)
     return rest.var(2, ddof=1).sum(1) * (weights @ weights) / (seeds * (seeds - 1))

@@ -12,10 +12,15 @@ LEVEL = 0.05
 
 
 class Effects(NamedTuple):
-    """Of K comparisons, each (K,): mean difference, its 95 % interval and p-value; NaN where there is none.
+    """The effects of K comparisons.
 
-    `conditional` is what interval and mean can't speak of, because there is one alone: "seeds", "clips" (one
-    group of them), "seeds and clips", or "". Where it isn't empty there are no p-values.
+    Attributes:
+        mean: the mean difference (K,).
+        low, high: the ends of its 95 % interval (K,); NaN where there is none.
+        p: its p-value (K,); NaN where there is none.
+        conditional: what there is only one of, so that interval and mean don't speak of others: "seeds",
+            "clips" (one group of them), "seeds and clips", or "" where there are several of both. Unless it
+            is "", there are no p-values.
     """
 
     mean: np.ndarray
@@ -26,9 +31,9 @@ class Effects(NamedTuple):
 
 
 def paired_effects(differences: np.ndarray, groups: Groups = None) -> Effects:
-    """Effects of differences (K, S, C) over seeds and clips, whose groups (C,) are what was replicated.
+    """Return the effects of differences (K, S, C) over seeds and clips, whose groups are `groups` (C,).
 
-    Interval and p-value are one thing: 0 lies outside exactly where p is at most 0.05.
+    Interval and p-value agree: 0 lies outside the interval exactly where p is below 0.05.
     """
     mean, known = differences.mean((1, 2)), error(differences, groups)
     nothing = np.full_like(mean, np.nan)
@@ -38,11 +43,12 @@ def paired_effects(differences: np.ndarray, groups: Groups = None) -> Effects:
 
 
 def equivalence_p(differences: np.ndarray, margin: float | np.ndarray, groups: Groups = None) -> np.ndarray:
-    """P-values (K,) of the claim that means of differences (K, S, C) lie within +-margin, () or (K,).
+    """Return the p-values (K,) of the claim that means of differences (K, S, C) lie within +-margin.
 
-    The level at which the interval just lies within. Two one-sided tests would do with the interval of twice
-    that level (Schuirmann 1987), so this is on the safe side, and it agrees with the interval that is shown.
-    NaN with one seed or one group.
+    The margin is () or (K,), in the unit of the differences. A p-value is the level at which the interval
+    just lies within the margin. Two one-sided tests would allow the interval of twice that level (Schuirmann
+    1987). So this is on the safe side, and it agrees with the interval that is shown. NaN with one seed or
+    one group.
     """
     known = error(differences, groups)
     if known.conditional:

@@ -1,4 +1,4 @@
-"""What a table could have seen: effects found in four of five repetitions, and the seeds that takes."""
+"""What a table could have seen: effects that are found in four of five tables, and the seeds that needs."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from scipy.special import chdtri, ndtri
 from memmlp.statistics.crossed import Error, Groups, error
 from memmlp.statistics.effects import LEVEL
 
-DRAWS = 4096  # of the error and its estimate; a power of two, for Sobol's sequence
+DRAWS = 4096  # simulated tables; a power of two, as Sobol's sequence wants
 
 
 def detectable(
     differences: np.ndarray, comparisons: int, groups: Groups = None, power: float = 0.8
 ) -> np.ndarray:
-    """Effects (K,) that tables like these differences (K, S, C) would call significant with this power.
+    """Return the effects (K,) that tables like these differences (K, S, C) would find with this power.
 
-    At the first, strictest step of Holm's correction over so many comparisons. The variances that were
-    measured are taken for the true ones, all effects for normal. NaN with one seed or one group.
+    "Find" is to call significant at the first, strictest step of Holm's correction over `comparisons`. The
+    measured variances are taken for the true ones, and all effects for normal. NaN with one seed or one
+    group.
     """
     known = error(differences, groups)
     if known.conditional:
@@ -36,10 +37,21 @@ def seeds_needed(
     power: float = 0.8,
     most: int = 1000,
 ) -> int | None:
-    """The fewest seeds with which this effect would be found, by one comparison's differences (S, C).
+    """Return the fewest seeds with which this effect would be found, judged by differences (S, C).
 
-    As `detectable`, the shares of seeds and noise divided by the seeds. None where not even `most` would do,
-    because the groups of clips are too few or too unlike, and with one seed or one group.
+    It is computed as in `detectable`, with the parts of seeds and noise divided by the number of seeds.
+
+    Args:
+        differences: of one comparison (S, C).
+        effect: the effect to be found, in the unit of the differences.
+        comparisons: how many comparisons Holm's correction is over.
+        groups: the group of each clip (C,).
+        power: the share of tables in which the effect is to be found.
+        most: the largest number of seeds to consider.
+
+    Returns:
+        None where not even `most` seeds would do, because the groups of clips are too few or too unlike, and
+        with one seed or one group.
     """
     matrix = differences.reshape(1, *differences.shape[-2:])
     known = error(matrix, groups)
@@ -57,19 +69,26 @@ def seeds_needed(
 
 
 def components(known: Error) -> np.ndarray:
-    """The shares (3, K) of seeds, groups and noise in the means' variances."""
+    """Return the parts (3, K) of seeds, groups and noise in the variances of the means."""
     seeds, groups, noise = known.variances
     return np.stack([np.maximum(seeds - noise, 0), np.maximum(groups - noise, 0), noise])
 
 
 def found(parts: np.ndarray, seeds: int, groups: float, level: float, power: float) -> np.ndarray:
-    """Effects (K,) found at this level with this power, where the variance has these parts (3, K).
+    """Return the effects (K,) that are found at this level with this power.
 
-    An effect is found where it and the mean's error exceed half the interval's width. So it is a quantile
-    of that half less the error, over tables drawn with these variances and with `groups` degrees of freedom.
+    An effect is found where it exceeds half the width of the interval less the error of the mean. So it is a
+    quantile of that difference over simulated tables.
+
+    Args:
+        parts: the true parts (3, K) of seeds, groups and noise in the variance of the mean.
+        seeds: the number of seeds.
+        groups: degrees of freedom of B.
+        level: the level of the test.
+        power: the share of tables in which the effect is to be found.
     """
     z, estimates = _draws(seeds, groups)
-    true = parts + parts[2] * [[1], [1], [0]]  # A and B hold the noise
+    true = parts + parts[2] * [[1], [1], [0]]  # the estimates A and B both contain the noise
     drawn = (true[:, :, None] * estimates[:, None]).reshape(3, -1)
     half = Error(drawn, seeds - 1, groups).half(level).reshape(-1, DRAWS)
     return np.quantile(half - np.sqrt(parts.sum(0))[:, None] * z, power, axis=1)
@@ -77,7 +96,12 @@ def found(parts: np.ndarray, seeds: int, groups: float, level: float, power: flo
 
 @functools.cache
 def _draws(seeds: int, groups: float) -> tuple[np.ndarray, np.ndarray]:
-    """Standard normal errors (DRAWS,), and A, B and E over their expectations (3, DRAWS)."""
+    """Draw what varies between tables.
+
+    Returns:
+        Standard normal errors of the mean (DRAWS,), and estimates of A, B and E over their expectations (3,
+        DRAWS), which are chi-squared over their degrees of freedom.
+    """
     from scipy.stats import qmc  # slow to import, as is all of scipy.stats
 
     uniform = qmc.Sobol(4, seed=0).random(DRAWS).T

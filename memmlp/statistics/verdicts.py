@@ -11,7 +11,11 @@ from memmlp.statistics.effects import LEVEL
 
 
 class Verdict(StrEnum):
-    """What a comparison says: of the paper's effect, or of the difference where the paper has no sign."""
+    """What is claimed of a comparison.
+
+    HOLDS and OPPOSITE speak of the paper's effect, HIGHER and LOWER of the measured difference where the
+    paper has none. OPEN claims nothing.
+    """
 
     HOLDS = "holds"
     OPPOSITE = "opposite"
@@ -22,9 +26,9 @@ class Verdict(StrEnum):
 
 
 def holm(p: np.ndarray) -> np.ndarray:
-    """Holm's step-down correction of p-values (K,) over all of them; NaN stays NaN and does not count.
+    """Correct p-values (K,) for their number by Holm's step-down method; NaN stays NaN and does not count.
 
-    The probability that any of the differences called significant is none stays below the level (Holm 1979).
+    The probability of any wrong claim of a difference stays below the level (Holm 1979).
     """
     p = np.asarray(p, float)
     order = np.flatnonzero(~np.isnan(p))
@@ -37,15 +41,15 @@ def holm(p: np.ndarray) -> np.ndarray:
 def verdict(
     difference: float, equivalence: float, mean: float, paper: float | None = None, level: float = LEVEL
 ) -> Verdict:
-    """The verdict on one comparison of a table.
+    """Return the verdict on one comparison of a table.
 
-    Claims of a difference and claims of equivalence are two families, each with 5 % for a wrong one: they
+    Claims of a difference and claims of equivalence are two families, each with 5 % for a wrong claim: they
     answer different questions, and a mean can't be wrongly called both. An interval that lies within the
-    margin is no effect of interest, even where it does not reach 0.
+    margin shows no effect of interest, even where it does not contain 0.
 
     Args:
-        difference: its p-value after Holm's correction over the table's; NaN where there is none.
-        equivalence: likewise, of `equivalence_p`.
+        difference: the p-value of a difference, corrected over the table; NaN where there is none.
+        equivalence: the p-value of `equivalence_p`, corrected likewise.
         mean: the measured mean difference.
         paper: the paper's difference; None or 0 where it claims no sign.
         level: what either family may spend, less than 5 % where there are several looks.
@@ -60,7 +64,7 @@ def verdict(
 
 
 def looks(most: int) -> tuple[int, ...]:
-    """Seeds after each round of a sweep that goes on until all is decided: 3, 5, 8, 13, ... up to `most`.
+    """Return the numbers of seeds at which there are looks: 3, 5, 8, 13, ... up to `most`.
 
     Two seeds never decide anything at the levels of a table, so the first look is at three.
     """
@@ -71,21 +75,24 @@ def looks(most: int) -> tuple[int, ...]:
 
 
 def spending(number: int) -> tuple[float, ...]:
-    """The level that each of so many looks may spend; together 5 %, so that nothing need be assumed of them.
+    """Return the level that each of so many looks may spend.
 
-    Twice as much at every look: of weights growing by 1, 2 and 3 these lost few decisions and few seeds.
+    Together they are 5 %, so that nothing need be assumed of how the looks depend on each other. Each level
+    is twice the one before: of weights growing by a factor of 1, 2 and 3 these cost few decisions and few
+    seeds.
     """
     weights = 2.0 ** np.arange(number)
     return tuple(map(float, LEVEL * weights / weights.sum()))
 
 
 def sequential(p: np.ndarray, claimed: np.ndarray, closed: np.ndarray) -> np.ndarray:
-    """Holm's correction (K,) at a look after others, to be compared with the look's share of the level.
+    """Correct p-values (K,) by Holm at a look after others; they compare with the look's share of the level.
 
-    What was decided stays so. Comparisons that this family has claimed leave the correction of the others;
-    those that are closed without a claim, because the other family decided them or their arm has stopped,
-    stay in it as ones that can't be claimed any more. A first wrong claim then needs a p-value of a true null
-    below the look's level over their number, at a look fixed beforehand: the looks' levels add up.
+    What was decided stays so. Comparisons that this family has claimed leave the correction of the others.
+    Comparisons that are closed without such a claim, because the other family decided them or their arm has
+    stopped, stay in it as ones that can't be claimed any more. So a first wrong claim needs a true null whose
+    p-value is below the look's level over the number of nulls, at a look that was fixed beforehand: the
+    looks' levels add up.
 
     Args:
         p: p-values (K,) of this look; NaN where there is none, which never decides.

@@ -1,4 +1,4 @@
-"""The live table of a sweep: arm by seed, what is done, running and waiting, and why something failed."""
+"""The live table of a sweep: arms by seeds, what is done, running and waiting, and why runs failed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WORDS = {"new": "waiting", "stopped": "waiting, begun", "lost": "lost, to be tak
 
 
 class Screen:
-    """What changes, shown in place on a terminal; elsewhere a line for every change."""
+    """Shows something that changes: in place on a terminal, elsewhere with a line for every change."""
 
     def __init__(self, console: Console | None = None):
         self.console = console or Console(highlight=False, stderr=True)
@@ -37,7 +37,10 @@ class Screen:
             self.live.stop()
 
     def show(self, whole: Callable[[], RenderableType], changes: Iterable[str]) -> None:
-        """Show the whole on a terminal, elsewhere the lines of what changed."""
+        """Show the whole on a terminal; elsewhere print the lines about what changed.
+
+        `whole` is called only where it is shown.
+        """
         if self.console.is_terminal:
             self.live.update(whole())
         else:
@@ -46,7 +49,7 @@ class Screen:
 
 
 class Board(Screen):
-    """Shows a plan's state: arms by seeds."""
+    """Shows the state of a plan: arms by seeds."""
 
     before: Mapping[str, str] | None = None
 
@@ -57,7 +60,7 @@ class Board(Screen):
         self.before = states
 
     def _changes(self, plan: Plan, states: Mapping[str, str]) -> list[str]:
-        """A line for each task whose state is another than before."""
+        """Return a line for each task whose state changed since the last update."""
         if self.before is None:
             return []
         changed = [task for task in plan.tasks if self.before.get(task.key) != states[task.key]]
@@ -66,26 +69,26 @@ class Board(Screen):
 
 
 def _change(plan: Plan, task: RunTask, state: str) -> str:
-    """What became of a task, and why."""
+    """Say what became of a task, and why."""
     reason = plan.run_of(task).failure if state == "failed" else None
     return f"{name(plan, task)}: {WORDS.get(state, state)}{f', {reason}' if reason else ''}"
 
 
 def name(plan: Plan, task: RunTask) -> str:
-    """The task as a person knows it: arm and seed, of a VQ-VAE the seeds whose runs need it."""
+    """Return the task's name for people: arm and seed; for a VQ-VAE the seeds whose runs need it."""
     cells = [f"{entry.label} seed {entry.seed}" for entry in plan.entries if entry.key == task.key]
     return cells[0] if cells else f"VQ-VAE {task.id}{_seeds(plan, task)}"
 
 
 def _seeds(plan: Plan, upstream: RunTask) -> str:
-    """The seeds of the entries that need that run."""
+    """Name the seeds of the entries that need an upstream run."""
     users = {task.id for task in plan.tasks if task.upstream == upstream.id}
     seeds = sorted({entry.seed for entry in plan.entries if entry.id in users})
     return f" of seed {', '.join(map(str, seeds))}" if seeds else ""
 
 
 def render(plan: Plan, states: Mapping[str, str]) -> Group:
-    """Arms by seeds, the VQ-VAEs, the counts, and the reasons of what failed."""
+    """Draw arms by seeds, the VQ-VAEs, the counts of states, and the reasons of what failed."""
     tasks = {task.key: task for task in plan.tasks}
     seeds = sorted({entry.seed for entry in plan.entries})
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=f"sweep {plan.name}", title_justify="left")
@@ -106,7 +109,7 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
 
 
 def cell(plan: Plan, task: RunTask, state: str) -> Text:
-    """A run in a few characters."""
+    """Describe a run in a few characters."""
     run = plan.run_of(task)
     if state == "running":
         return Text(progress(run, total_steps(task)), style=COLOURS[state])
@@ -120,18 +123,18 @@ def _upstream(plan: Plan, task: RunTask, state: str) -> Text:
 
 
 def result(run: Run) -> str:
-    """The stream-mode MPJPE of a finished run."""
+    """Return the stream-mode MPJPE of a finished run, rotation branch, as text; empty if it has none."""
     value = run.results.get("stream", {}).get("rotation", {}).get("MPJPE")
     return f"{value:.2f} cm" if isinstance(value, int | float) else ""
 
 
 def total_steps(task: RunTask) -> int:
-    """Steps of the task's training."""
+    """Return the number of steps of the task's training."""
     return int(task.config["vqvae" if task.kind == "vqvae" else "optim"]["steps"])
 
 
 def progress(run: Run, total: int) -> str:
-    """Steps, time left and loss of a run in training."""
+    """Describe a run in training: its steps, the time left, and its loss."""
     log = [entry for entry in run.metrics() if entry.phase == "train"]
     if not log:
         return "starting"
@@ -142,14 +145,17 @@ def progress(run: Run, total: int) -> str:
 
 
 def _words(seconds: float | None) -> str:
-    """A time left, to the minute where it is long."""
+    """Return a time left as text, in minutes where it is long; empty for None."""
     if seconds is None:
         return ""
     return f" {seconds / 60:.0f} min" if seconds >= 90 else f" {seconds:.0f} s"
 
 
 def time_left(log: list[Metrics], total: int) -> float | None:
-    """Seconds to the end of training at the rate of the last entries; None where there is no rate yet."""
+    """Return the seconds to the end of training, at the rate of the last five entries of the log.
+
+    None where there is no rate yet.
+    """
     recent = log[-5:]
     steps, seconds = recent[-1].step - recent[0].step, recent[-1].time - recent[0].time
     if steps <= 0 or seconds <= 0:
@@ -158,7 +164,7 @@ def time_left(log: list[Metrics], total: int) -> float | None:
 
 
 def _counts(states: Mapping[str, str]) -> str:
-    """How many runs are in which state."""
+    """Say how many runs are in which state."""
     counts: dict[str, int] = {}
     for state in states.values():
         word = WORDS.get(state, state).partition(",")[0]

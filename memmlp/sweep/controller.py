@@ -1,4 +1,4 @@
-"""The controller of a sweep: keeps workers going while there is work, and shows how far it is."""
+"""The controller of a sweep: it keeps workers going while there is work, and shows how far it is."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ from memmlp.sweep.plan import Plan
 from memmlp.sweep.worker import Presence
 
 LOOK = 0.5  # seconds between looks at the run folders
-QUICK = 20.0  # seconds within which a worker that ends has not begun to work
-PATIENCE = 5  # workers in a row that may end so
+QUICK = 20.0  # seconds; a worker that ends sooner has failed to start
+PATIENCE = 5  # how many in a row, times the fleet's size, may fail to start
 
 
 class Fleet:
-    """As many workers as there is work for; those that died are replaced.
+    """The workers of a controller: as many as there is work for, those that died replaced.
 
     Args:
-        executor: starts them. work: what a worker does. size: how many at most. logs: where theirs are.
-        presence: what tells the workers that the controller lives; it ends with the fleet.
+        executor: starts workers.
+        work: what a worker does.
+        size: the largest number of workers.
+        logs: the folder of the workers' logs, for error messages.
+        presence: tells the workers that the controller lives, for as long as the fleet exists.
     """
 
     def __init__(
@@ -39,9 +42,10 @@ class Fleet:
         self.stillborn = 0
 
     def keep(self, wanted: int) -> None:
-        """Bring the number of living workers to `wanted`, or to the fleet's size.
+        """Start workers until `wanted` are alive, or as many as the fleet's size.
 
-        Raises InputError when one after another ends as soon as it is started.
+        Raises:
+            InputError: when workers one after another end as soon as they are started.
         """
         ended = [started for handle, started in self.handles if not handle.alive()]
         self.handles = [(handle, started) for handle, started in self.handles if handle.alive()]
@@ -61,9 +65,10 @@ class Fleet:
 
 
 def oversee(plan: Plan, fleet: Fleet, board: Board) -> None:
-    """Keep the fleet at the plan until nothing is left; when stopped or interrupted, end the workers.
+    """Keep the fleet at the plan until nothing is left.
 
-    Runs that other sweeps' workers are at are waited for.
+    Runs that the workers of other sweeps are at are waited for. When the plan is stopped by a failure, or
+    this process is interrupted, the workers are ended.
     """
     try:
         with board:

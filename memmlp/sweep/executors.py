@@ -1,6 +1,7 @@
-"""Where workers run: processes of this machine or jobs of a Slurm cluster by submitit, or Ray's tasks.
+"""Executors, which start workers: as processes, as jobs of a Slurm cluster, or as tasks of Ray.
 
-An executor only starts workers; which run is whose is settled among them (memmlp.sweep.worker).
+Processes and Slurm jobs are submitit's. An executor only starts workers; which worker does which run is
+settled among them (memmlp.sweep.worker).
 """
 
 from __future__ import annotations
@@ -15,65 +16,68 @@ from memmlp.common.errors import InputError
 if TYPE_CHECKING:
     import submitit
 
-FOREVER = 7 * 24 * 60  # minutes: local workers end by themselves
+FOREVER = 7 * 24 * 60  # minutes, a limit that submitit wants; workers end by themselves
 
 
 class Handle(Protocol):
-    """A started worker."""
+    """A worker that was started."""
 
     def alive(self) -> bool:
-        """Whether it waits or works."""
+        """Return whether the worker waits or works."""
 
     def cancel(self) -> None:
-        """End it."""
+        """End the worker."""
 
 
 class Executor(Protocol):
     """Starts workers."""
 
     def submit(self, work: Callable[[], None]) -> Handle:
-        """Start a worker; `work` must be importable where it runs."""
+        """Start a worker; `work` must be picklable, and importable where the worker runs."""
 
 
 class Requeued:
-    """Work that a preempted Slurm job does again: its runs go on from their checkpoints."""
+    """Work that a preempted Slurm job does again; its runs go on from their checkpoints."""
 
     def __init__(self, work: Callable[[], None]):
         self.work = work
 
     def __call__(self) -> None:
-        """Work."""
+        """Do the work."""
         self.work()
 
     def checkpoint(self) -> Any:
-        """What submitit queues when the job is preempted or its time is up."""
+        """Return what submitit puts into the queue when the job is preempted or its time is up."""
         from submitit.helpers import DelayedSubmission
 
         return DelayedSubmission(self)
 
 
 class Submitted:
-    """A submitit job."""
+    """A worker that is a job of submitit's."""
 
     def __init__(self, job: submitit.Job):
         self.job = job
 
     def alive(self) -> bool:
-        """Whether it waits or works."""
+        """Return whether the job waits or works."""
         return not self.job.done()
 
     def cancel(self) -> None:
-        """End it."""
+        """End the job."""
         self.job.cancel(check=False)
 
 
 class Submitit:
-    """submitit's executors.
+    """Starts workers by submitit.
 
     Args:
-        cluster: "local" (processes of this machine), "slurm", or "debug" (in this process).
-        folder: of the workers' logs, with %j for a worker's number.
+        cluster: "local" (processes of this machine), "slurm", or "debug" (inside this process).
+        folder: the folder of the workers' logs, with %j for a worker's number.
         options: submitit's parameters, those of sbatch among them.
+
+    Raises:
+        InputError: where submitit refuses the cluster or an option.
     """
 
     def __init__(self, cluster: str, folder: Path, options: Mapping[str, Any] | None = None):
@@ -97,7 +101,7 @@ class Submitit:
 
 
 def sbatch(folder: Path, options: Mapping[str, Any] | None = None) -> str:
-    """What sbatch would be given for a worker, on a machine with or without Slurm."""
+    """Return the file that sbatch would be given for a worker; Slurm need not be installed."""
     import submitit
 
     class Anywhere(submitit.SlurmExecutor):
@@ -111,32 +115,36 @@ def sbatch(folder: Path, options: Mapping[str, Any] | None = None) -> str:
 
 
 def _set(executor: submitit.Executor, options: Mapping[str, Any] | None) -> None:
-    """Give the executor its options under the names it knows them by."""
+    """Give the executor its options under the names by which it knows them."""
     common = {"name": "memmlp", "timeout_min": FOREVER, **(options or {})}
     executor.update_parameters(**executor._convert_parameters(common))
 
 
 class RayTask:
-    """A Ray task."""
+    """A worker that is a task of Ray's."""
 
     def __init__(self, reference: Any):
         self.reference = reference
 
     def alive(self) -> bool:
-        """Whether it waits or works."""
+        """Return whether the task waits or works."""
         import ray
 
         return not ray.wait([self.reference], timeout=0)[0]
 
     def cancel(self) -> None:
-        """End it."""
+        """End the task."""
         import ray
 
         ray.cancel(self.reference, force=True)
 
 
 class Ray:
-    """Tasks of a Ray cluster: the one of RAY_ADDRESS, or one on this machine."""
+    """Starts workers as tasks of a Ray cluster: the one that RAY_ADDRESS names, or one on this machine.
+
+    Raises:
+        InputError: where Ray is not installed.
+    """
 
     def __init__(self, options: Mapping[str, Any] | None = None):
         try:

@@ -1,4 +1,7 @@
-"""A plan: which runs a sweep's arms and seeds are, and how far they are. The run folders say the latter."""
+"""A plan: the runs that a sweep's arms and seeds need, and how far they are.
+
+Only the runs' identities are kept in a plan; how far they are is read from the run folders.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +23,12 @@ class RunTask:
     """One run to be brought to its end.
 
     Attributes:
-        id: of the run. kind: "vqvae" or "memmlp".
-        config: the resolved config of an experiment that needs it.
-        upstream: the run that must be done before; None for none.
-        stages: identities of the evaluations and the deployment that are wanted of it.
-        what: what it has in common with runs of other recipe numbers (`Identity.what`).
+        id: the run's id.
+        kind: "vqvae" or "memmlp".
+        config: the resolved config of an experiment that needs the run.
+        upstream: the id of the run that must be done before; None for none.
+        stages: identities of the evaluations and the deployment that are wanted of the run.
+        what: what the run has in common with runs of other recipe numbers (`Identity.what`).
     """
 
     id: str
@@ -36,7 +40,7 @@ class RunTask:
 
     @property
     def key(self) -> str:
-        """What tells it from others: arms may want other evaluations of the same run."""
+        """What tells the task from others: the run's id and the stages that are wanted of it."""
         return " ".join((self.id, *self.stages))
 
 
@@ -51,19 +55,22 @@ class Entry:
 
     @property
     def key(self) -> str:
-        """That of its task."""
+        """The key of the entry's task."""
         return " ".join((self.id, *self.stages))
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The entries of a sweep and the tasks they need, each once, upstream runs before those that need them.
+    """The entries of a sweep, and the tasks that they need, each once and after those that it needs.
 
     Attributes:
-        name: of the sweep. outputs: folder of the runs' folder.
-        open: more tasks may come, so workers stay (a search); a sweep's plan is closed.
-        cancelled: ids that no worker shall go on with.
-        fail_fast: the first failed run ends the sweep.
+        name: the sweep's name.
+        outputs: the folder of runs and caches.
+        entries: the cells of the sweep.
+        tasks: the runs to be made.
+        open: whether more tasks may come (a search), so that workers stay. A sweep's plan is closed.
+        cancelled: ids of runs that no worker is to go on with.
+        fail_fast: whether the first failed run ends the sweep.
     """
 
     name: str
@@ -75,7 +82,7 @@ class Plan:
     fail_fast: bool = False
 
     def run(self, label: str, seed: int) -> Run | None:
-        """The run of an arm with a seed, finished or not; None where its identity is not known."""
+        """Return the run of an arm with a seed, finished or not; None where its identity is not known."""
         found = self._by_cell.get((label, seed))
         return Run.of(self.outputs, found) if found else None
 
@@ -84,16 +91,16 @@ class Plan:
         return {(entry.label, entry.seed): entry.id for entry in self.entries}
 
     def run_of(self, task: RunTask | Entry) -> Run:
-        """The run of a task."""
+        """Return the run of a task or entry."""
         return Run.of(self.outputs, task.id)
 
     def complete(self, task: RunTask | Entry) -> bool:
-        """Whether the run is trained and all of its stages that are wanted were made."""
+        """Return whether the run is trained and all wanted stages of it were made."""
         run = self.run_of(task)
         return run.done and all(map(run.has, task.stages))
 
     def states(self) -> dict[str, str]:
-        """The state of every task by its key: its run's, or "blocked" where its upstream run failed."""
+        """Return every task's state by its key: its run's, or "blocked" where its upstream run failed."""
         states = {task.key: self.run_of(task).state(self.complete(task)) for task in self.tasks}
         for task in self.tasks:
             if states[task.key] != "done" and states.get(task.upstream or "") == "failed":
@@ -101,7 +108,7 @@ class Plan:
         return states
 
     def left(self) -> list[RunTask]:
-        """The tasks that are neither done nor failed nor blocked nor cancelled; none of a stopped plan."""
+        """Return the tasks to be done: not done, failed, blocked or cancelled. A stopped plan has none."""
         if self.stopped:
             return []
         states = self.states()
@@ -114,17 +121,17 @@ class Plan:
         return self.fail_fast and "failed" in self.states().values()
 
     def counts(self) -> Counter[str]:
-        """How many tasks are in which state."""
+        """Count the tasks in each state."""
         return Counter(self.states().values())
 
     def save(self, path: Path) -> None:
-        """Write the plan, whole or not at all."""
+        """Write the plan to a file, as a whole or not at all."""
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, {**asdict(self), "outputs": str(self.outputs)})
 
     @classmethod
     def load(cls, path: Path) -> Plan:
-        """A saved plan. Raises InputError where the file is none."""
+        """Read a saved plan. Raises InputError where the file holds none."""
         try:
             content = json.loads(path.read_bytes())
             content["entries"] = tuple(Entry(**_stages(entry)) for entry in content["entries"])
@@ -136,12 +143,12 @@ class Plan:
 
 
 def _stages(fields: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a task or entry, its stages as they were before they were JSON."""
+    """Return the fields of a task or entry with its stages as a tuple, which JSON turned into a list."""
     return fields | {"stages": tuple(fields.get("stages", ()))}
 
 
 def unique(tasks: Iterable[RunTask]) -> tuple[RunTask, ...]:
-    """Each task once, in the order given, an upstream run right before the first task that needs it."""
+    """Return each task once, in the order given, an upstream run right before the first that needs it."""
     known = {task.key: task for task in tasks}
     order = (key for task in known.values() for key in (task.upstream, task.key) if key in known)
     return tuple(known[key] for key in dict.fromkeys(order))

@@ -1,14 +1,14 @@
-"""Sweep files: arms (a label and the smallest difference to the base), seeds, and the paper's values.
+"""Sweep files: arms (each a label and its overrides of the base), seeds, and the paper's values.
 
 title: Placement of memory blocks in the backbone
-table: 14                          # of the paper; left out in sweeps of your own
+table: 14                          # the number in the paper; left out in sweeps of your own
 base: [experiment=paper]           # overrides that all arms share
 seeds: [0, 1, 2]
-control: 2  , 4, 6, 8              # the arm that the others are compared with; the first one by default
+control: 2, 4, 6, 8                # the arm that the others are compared with; the first one by default
 metrics: [MPJRE, MPJPE, MPJVE, Jitter]
 branch: combined                   # whose errors the rows show: rotation (the default), position or combined
-branch_source: its last row is Table 6's after inverse kinematics                   # how we know
-smallest: {MPJPE: 0.1}             # smallest effect of interest by metric; SMALLEST has the defaults
+branch_source: its last row is Table 6's after inverse kinematics    # how we know the paper's branch
+smallest: {MPJPE: 0.1}             # the smallest effect of interest by metric; SMALLEST has the defaults
 arms:
   2, 4, 6, 8: {overrides: [], paper: {MPJRE: 2.57}}
   "2": {overrides: ['memory.layers=[2]'], paper: {MPJRE: 2.63}, note: as printed}
@@ -40,7 +40,10 @@ KEYS = (
 )  # fmt: skip
 ARM_KEYS = ("overrides", "branch", "against", "paper", "note")
 COSTS = ("FLOPs", "MACs", "parameters", "size", "ms", "ratio", "FPS")
-"""Columns that are no errors: GFLOP, GMAC, millions, MB, ms, those over the yardstick's, 1 / s."""
+"""Metrics that are costs and no errors.
+
+Their units: GFLOP, GMAC, millions, MB, ms, multiples of the yardstick's time, and frames a second.
+"""
 
 
 @dataclass(frozen=True)
@@ -49,13 +52,14 @@ class Arm:
 
     Attributes:
         label: its name in the table.
-        overrides: its difference to the base; None where the row is the paper's alone (a system not built).
+        overrides: its overrides of the base; None where the row is the paper's alone (a system not built).
         branch: whose errors the row shows: rotation, position, or combined (after inverse kinematics).
         paper: the paper's values by metric, as printed.
-        note: a word of warning shown under the table.
-        against: label of the arm that this one is compared with; None for the sweep's control.
-        fixed: whether the branch is the arm's own, and not the sweep's.
-        seeds: in place of the sweep's, where seeds are spent on open verdicts alone; None for the sweep's.
+        note: a remark shown under the table.
+        against: the label of the arm that this one is compared with; None for the sweep's control.
+        fixed: whether the file gives the arm a branch of its own.
+        seeds: its seeds in place of the sweep's, where seeds are spent on open verdicts alone; None for the
+            sweep's.
     """
 
     label: str
@@ -82,12 +86,19 @@ class Sweep:
     """A sweep file, or one with overrides added on the command line.
 
     Attributes:
-        name: the file's stem. title, notes: for the table. table: its number in the paper.
-        base: overrides of all arms. seeds: of each arm.
-        arms: the rows in order. control: the label that the others are compared with.
-        metrics: the columns. extra: overrides of the command line.
-        branch_source: how we know which branch the paper's values belong to, where the file says.
-        smallest: smallest effect of interest by metric, in the metric's unit; every metric but costs has one.
+        name: the file's stem.
+        title: the table's title.
+        table: the table's number in the paper; None for a sweep of one's own.
+        notes: remarks shown under the table.
+        base: overrides that all arms share.
+        seeds: the seeds of each arm.
+        arms: the rows in order.
+        control: the label of the arm that the others are compared with.
+        metrics: the columns.
+        extra: overrides of the command line.
+        branch_source: how we know which branch the paper's values belong to; None where the file does not
+            say.
+        smallest: the smallest effect of interest by metric, in its unit; every metric but costs has one.
     """
 
     name: str
@@ -104,10 +115,13 @@ class Sweep:
     smallest: Mapping[str, float] = field(default_factory=lambda: SMALLEST)
 
     def with_branch(self, branch: str) -> Sweep:
-        """The same sweep, its arms showing another branch; an arm whose file gives it its own keeps it.
+        """Return the same sweep with its arms showing another branch.
 
-        The paper's values are another branch's then, and left out. Raises InputError for a branch that there
-        is none of.
+        An arm whose file gives it a branch of its own keeps that. The paper's values belong to the branch
+        that they were printed for, so arms that change theirs lose them.
+
+        Raises:
+            InputError: for an unknown branch.
         """
         name = _branch(branch, "branch")
         arms = tuple(
@@ -117,17 +131,23 @@ class Sweep:
         return self if arms == self.arms else replace(self, arms=arms, branch_source=None)
 
     def control_of(self, arm: Arm) -> str | None:
-        """The label of the arm that one is compared with; None for the sweep's control, if it has none."""
+        """Return the label of the arm that an arm is compared with; None for the sweep's control itself.
+
+        The sweep's control may still name another arm with `against`.
+        """
         return arm.against or (self.control if arm.label != self.control else None)
 
     def seeds_of(self, arm: Arm) -> tuple[int, ...]:
-        """The seeds of an arm, the sweep's where it has none of its own."""
+        """Return the seeds of an arm: its own where it has some, else the sweep's."""
         return self.seeds if arm.seeds is None else arm.seeds
 
     def with_overrides(self, overrides: Sequence[str]) -> Sweep:
-        """The same sweep, further overrides standing after its base and before its arms' differences.
+        """Return the same sweep with further overrides, after its base and before the arms' own.
 
-        `seed=0,1` or `seed=0` sets the seeds. Raises InputError for the outputs folder, no arm's matter.
+        `seed=0,1` or `seed=0` sets the seeds.
+
+        Raises:
+            InputError: for an override of the outputs folder, which an option of the command sets.
         """
         if any(word.partition("=")[0].lstrip("+") == "paths.outputs" for word in overrides):
             raise InputError("paths.outputs: allowed here is --outputs FOLDER, or MEMMLP_OUTPUTS")
@@ -137,16 +157,16 @@ class Sweep:
         return replace(self, extra=(*self.extra, *others), seeds=chosen)
 
     def overrides(self, arm: Arm) -> tuple[str, ...]:
-        """Those of an arm: the base's, the command line's, its own; of two for one key the later one."""
+        """Return an arm's overrides: the base's, the command line's, its own; the last one for a key wins."""
         words = (*self.base, *self.extra, *(arm.overrides or ()))
         return tuple({word.partition("=")[0].lstrip("+~"): word for word in words}.values())
 
     def runnable(self) -> tuple[Arm, ...]:
-        """The arms that are not the paper's alone."""
+        """Return the arms that can be run, which are all but the paper's alone."""
         return tuple(arm for arm in self.arms if arm.overrides is not None)
 
     def jobs(self) -> list[Job]:
-        """What has to be run, arm by arm."""
+        """Return the trainings that the sweep needs, arm by arm."""
         return [
             Job(arm.label, seed, (*self.overrides(arm), f"seed={seed}"))
             for arm in self.runnable()
@@ -155,10 +175,10 @@ class Sweep:
 
 
 class UniqueKeys(yaml.SafeLoader):
-    """Safe YAML in which no mapping has a key twice: plain YAML lets the last one win without a word."""
+    """Safe YAML that refuses a mapping with a key twice, where plain YAML silently takes the last one."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """The mapping. Raises ConstructorError for a key that is there twice."""
+        """Return the mapping. Raises ConstructorError for a key that occurs twice."""
         seen = set()
         for key, _ in node.value:
             if key.value in seen:
@@ -168,7 +188,7 @@ class UniqueKeys(yaml.SafeLoader):
 
 
 def load_sweep(path: Path) -> Sweep:
-    """Read a sweep file. Raises InputError, naming file and key."""
+    """Read a sweep file. Raises InputError, naming file and key, where it is wrong."""
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), UniqueKeys)
     except OSError as error:
@@ -182,7 +202,7 @@ def load_sweep(path: Path) -> Sweep:
 
 
 def parse_sweep(name: str, content: Any) -> Sweep:
-    """The sweep of a file's content. Raises InputError, naming the key."""
+    """Return the sweep that a file's content describes. Raises InputError, naming the key."""
     content = _mapping(content, "the file", KEYS)
     branch = _branch(content.get("branch", BRANCHES[0]), "branch")
     arms = [_arm(label, value, branch) for label, value in _labelled(content.get("arms", {})).items()]
@@ -213,7 +233,7 @@ def parse_sweep(name: str, content: Any) -> Sweep:
 
 
 def _arm(label: str, value: Any, branch: str) -> Arm:
-    """An arm from its mapping, or from its overrides alone; the branch is the sweep's."""
+    """Return an arm from its mapping, or from a bare list of its overrides; `branch` is the sweep's."""
     name = f"arms.{label}"
     if isinstance(value, list):
         return Arm(label, tuple(_overrides(value, name)), branch)
@@ -231,14 +251,14 @@ def _arm(label: str, value: Any, branch: str) -> Arm:
 
 
 def _branch(value: Any, name: str) -> str:
-    """The name of a branch."""
+    """Return the name of a branch. Raises InputError, naming the key, for an unknown one."""
     if value not in BRANCHES:
         raise InputError(f"{name}: '{value}'; allowed are {', '.join(BRANCHES)}")
     return value
 
 
 def _check_controls(arms: Sequence[Arm], runnable: Sequence[str]) -> None:
-    """Refuse an arm that is compared with itself, or with what isn't run."""
+    """Refuse an arm that is compared with itself, or with an arm that is not run."""
     for arm in arms:
         others = [label for label in runnable if label != arm.label]
         if arm.against is not None and arm.against not in others:
@@ -248,7 +268,11 @@ def _check_controls(arms: Sequence[Arm], runnable: Sequence[str]) -> None:
 
 
 def _grid(arms: Sequence[Arm], axes: Mapping[str, Any], branch: str) -> Iterable[Arm]:
-    """Every arm with every combination of the axes' values."""
+    """Yield every arm with every combination of the axes' values.
+
+    The paper's own arms stay as they are. Without arms there is one for each combination. An arm with a
+    control of its own is compared with that control at the same combination.
+    """
     for key, values in axes.items():
         if not isinstance(values, list) or not values:
             raise InputError(f"axes.{key}: allowed is a list of values, not empty")
@@ -264,7 +288,7 @@ def _grid(arms: Sequence[Arm], axes: Mapping[str, Any], branch: str) -> Iterable
 
 
 def _word(value: Any) -> str:
-    """A value as an override has it."""
+    """Return a value as text in an override."""
     if value is None:
         return "null"
     if isinstance(value, bool):
@@ -275,7 +299,7 @@ def _word(value: Any) -> str:
 
 
 def _mapping(value: Any, name: str, keys: Sequence[str] = ()) -> Mapping[str, Any]:
-    """The value as a mapping whose keys are known."""
+    """Return the value, checked to be a mapping with known keys only."""
     if not isinstance(value, Mapping):
         raise InputError(f"{name}: {_kind(value)}; allowed is a mapping")
     for key in value:
@@ -288,7 +312,7 @@ def _mapping(value: Any, name: str, keys: Sequence[str] = ()) -> Mapping[str, An
 
 
 def _labelled(value: Any) -> dict[str, Any]:
-    """The arms by label; labels that YAML takes for numbers are words here."""
+    """Return the arms by label; a label that YAML takes for a number becomes text."""
     arms = {str(label): arm for label, arm in _mapping(value, "arms").items()}
     if len(arms) < len(value):
         raise InputError("arms: two have the same label")
@@ -299,7 +323,7 @@ def _labelled(value: Any) -> dict[str, Any]:
 
 
 def _overrides(value: Any, name: str) -> list[str]:
-    """A list of Hydra's overrides; what they mean is found out when they are composed."""
+    """Return a list of Hydra overrides, checked for their form only; composing them shows what they mean."""
     words = _texts(value, name)
     for word in words:
         if not re.match(r"[+~]*[\w./@]+(=|$)", word):
@@ -328,7 +352,7 @@ def _table(value: Any) -> int | None:
 
 
 def _seeds(value: Any, name: str) -> tuple[int, ...]:
-    """Whole numbers, each once."""
+    """Return the seeds, checked to be whole numbers, each once."""
     items = value if isinstance(value, list) else [value]
     words = [str(item).strip() for item in items]
     if not words or not all(re.fullmatch(r"\d+", word) for word in words) or len(set(words)) < len(words):
@@ -337,6 +361,7 @@ def _seeds(value: Any, name: str) -> tuple[int, ...]:
 
 
 def _metrics(value: Any) -> tuple[str, ...]:
+    """Return the names of the columns, checked to be metrics or costs."""
     names = _texts(value, "metrics")
     if not names:
         raise InputError("metrics: empty; allowed is at least one")
@@ -347,7 +372,7 @@ def _metrics(value: Any) -> tuple[str, ...]:
 
 
 def _paper(value: Any, name: str) -> dict[str, float]:
-    """The paper's values by metric."""
+    """Return the paper's values by metric."""
     values = dict(_mapping(value or {}, name, [*UNITS, *COSTS]))
     for metric, number in values.items():
         if not isinstance(number, int | float) or isinstance(number, bool):
@@ -356,7 +381,7 @@ def _paper(value: Any, name: str) -> dict[str, float]:
 
 
 def _smallest(value: Any) -> dict[str, float]:
-    """Smallest effects of interest by metric."""
+    """Return the smallest effects of interest by metric."""
     values = dict(_mapping(value or {}, "smallest", [*UNITS]))
     for metric, number in values.items():
         real = isinstance(number, int | float) and not isinstance(number, bool)
@@ -366,5 +391,5 @@ def _smallest(value: Any) -> dict[str, float]:
 
 
 def _kind(value: Any) -> str:
-    """A value of the wrong kind, as an error names it."""
+    """Describe a value of the wrong kind for an error message."""
     return "nothing" if value is None else f"{value!r}"[:60]

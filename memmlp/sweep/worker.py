@@ -1,7 +1,8 @@
 """A worker takes a plan's tasks, one after another, each under its run's lock, until none is left.
 
-Any number of workers, on any machines that share the outputs folder, may work on the same runs: a run is
-brought to its end by one of them, and a killed one's is taken over from its last checkpoint.
+Any number of workers, on any machines that share the outputs folder, may work on the same runs. A run is
+brought to its end by one of them. When a worker is killed, another takes its run over from the last
+checkpoint.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from memmlp.common.errors import InputError, TrainingDiverged
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask
 
-PAUSE = 0.5  # seconds between looks at a plan whose tasks are all in other hands
+PAUSE = 0.5  # seconds before another look at a plan whose tasks others are at
 ABANDONED = 600.0  # seconds without a sign of life after which an open plan's controller counts as dead
 DEATHS = 10  # workers that died at the same step of a run before it counts as failed
 
@@ -25,13 +26,19 @@ Perform = Callable[[Plan, RunTask], None]
 
 
 class Cancelled(Exception):
-    """The plan no longer wants the run; its folder stays as it is and can be resumed."""
+    """Raised when the plan no longer wants the run. Its folder stays as it is, and can be resumed."""
 
 
 def work(path: Path, perform: Perform, wanted: Callable[[], bool] = lambda: True) -> None:
-    """Work on the plan of that file, which is read again before each task, while work is wanted.
+    """Work on the plan of that file while `wanted` returns true and tasks are left.
 
-    `perform` brings a task's run to its end, or raises.
+    The file is read again before each task, for the plan may have changed. An open plan (a search's) may get
+    more tasks, so its workers stay.
+
+    Args:
+        path: the plan's file.
+        perform: brings a task's run to its end, or raises.
+        wanted: whether to go on.
     """
     while wanted():
         plan = Plan.load(path)
@@ -43,12 +50,19 @@ def work(path: Path, perform: Perform, wanted: Callable[[], bool] = lambda: True
 
 
 def directed(path: Path) -> bool:
-    """Whether the plan of that file is closed, or its controller, which touches the file, lives."""
+    """Return whether the plan of that file is closed, or open with a controller that lives.
+
+    A living controller touches the file all the time.
+    """
     return not Plan.load(path).open or time.time() - path.stat().st_mtime < ABANDONED
 
 
 def attempt(plan: Plan, task: RunTask, perform: Perform) -> bool:
-    """Bring a task's run to its end, if nobody else is at it and its upstream run is done."""
+    """Bring a task's run to its end, if its upstream run is done and nobody else is at it.
+
+    Returns:
+        False where the task has to wait for its upstream run or for another worker; else True.
+    """
     run = plan.run_of(task)
     if task.upstream and not Run.of(plan.outputs, task.upstream).done:
         return False
@@ -65,7 +79,7 @@ def attempt(plan: Plan, task: RunTask, perform: Perform) -> bool:
 
 
 def _perform(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
-    """Perform the task; what goes wrong is left with the run, for the other tasks have no part in it."""
+    """Perform the task. A failure is recorded with the run, for it does not concern the other tasks."""
     try:
         perform(plan, task)
     except Cancelled:
@@ -77,7 +91,10 @@ def _perform(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
 
 
 def deaths(run: Run) -> int:
-    """How many processes in a row, since a retry, began the run at the step where it still is."""
+    """Count the last processes that, one after another, began the run at the step where it still is.
+
+    Processes from before the last --retry don't count.
+    """
     step, count, manifest = run.step, 0, run.manifest
     for begun in reversed(manifest.get("attempts", [])[manifest.get("forgiven", 0) :]):
         if begun.get("step") != step:
@@ -87,7 +104,7 @@ def deaths(run: Run) -> int:
 
 
 class Presence:
-    """Says whether the process that made it lives: it holds a lock that its death frees."""
+    """A sign that the process that made it lives: a lock, which is freed even by the process's death."""
 
     def __init__(self, path: Path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -97,7 +114,7 @@ class Presence:
 
     @staticmethod
     def of(path: Path) -> bool:
-        """Whether the process with that file lives."""
+        """Return whether the process with that lock file lives."""
         probe = FileLock(path)
         try:
             probe.acquire(timeout=0)

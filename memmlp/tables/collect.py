@@ -1,4 +1,4 @@
-"""From a sweep and its finished runs to a table's numbers."""
+"""From a sweep and its finished runs to the numbers of a table."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Find = Callable[[Arm, int], Measured | None]
 
 
 def finished(sweep: Sweep, find: Find) -> dict[str, Runs]:
-    """The finished runs of each arm, by seed."""
+    """Return the finished runs of each runnable arm, by seed."""
     return {
         arm.label: {seed: run for seed in sweep.seeds_of(arm) if (run := find(arm, seed)) is not None}
         for arm in sweep.runnable()
@@ -35,18 +35,21 @@ def collect(
     older: Say = silent,
     rounds: Rounds | None = None,
 ) -> Table:
-    """The table of a sweep.
+    """Make the table of a sweep.
 
     Args:
+        sweep: the sweep; where seeds were spent in rounds, `rounds.spent(sweep)`.
         runs: the finished runs of every runnable arm, by seed (`finished`).
-        modes: of evaluation ("stream", "window"). command: what fills the missing arms.
-        state: how far the unfinished run of an arm and seed is, in a word; None for nothing to say.
-        older: the run of an earlier recipe that stands where one is missing; None where there is none.
-        rounds: whose verdicts stand, where seeds were spent so; the sweep is then `rounds.spent(sweep)`.
+        modes: the modes of evaluation to show ("stream", "window").
+        command: the command that makes missing runs; `memmlp sweep` with the sweep's name by default.
+        state: says in a word how far the unfinished run of an arm and seed is; None for nothing to say.
+        older: names the run of an earlier recipe that there is in place of a missing one; None for none.
+        rounds: the rounds whose verdicts stand; None for verdicts of a fixed number of seeds.
     """
     shown = tuple(modes) if set(sweep.metrics) - set(COSTS) else tuple(modes)[:1]
     seen = with_existing_branches(sweep, runs)
-    every = MODES if set(sweep.metrics) - set(COSTS) else shown  # corrected over both, whichever is shown
+    # The correction is over both modes, whichever of them are shown.
+    every = MODES if set(sweep.metrics) - set(COSTS) else shown
     found = effects(seen, runs, every)
     compared = sum(effect.p is not None for effect in found.values())
     if rounds:
@@ -69,11 +72,13 @@ def collect(
 
 
 def without_runs(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
-    """The table of a sweep whose runs cannot be known: the paper's values, and why there is no more."""
+    """Make the table of a sweep whose runs can't be known: the paper's values, and the reason."""
     return replace(collect(sweep, {arm.label: {} for arm in sweep.runnable()}, modes), flags=(reason,))
 
 
 def _row(sweep: Sweep, arm: Arm, runs: Runs | None, modes: Sequence[str], found: Mapping[Key, Effect]) -> Row:
+    """Return an arm's row; `runs` is None for a row that is the paper's alone."""
+
     def cell(mode: str, metric: str) -> Cell:
         numbers = {seed: run.value(mode, arm.branch, metric) for seed, run in (runs or {}).items()}
         values = {seed: value for seed, value in numbers.items() if value is not None}

@@ -16,9 +16,11 @@ class Distribution(NamedTuple):
     """An arm's errors in one metric.
 
     Attributes:
-        label: of the arm. errors: (S, C) by seed and clip; empty where there are none.
-        middle: their interquartile mean. improvement: the probability that a run of the arm has a smaller
-            error than one of its control on the same clip. None where there is none.
+        label: the arm's label.
+        errors: the errors (S, C) by seed and clip; empty where there are none.
+        middle: their interquartile mean; None where there are none.
+        improvement: the probability that a run of the arm has a smaller error than one of its control on the
+            same clip; None without a control or a shared clip.
     """
 
     label: str
@@ -28,7 +30,10 @@ class Distribution(NamedTuple):
 
 
 def distributions(sweep: Sweep, runs: Mapping[str, Runs], mode: str) -> dict[str, list[Distribution]]:
-    """Those of every arm by metric, of the clips that all runs have; metrics that no run has are left out."""
+    """Return the distributions of every arm, by metric, over the clips that all runs have.
+
+    Metrics that no run has are left out.
+    """
     seen = with_existing_branches(sweep, runs)
     every = [run for found in runs.values() for run in found.values()]
     clips = [clip for clip in every[0].clips if all(clip in run.clips for run in every)] if every else []
@@ -46,11 +51,15 @@ def _of_metric(
 
 
 def _errors(runs: Runs, clips: list[str], mode: str, arm: Arm, metric: str) -> np.ndarray:
-    """Errors (S, C), NaN for a clip of which a run has none."""
+    """Return errors (S, C), with NaN for a clip of which a run has none."""
     return np.array([run.by_clip(clips, mode, arm.branch, metric) for run in runs.values()])
 
 
 def _distribution(label: str, errors: Mapping[str, np.ndarray], other: Arm | None) -> Distribution:
+    """Return an arm's distribution, over the clips for which all its runs have a number.
+
+    The comparison with the control is over the clips for which the control's runs have one, too.
+    """
     every, theirs = errors[label], errors.get(other.label) if other else None
     known = np.isfinite(every).all(0)
     ours = every[:, known]

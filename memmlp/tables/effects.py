@@ -16,24 +16,29 @@ from memmlp.sweep.spec import COSTS, Arm, Sweep
 from memmlp.tables.measured import Measured
 from memmlp.tables.table import Effect, Key
 
-Runs = Mapping[int, Measured]  # by seed
+Runs = Mapping[int, Measured]  # an arm's finished runs by seed
 
 
 class Paired(NamedTuple):
-    """An arm's errors less its control's, (S, C) by seed and clip, and the clips' groups as numbers (C,)."""
+    """An arm's differences from its control.
+
+    Attributes:
+        matrix: the arm's errors less the control's (S, C), by seed and clip.
+        groups: the number of each clip's group (C,).
+    """
 
     matrix: np.ndarray
     groups: np.ndarray
 
 
 def control_arm(sweep: Sweep, arm: Arm) -> Arm | None:
-    """The arm that another is compared with; None for the sweep's control and rows of the paper alone."""
+    """Return the arm that an arm is compared with; None for the sweep's control and the paper's own rows."""
     label = sweep.control_of(arm) if arm.overrides is not None else None
     return next((other for other in sweep.arms if other.label == label), None)
 
 
 def paper_effect(sweep: Sweep, arm: Arm, metric: str) -> float | None:
-    """The paper's difference from the control, as printed; None where there is none."""
+    """Return the paper's difference from the control, of printed values; None where one is not printed."""
     other = control_arm(sweep, arm)
     ours = (arm.paper or {}).get(metric)
     theirs = (other.paper or {}).get(metric) if other else None
@@ -41,7 +46,7 @@ def paper_effect(sweep: Sweep, arm: Arm, metric: str) -> float | None:
 
 
 def paired(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dict[Key, Paired]:
-    """The differences of all arms in all metrics that are no costs, where there are any."""
+    """Return the differences of all arms in all error metrics, where there are any."""
     found = {}
     for arm, other in _compared(sweep):
         ours, theirs = runs[arm.label], runs[other.label]
@@ -56,7 +61,10 @@ def paired(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dict
 
 
 def effects(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dict[Key, Effect]:
-    """The effects of all arms, their p-values corrected over all of them; of costs the bare differences."""
+    """Return the effects of all arms, with p-values corrected over all of them.
+
+    Of costs it has the bare differences, without p-values.
+    """
     printed = {
         Key(arm.label, mode, metric): paper_effect(sweep, arm, metric)
         for arm, mode, metric in itertools.product(sweep.runnable(), modes, sweep.metrics)
@@ -67,13 +75,13 @@ def effects(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dic
 
 
 def one_and_the_same(arm: Arm, other: Arm, ours: Runs, theirs: Runs) -> bool:
-    """Whether two arms show the same branch of the same runs, so that there is nothing to compare."""
+    """Return whether two arms show the same branch of the same run, so that there is nothing to compare."""
     same = any(ours[seed].id == theirs[seed].id for seed in ours.keys() & theirs.keys())
     return same and arm.branch == other.branch
 
 
 def _compared(sweep: Sweep) -> Iterator[tuple[Arm, Arm]]:
-    """Each arm that has a control, with it."""
+    """Yield each arm that has a control, with its control."""
     for arm in sweep.runnable():
         other = control_arm(sweep, arm)
         if other is not None:
@@ -88,7 +96,7 @@ def _paired(
     mode: str,
     metric: str,
 ) -> Paired:
-    """Ours less theirs over the shared seeds and clips that all runs have a number of."""
+    """Return ours less theirs, over the shared seeds and those clips that all runs have a number for."""
     seeds, clips = shared
     sides = [
         np.array([runs[seed].by_clip(clips, mode, branch, metric) for seed in seeds])
@@ -102,14 +110,18 @@ def _paired(
 
 
 def _shared(ours: Runs, theirs: Runs) -> tuple[list[int], list[str]]:
-    """The seeds that both have, and the clips that all their runs have."""
+    """Return the seeds that both arms have, and the clips that all their runs have."""
     seeds = [seed for seed in ours if seed in theirs]
     names = [runs[seed].clips for runs in (ours, theirs) for seed in seeds]
     return seeds, [name for name in names[0] if all(name in other for other in names)] if names else []
 
 
 def alike(pairs: Mapping[Key, Paired]) -> Iterator[tuple[list[Key], np.ndarray, np.ndarray]]:
-    """Comparisons of the same seeds and groups together: keys, differences (K, S, C), groups (C,)."""
+    """Group the comparisons that have the same seeds and groups of clips, to be computed at once.
+
+    Yields:
+        Keys (K), differences (K, S, C), and the clips' groups (C,), which they share.
+    """
     batches: dict[tuple[int, bytes], list[Key]] = defaultdict(list)
     for key, pair in pairs.items():
         batches[len(pair.matrix), pair.groups.tobytes()].append(key)
@@ -118,7 +130,7 @@ def alike(pairs: Mapping[Key, Paired]) -> Iterator[tuple[list[Key], np.ndarray, 
 
 
 def tested(pairs: Mapping[Key, Paired], smallest: Mapping[str, float]) -> dict[Key, Effect]:
-    """The effects with their own p-values, in the pairs' order."""
+    """Return the effects with p-values of their own, not corrected yet, in the order of the pairs."""
     found: dict[Key, Effect] = {}
     for keys, differences, groups in alike(pairs):
         size = {"seeds": differences.shape[1], "clips": differences.shape[2], "groups": len(set(groups))}
@@ -137,7 +149,10 @@ def tested(pairs: Mapping[Key, Paired], smallest: Mapping[str, float]) -> dict[K
 def _judged(
     tested: Mapping[Key, Effect], smallest: Mapping[str, float], printed: Mapping[Key, float | None]
 ) -> dict[Key, Effect]:
-    """The effects with corrected p-values, differences by one Holm and equivalences by another; verdicts."""
+    """Return the effects with verdicts and corrected p-values.
+
+    Differences are corrected by Holm over all comparisons, and so are equivalences, as a family of their own.
+    """
     keys = list(tested)
     different = holm(np.array([or_nan(tested[key].p) for key in keys]))
     equal = holm(np.array([or_nan(tested[key].equal) for key in keys]))
@@ -149,7 +164,7 @@ def _judged(
 
 
 def _costs(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dict[Key, Effect]:
-    """The differences of mean costs, which have no interval: they are exact, or this machine's."""
+    """Return the differences of mean costs. They have no interval, for they are exact or this machine's."""
     found = {}
     for arm, other in _compared(sweep):
         for mode, metric in itertools.product(modes, set(sweep.metrics) & set(COSTS)):
@@ -165,17 +180,17 @@ def _mean_cost(runs: Runs, metric: str) -> float:
 
 
 def or_none(number: float) -> float | None:
-    """The number; None for NaN."""
+    """Return the number; None for NaN."""
     return None if math.isnan(number) else float(number)
 
 
 def or_nan(number: float | None) -> float:
-    """The number; NaN for None."""
+    """Return the number; NaN for None."""
     return math.nan if number is None else number
 
 
 def with_existing_branches(sweep: Sweep, runs: Mapping[str, Runs]) -> Sweep:
-    """The sweep, arms whose networks have one head alone showing that one, the rotation branch."""
+    """Return the sweep with the rotation branch for arms whose networks have no position branch."""
 
     def single(arm: Arm) -> bool:
         found = runs.get(arm.label, {}).values()

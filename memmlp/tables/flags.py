@@ -1,4 +1,4 @@
-"""What a reader has to know of the runs behind a table, a line each."""
+"""Flags: what a reader has to know of the runs behind a table, a line each."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from memmlp.tables.measured import Measured
 
 Say = Callable[[Arm, int], str | None]
 BUILT_IN = "builtin"
-SMPLH = (1, 2, 3)  # the paper's tables on AMASS, whose rest joints are each subject's SMPL-H body's
+SMPLH = (1, 2, 3)  # the paper's tables on AMASS, on the rest joints of SMPL-H bodies
 ORIGIN = {
     "code": "code", "data": "data", "hardware": "hardware", "device": "device", "gpu": "GPU",
     "threads": "threads", "torch": "torch", "precision": "precision",
@@ -22,18 +22,21 @@ ORIGIN = {
 
 
 def silent(arm: Arm, seed: int) -> None:
-    """Has nothing to say of a cell."""
+    """Have nothing to say about a cell: the default where a `Say` is wanted."""
 
 
 def flags(
     sweep: Sweep, asked: Sweep, runs: Mapping[str, Runs], command: str, state: Say, older: Say
 ) -> Iterable[str]:
-    """The lines.
+    """Yield the flags of a table.
 
     Args:
-        sweep: as shown. asked: as it was before arms without the branch fell back to another.
-        command: what fills the missing arms. state: how far an unfinished run is, in a word.
-        older: the run of an earlier recipe that a missing cell has.
+        sweep: the sweep as it is shown.
+        asked: the sweep before arms without the wanted branch fell back to another.
+        runs: the finished runs of every runnable arm, by seed.
+        command: the command that makes missing runs.
+        state: says in a word how far the unfinished run of an arm and seed is.
+        older: names the run of an earlier recipe that there is in place of a missing one.
     """
     every = [(arm.label, run) for arm in sweep.runnable() for run in runs[arm.label].values()]
     yield from _missing(sweep, runs, command, state)
@@ -55,6 +58,7 @@ def flags(
 
 
 def _missing(sweep: Sweep, runs: Mapping[str, Runs], command: str, state: Say) -> Iterable[str]:
+    """Flag the runs that are missing, how far they are, and the command that makes them."""
     gaps = []
     for arm in sweep.runnable():
         seeds = _gaps(sweep, arm, runs)
@@ -67,7 +71,7 @@ def _missing(sweep: Sweep, runs: Mapping[str, Runs], command: str, state: Say) -
 
 
 def _older(sweep: Sweep, runs: Mapping[str, Runs], older: Say) -> Iterable[str]:
-    """The missing cells that a run of an earlier recipe would fill."""
+    """Flag missing cells for which there is a run of an earlier recipe."""
     found = [
         f"'{arm.label}' seed {seed} ({run})"
         for arm in sweep.runnable()
@@ -83,7 +87,7 @@ def _gaps(sweep: Sweep, arm: Arm, runs: Mapping[str, Runs]) -> list[int]:
 
 
 def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, Runs], command: str) -> Iterable[str]:
-    """Rows that show another branch than the table's, and rows that have not been evaluated in theirs."""
+    """Flag rows that show another branch than the table's, and rows not evaluated in the one they show."""
     wanted = {arm.label: arm.branch for arm in asked.arms}
     fallen = [arm for arm in sweep.runnable() if arm.branch != wanted[arm.label]]
     if fallen:
@@ -96,6 +100,7 @@ def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, Runs], command: str
 
 
 def _unequal_clips(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+    """Flag arms that don't have the same test clips as their controls."""
     for arm in sweep.runnable():
         other = control_arm(sweep, arm)
         if other is None:
@@ -111,7 +116,7 @@ def _unequal_clips(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
 
 
 def _unequal_groups(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Clips that are of one group in some runs and of another in others: replicates by two countings."""
+    """Flag clips that belong to one group in some runs and to another in others."""
     groups: dict[str, set[str]] = defaultdict(set)
     for _, run in every:
         for clip in run.clips:
@@ -122,9 +127,9 @@ def _unequal_groups(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
 
 
 def _no_numbers(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
-    """Runs without a number of clips of which others have one: networks that diverged there.
+    """Flag runs that have no number for clips for which others have one, because their network diverged.
 
-    A clip of which no run has one is too short for the metric.
+    A clip for which no run has a number is too short for the metric.
     """
     lost: dict[tuple[str, int], set[str]] = defaultdict(set)
     every = [(arm, seed, run) for arm in sweep.runnable() for seed, run in runs[arm.label].items()]
@@ -144,14 +149,17 @@ def _no_numbers(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
 
 
 def _lacking(run: Measured, mode: str, branch: str, metric: str) -> set[str]:
-    """The clips of which a run has no number."""
+    """Return the clips for which a run has no finite number."""
     names = list(run.clips)
     known = np.isfinite(run.by_clip(names, mode, branch, metric))
     return {name for name, there in zip(names, known, strict=True) if not there}
 
 
 def _differing(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:
-    """A line where arms differ in something, naming which have what."""
+    """Flag that arms differ in something, and name the arms that have each value.
+
+    `found` has pairs of a value and an arm's label.
+    """
     groups: dict[str, list[str]] = defaultdict(list)
     for value, label in found:
         groups[value].append(label)
@@ -161,7 +169,7 @@ def _differing(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:
 
 
 def _recipes(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Components that arms share but have in different recipes."""
+    """Flag components that several arms have, but in different recipes."""
     for name in sorted({name for _, run in every for name in run.origin.recipes}):
         having = [(run, label) for label, run in every if name in run.origin.recipes]
         yield from _differing(
@@ -170,7 +178,7 @@ def _recipes(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
 
 
 def _replicates(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
-    """What the intervals do not speak of: seeds, groups of clips or VQ-VAEs of which there is one."""
+    """Flag what the intervals don't speak of: seeds, groups of clips or VQ-VAEs, if there is only one."""
     measured = {label: list(found.values()) for label, found in runs.items() if found}
     if len(measured) < 2:
         return
@@ -189,7 +197,7 @@ def _replicates(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
 
 
 def _same(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
-    """Arms that are one run: what tells them apart has no effect under these overrides."""
+    """Flag arms that are one run, because under these overrides nothing tells them apart."""
     for arm in sweep.runnable():
         other = control_arm(sweep, arm)
         if other and one_and_the_same(arm, other, runs[arm.label], runs[other.label]):
@@ -197,7 +205,7 @@ def _same(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
 
 
 def _single(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
-    """Comparisons of one seed, where others have more."""
+    """Flag comparisons that have one seed where others have more."""
     pairs = [(arm.label, other.label) for arm in sweep.runnable() if (other := control_arm(sweep, arm))]
     shared = {one: len(runs[one].keys() & runs[two].keys()) for one, two in pairs}
     few = [label for label, number in shared.items() if number == 1]
@@ -211,7 +219,7 @@ def _one_vqvae(found: Sequence[Measured]) -> bool:
 
 
 def _body(sweep: Sweep, every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Runs on the built-in skeleton beside the paper's numbers on SMPL-H bodies."""
+    """Flag runs on the built-in skeleton in tables where the paper's numbers are on SMPL-H bodies."""
     bare = [label for label, run in every if run.origin.body == BUILT_IN]
     if sweep.table in SMPLH and bare:
         yield f"on the built-in skeleton, the paper's are on SMPL-H bodies (data.body=FILE): {_quoted(bare)}"
@@ -226,5 +234,5 @@ def _quoted(labels: Iterable[str]) -> str:
 
 
 def _listed(words: Sequence[str], most: int = 12) -> str:
-    """Words with commas or, of many, the first ones and how many more."""
+    """Return words with commas between; of many only the first ones and the number of the others."""
     return ", ".join(words[:most]) + (f", and {len(words) - most} more" if len(words) > most else "")

@@ -1,4 +1,4 @@
-"""A table as Markdown, LaTeX, HTML, JSON, or on a terminal."""
+"""A table in a format: Markdown, LaTeX, HTML, JSON, or lines on a terminal."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from memmlp.statistics import Verdict
 from memmlp.tables.grid import MINUS, Grid, Line, caption, grids, legend
 from memmlp.tables.table import Table
 
-GAP = "  "  # between columns
-LABEL = 18  # characters of the arms' column on a terminal, at most
+GAP = "  "  # stands between columns on a terminal
+LABEL = 18  # the largest width of the arms' column on a terminal, characters
 TEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
     "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", MINUS: "$-$",
@@ -29,7 +29,7 @@ TEX = {
 
 
 def markdown(table: Table) -> str:
-    """GitHub's Markdown."""
+    """Return the table in GitHub's Markdown."""
     parts = [f"### {escaped(caption(table))}"]
     for grid in grids(table):
         rows = [list(map(escaped, grid.header)), ["---", ":---:", *["---:"] * len(table.metrics)]]
@@ -41,12 +41,12 @@ def markdown(table: Table) -> str:
 
 
 def escaped(text: str) -> str:
-    """A text that Markdown shows as it is."""
+    """Return the text with everything escaped that Markdown would interpret."""
     return re.sub(r"([\\`*_|<>\[\]#])", r"\\\1", text)
 
 
 def latex(table: Table) -> str:
-    """A LaTeX table for the packages booktabs and amssymb."""
+    """Return a LaTeX table for the packages booktabs and amssymb."""
     lines = ["% needs \\usepackage{booktabs,amssymb}", r"\begin{table}", r"\centering", r"\small"]
     lines.append(rf"\caption{{{_tex(caption(table))}}}")
     lines.append(rf"\begin{{tabular}}{{ll{'r' * len(table.metrics)}}}")
@@ -63,12 +63,12 @@ def latex(table: Table) -> str:
 
 
 def as_json(table: Table) -> str:
-    """All there is, with the values of each seed."""
+    """Return everything that the table holds as JSON, with the values of each seed."""
     return json.dumps(plain(_with_summaries(table)), indent=2, ensure_ascii=False) + "\n"
 
 
 def as_html(table: Table) -> str:
-    """A section to put into a page."""
+    """Return the table as a section for an HTML page."""
     parts = [f'<section class="result" id="{_html(table.name)}"><h3>{_html(caption(table))}</h3>']
     for grid in grids(table):
         title = f"<caption>{_html(grid.mode)} mode</caption>" if grid.mode else ""
@@ -80,7 +80,7 @@ def as_html(table: Table) -> str:
 
 
 def show(table: Table, console: Console) -> None:
-    """Print on a terminal, the columns that do not fit in further blocks below."""
+    """Print the table on a terminal; columns that do not fit stand in further blocks below."""
     console.print(caption(table), style="bold", soft_wrap=True)
     for grid in grids(table):
         if grid.mode:
@@ -102,7 +102,7 @@ def _all(grid: Grid) -> Iterator[Line]:
 
 
 def _remarks(table: Table) -> list[str]:
-    """What stands below a table."""
+    """Return the lines that stand below a table."""
     return [*legend(table), *table.flags, *table.notes]
 
 
@@ -120,13 +120,13 @@ def _html(text: str | None) -> str:
 
 
 def _html_head(name: str) -> str:
-    """A column's head, the unit below."""
+    """Return the HTML of a column's head, with the unit in a line of its own."""
     metric, *unit = map(_html, _header(name))
     return "<br>".join([metric, *(f"<small>{word}</small>" for word in unit)])
 
 
 def _html_group(group: Sequence[Line]) -> str:
-    """An arm's rows, headed by its label."""
+    """Return the HTML of an arm's rows, headed by its label."""
     label = f'<th scope="rowgroup" rowspan="{len(group)}">{_html(group[0].head[0])}</th>'
     heads = [label, *[""] * (len(group) - 1)]
     rows = [
@@ -142,7 +142,10 @@ def _html_line(line: Line) -> str:
 
 
 def _html_mark(text: str) -> str:
-    """A part of a cell, its sign of agreement or significance set off; a verdict in a class of its name."""
+    """Return the HTML of a part of a cell.
+
+    A verdict gets a class of its own name; the signs of agreement and significance get one each.
+    """
     word = text.partition(" ")[0]
     if word in set(Verdict):
         return f'<span class="verdict {word}">{text}</span>'
@@ -154,7 +157,10 @@ def _html_mark(text: str) -> str:
 
 
 def _fitting(grid: Grid, width: int) -> list[list[int]]:
-    """The metrics' columns in groups of about one size that fit beside the arms'."""
+    """Divide the metrics' columns into the fewest groups of nearly equal size that fit the width.
+
+    The arms' two columns stand before each group.
+    """
     columns = range(2, len(grid.header))
     widths = [
         _width(block[column] for block in _blocks(grid)) + len(GAP) for column in range(len(grid.header))
@@ -168,7 +174,7 @@ def _fitting(grid: Grid, width: int) -> list[list[int]]:
 
 
 def _lined(grid: Grid, columns: Sequence[int]) -> Iterator[str]:
-    """Some columns of a grid in lines. (Hundreds of arms would take rich's table seconds.)"""
+    """Yield some columns of a grid as lines. (Rich's own table would take seconds for hundreds of arms.)"""
     blocks = [[block[i] for i in (0, 1, *columns)] for block in _blocks(grid)]
     widths = [_width(block[i] for block in blocks) for i in range(len(columns) + 2)]
     for number, block in enumerate(blocks):
@@ -188,12 +194,12 @@ def _width(parts: Iterable[Sequence[str]]) -> int:
 
 
 def _blocks(grid: Grid) -> list[list[Sequence[str]]]:
-    """The head and each arm, as the lines of each of their columns."""
+    """Return the head and each arm as a block: the lines of each of its columns."""
     return [[*map(_header, grid.header)], *map(_block, grid.groups)]
 
 
 def _block(group: Sequence[Line]) -> list[Sequence[str]]:
-    """An arm's columns, the label folded beside its lines."""
+    """Return an arm's columns as lines, with its label folded beside them."""
     columns: list[list[str]] = [[] for _ in (0, *group[0].cells)]
     for line in group:
         height = max(map(len, line.cells))
@@ -203,14 +209,14 @@ def _block(group: Sequence[Line]) -> list[Sequence[str]]:
 
 
 def _header(name: str) -> list[str]:
-    """A column's head in two lines: name and direction, unit."""
+    """Split a column's head into two lines: the name with its direction, and the unit."""
     metric, _, rest = name.partition(" [")
     unit, _, arrow = rest.partition("] ")
     return [f"{metric} {arrow}", unit] if rest else [name]
 
 
 def _with_summaries(table: Table) -> dict[str, Any]:
-    """The table's fields, each cell with its mean, sd and agreement."""
+    """Return the table's fields, with each cell's mean, standard deviation and agreement added."""
     fields = asdict(table)
     for row, words in zip(table.rows, fields["rows"], strict=True):
         for mode, cells in row.cells.items():

@@ -1,4 +1,4 @@
-"""A table's numbers as words in rows and columns, the same for every format."""
+"""The words of a table in rows and columns, which are the same for every format."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ class Line:
     """A line of an arm.
 
     Attributes:
-        kind: "measured", "difference" (from the control) or "paper". head: its first two cells.
-        cells: one a metric, each of one or two parts.
+        kind: "measured", "difference" (from the control) or "paper".
+        head: the words of its first two columns, arm and seeds.
+        cells: one for each metric, each of one to three parts.
     """
 
     kind: str
@@ -32,7 +33,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Grid:
-    """The lines of one evaluation mode, arm by arm; `mode` is None where the columns know none."""
+    """The lines of one mode of evaluation, arm by arm; `mode` is None where it makes no difference."""
 
     mode: str | None
     header: tuple[str, ...]
@@ -40,7 +41,11 @@ class Grid:
 
 
 def grids(table: Table) -> list[Grid]:
-    """One grid a mode; one without a mode where all would be the same: of costs, or with nothing measured."""
+    """Return a grid for each mode.
+
+    There is a single grid without a mode where all modes would show the same: costs alone, or nothing
+    measured.
+    """
     timeless = set(table.metrics) <= set(COSTS) or not any(row.found for row in table.rows)
     header = ("arm", "seeds", *map(heading, table.metrics))
     return [
@@ -54,23 +59,23 @@ def grids(table: Table) -> list[Grid]:
 
 
 def heading(metric: str) -> str:
-    """A metric with its unit and the direction that is better."""
+    """Return a metric's name with its unit and the direction that is better."""
     words = (metric, f"[{unit(metric)}]" if unit(metric) else "", "↑" if metric == "FPS" else "↓")
     return " ".join(word for word in words if word)
 
 
 def unit(metric: str) -> str:
-    """A metric's unit; empty where it has none."""
+    """Return a metric's unit; empty where it has none."""
     return UNITS.get(metric, COST_UNITS.get(metric, "")).replace("10^2", "10²").replace("s^3", "s³")
 
 
 def caption(table: Table) -> str:
-    """The table's title."""
+    """Return the table's title, with its number in the paper."""
     return f"Table {table.number}: {table.title}" if table.number else table.title
 
 
 def legend(table: Table) -> list[str]:
-    """How to read the lines, where there is something measured; and whose errors they are."""
+    """Return the lines that explain the table: whose errors it shows, and how to read what was measured."""
     lines = [_branch(table)] if table.measured_metrics else []
     if not any(row.found for row in table.rows):
         return lines
@@ -84,7 +89,7 @@ def legend(table: Table) -> list[str]:
 
 
 def _branch(table: Table) -> str:
-    """The branch that the rows show, and how it is known that the paper's values are of it."""
+    """Say which branch the rows show, and how we know that the paper's values belong to it."""
     rows = {branch: [row for row in table.rows if row.branch == branch] for branch in _branches(table)}
     if len(rows) == 1:
         words = next(iter(rows))
@@ -101,7 +106,7 @@ def _branches(table: Table) -> list[str]:
 
 
 def _differences(table: Table) -> str:
-    """What a line of differences has, and of which arms it is."""
+    """Explain the lines of differences, and which control each arm has."""
     own = [row for row in table.rows if row.against not in (None, table.control)]
     others = "".join(f", of '{row.label}' from '{row.against}'" for row in own)
     least = "its look's level" if table.looks else "0.05"
@@ -113,7 +118,7 @@ def _differences(table: Table) -> str:
 
 
 def _meanings(table: Table) -> str:
-    """What the verdicts mean, and the smallest effects of interest."""
+    """Explain the verdicts, and give the smallest effects of interest."""
     margins = [
         f"{metric} {number_words(table.smallest[metric])} {unit(metric)}"
         for metric in table.measured_metrics
@@ -127,7 +132,7 @@ def _meanings(table: Table) -> str:
 
 
 def _looks(table: Table) -> list[str]:
-    """At how many seeds which part of the 5 % was spent."""
+    """Say at how many seeds there were looks, and which part of the 5 % each one spent."""
     words = [f"{seeds} ({100 * level:.2g} %)" for seeds, level in sorted(set(table.looks))]
     if not words:
         return []
@@ -138,7 +143,7 @@ def _looks(table: Table) -> list[str]:
 
 
 def _power(table: Table) -> list[str]:
-    """What this table could have seen, a line a metric."""
+    """Say what this table could have seen, a line for each metric."""
     lines = []
     for metric in table.measured_metrics:
         seen = [(table.detectable(mode, metric), mode) for mode in table.modes]
@@ -149,7 +154,7 @@ def _power(table: Table) -> list[str]:
 
 
 def _agreement(table: Table) -> str:
-    """The paper's line, and how many of its effects came to which verdict."""
+    """Explain the paper's lines, and count its effects by verdict."""
     mode, costs = table.modes[0], set(table.metrics) & set(COSTS)
     found = table.verdicts(mode)
     counts = ", ".join(f"{found[verdict]} {verdict}" for verdict in Verdict if found[verdict])
@@ -159,7 +164,10 @@ def _agreement(table: Table) -> str:
 
 
 def _lines(table: Table, row: Row, mode: str) -> Iterable[Line]:
-    """An arm's lines: measured, its difference, the paper's; of the paper's own rows that alone."""
+    """Yield an arm's lines: what was measured, its difference from the control, and the paper's values.
+
+    A row that is the paper's alone has only the last one.
+    """
     cells = [(row.cells[mode][metric], metric) for metric in table.metrics]
     paper = tuple((paper_words(cell, metric),) for cell, metric in cells)
     if row.paper_only:
@@ -175,7 +183,7 @@ def _lines(table: Table, row: Row, mode: str) -> Iterable[Line]:
 
 
 def value_words(cell: Cell, metric: str) -> str:
-    """Mean ± sd."""
+    """Return mean ± standard deviation over seeds; of costs but milliseconds the mean alone."""
     if cell.mean is None:
         return MISSING
     if metric in COSTS and (metric != "ms" or cell.sd is None):
@@ -185,7 +193,10 @@ def value_words(cell: Cell, metric: str) -> str:
 
 
 def effect_words(cell: Cell, metric: str) -> tuple[str, ...]:
-    """The difference, starred where it is significant, its interval and verdict; of a cost the ratio."""
+    """Return the parts of a difference's cell: the difference, its interval and its verdict.
+
+    A significant difference has a star. A cost has the difference and the ratio to the control instead.
+    """
     effect = cell.effect
     if effect is None:
         return (MISSING,)
@@ -202,29 +213,29 @@ def effect_words(cell: Cell, metric: str) -> tuple[str, ...]:
 
 
 def number_words(value: float) -> str:
-    """A number of two digits."""
+    """Return a number with two significant digits."""
     return f"{value:.2g}" if value < 100 else f"{value:.0f}"
 
 
 def _ratio(value: float | None, difference: float) -> tuple[str, ...]:
-    """How many times the control's a cost is that differs from it by so much."""
+    """Return how many times the control's cost this cost is, given its difference from it."""
     if value is None or value == difference:
         return ()
     return (f"(x {value / (value - difference):.3g})",)
 
 
 def _signed(number: float, form: str) -> str:
-    """A number with a proper minus."""
+    """Return a number in a format, with a typographic minus; "0" for zero."""
     return format(number, form).replace("-", MINUS) if number else "0"
 
 
 def _places(width: float) -> int:
-    """Decimals that show two digits of an interval's half width; 2 or 3."""
+    """Return the decimals (2 or 3) that show two digits of an interval's half width."""
     return min(max(1 - math.floor(math.log10(width / 2)), 2), 3) if width > 0 else 2
 
 
 def paper_words(cell: Cell, metric: str) -> str:
-    """The paper's value, its difference from the control, and whether ours has its sign."""
+    """Return the paper's value, its difference from the control, and whether it holds here."""
     if cell.paper is None:
         return MISSING
     places = 1 if metric in ("ms", "FPS") else 2

@@ -1,4 +1,4 @@
-"""What a finished run has to say to a table."""
+"""The results of a finished run, read from its folder for tables."""
 
 from __future__ import annotations
 
@@ -15,23 +15,29 @@ from memmlp.common.files import read_json
 from memmlp.runs.evaluated import intact
 from memmlp.runs.run import Run
 
-Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # mode -> branch -> metric -> value
+Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # values by mode, branch and metric
 UNKNOWN = "?"
 SHARED = "MPJPE"  # a metric that both branches have
-SAME = 1e-4  # relative difference of errors up to which they are of the same joints: float32, six digits kept
+SAME = 1e-4  # relative difference up to which two errors count as those of the same joints (float32)
 
 
 @dataclass(frozen=True)
 class Origin:
-    """What a run was made from and on; runs of one table should agree in it.
+    """What a run was made from, and on which machine. The runs of one table should agree in it.
 
     Attributes:
-        code: commit, or the version where there is no checkout. changed: whether it had uncommitted changes.
-        data: digest of the prepared data. body: whose rest joints the motion is on, "builtin" or a body
-            model's file.
-        hardware: the processor. device: "cpu" or "cuda"; gpu: its name. threads: of torch on the processor.
-        torch: its version. precision: of training.
-        recipes: number of the recipe by component. vqvae: id of the VQ-VAE's run, where there is one.
+        code: the commit; the package's version where there is no checkout.
+        changed: whether the checkout had uncommitted changes.
+        data: the digest of the prepared data.
+        hardware: the processor.
+        device: "cpu" or "cuda".
+        gpu: the GPU's name.
+        threads: torch's threads on the processor.
+        torch: torch's version.
+        precision: the precision of training.
+        body: whose rest joints the motion is on: "builtin" or the file of a body model.
+        recipes: the recipe number of each component.
+        vqvae: the id of the VQ-VAE's run; None where there is none.
     """
 
     code: str
@@ -53,14 +59,15 @@ class Measured:
     """The results of a finished run.
 
     Attributes:
-        id: of the run.
-        means: the metrics' means over the test clips. clips: those of each clip by its name.
+        id: the run's id.
+        means: the metrics' means over the test clips.
+        clips: the metrics of each clip, by its name.
         groups: the group (take, subject) of each clip; a clip that is not named is a group of its own.
-        costs: GFLOP, GMAC and ms of a streaming step, its time over the yardstick's in the same
-            minute, millions of parameters, MB of ONNX, frames a second.
+        costs: GFLOP, GMAC and ms of a streaming step, its time over the yardstick's in the same minute,
+            millions of parameters, MB of the ONNX file, and frames a second.
         origin: what the run was made from.
-        latency: all that was measured of its streaming step.
-        run: the folder where it lies; None where it was read from results that were kept without one.
+        latency: everything that was measured of its streaming step.
+        run: the run's folder; None where the results were kept without one.
     """
 
     id: str
@@ -73,27 +80,31 @@ class Measured:
     run: Run | None = None
 
     def value(self, mode: str, branch: str, metric: str) -> float | None:
-        """A metric's mean over clips, or a cost; None where the run has none."""
+        """Return a metric's mean over clips, or a cost; None where the run has none."""
         if metric in self.costs:
             return self.costs[metric]
         return _number(self.means, mode, branch, metric)
 
     def by_clip(self, names: Sequence[str], mode: str, branch: str, metric: str) -> np.ndarray:
-        """A metric of these clips (C,); NaN where the run has none."""
+        """Return a metric for each of these clips (C,); NaN where the run has none."""
         numbers = [_number(self.clips[name], mode, branch, metric) for name in names]
         return np.array([np.nan if number is None else number for number in numbers])
 
     def group(self, clip: str) -> str:
-        """The group of a clip."""
+        """Return the group of a clip."""
         return self.groups.get(clip, clip)
 
     def has(self, branch: str) -> bool:
-        """Whether the network was evaluated in that branch."""
+        """Return whether the run was evaluated in that branch."""
         return any(branch in branches for branches in self.means.values())
 
     @property
     def one_head(self) -> bool:
-        """Whether the network has rotations alone: its positions are theirs by forward kinematics."""
+        """Whether the network predicts rotations alone.
+
+        Its positions are then those of the rotations by forward kinematics, so both branches have the same
+        errors.
+        """
         pairs = [
             [_number(self.means, mode, branch, SHARED) for branch in ("rotation", "position")]
             for mode in self.means
@@ -103,9 +114,16 @@ class Measured:
 
 
 def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
-    """Read a finished run. Raises InputError, naming the file that is damaged.
+    """Read a finished run.
 
-    stages: identities of the evaluations and the deployment to read; all that there are by default.
+    Args:
+        folder: the run's folder.
+        stages: identities of the evaluations and the deployment to read. By default, or where there are none
+            of these, all evaluations that use the network as the run's own config does, and the deployment
+            that the run ships.
+
+    Raises:
+        InputError: naming the file that is damaged.
     """
     run = Run(folder)
     manifest = _read(run.manifest_path)
@@ -125,7 +143,10 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
 
 
 def _evaluations(run: Run, stages: Sequence[str] | None) -> list[Path]:
-    """The files of some evaluations, or of all that use the network as the run's own config does."""
+    """Return the files of some evaluations.
+
+    Without any of these stages, the files of all that use the network as the run's own config does.
+    """
     if wanted := [path for name in stages or () if (path := run.evaluation(name)).is_file()]:
         return wanted
     return run.own_evaluations
@@ -139,7 +160,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _costs(latency: Mapping[str, float]) -> dict[str, float]:
-    """The costs that the measurement has, in the tables' units."""
+    """Return the costs that were measured, in the units of the tables."""
 
     def of(name: str) -> float:
         return float(latency.get(name, np.nan))
@@ -157,11 +178,14 @@ def _costs(latency: Mapping[str, float]) -> dict[str, float]:
 
 
 def _origin(manifest: Mapping[str, Any]) -> Origin:
+    """Return the origin that a run's manifest tells."""
+
     def of(key: str) -> str:
         return str(manifest.get(key) or UNKNOWN)
 
     git = manifest.get("git") or {}
-    before = [git["before"][:7]] if git.get("before") else []  # of a training that was resumed by other code
+    # A training that other code resumed names the commit that it began with, too.
+    before = [git["before"][:7]] if git.get("before") else []
     return Origin(
         code=", ".join([*before, git["commit"][:7]]) if git else f"version {of('version')}",
         changed=bool(git.get("dirty")),
@@ -179,7 +203,7 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
 
 
 def _evaluated(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Origin:
-    """The origin of a run with that of its evaluations, where they were made by or on something else."""
+    """Return the origin of a run together with that of its evaluations, where these differ from it."""
     others = [_origin({**report.get("made_by", {}), **report}) for report in reports]
     found: dict[str, Any] = {"changed": origin.changed or any(other.changed for other in others)}
     for name in ("code", "hardware", "device", "gpu", "threads", "torch"):
@@ -191,6 +215,6 @@ def _evaluated(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Origin:
 
 
 def _number(errors: Errors, mode: str, branch: str, metric: str) -> float | None:
-    """A value of nested errors; files hold NaN as a word."""
+    """Return a value of nested errors as a number; None where there is none. (Files hold NaN as a word.)"""
     value = errors.get(mode, {}).get(branch, {}).get(metric)
     return None if value is None else float(value)

@@ -1,4 +1,4 @@
-"""What a planned sweep's runs have to say to a table."""
+"""What the runs of a planned sweep tell a table: results, how far they are, and older ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Read = Callable[[Path, tuple[str, ...]], Measured]
 
 
 def finder(plan: Plan, read: Read) -> Find:
-    """What finds the results of a planned sweep's finished runs."""
+    """Return a function that finds the results of a finished run of the plan by arm and seed."""
 
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
 
@@ -32,7 +32,7 @@ def finder(plan: Plan, read: Read) -> Find:
 
 
 def states(plan: Plan) -> Say:
-    """What tells how far a planned sweep's unfinished runs are, where they began."""
+    """Return a function that says how far an unfinished run of the plan is, once it began."""
 
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
 
@@ -45,7 +45,7 @@ def states(plan: Plan) -> Say:
 
 
 def older(plan: Plan) -> Say:
-    """What finds runs that differ from those of a planned sweep in recipe numbers alone, by cell."""
+    """Return a function that names a finished run that differs from a planned one in recipe numbers alone."""
     whats = {task.key: task.what for task in plan.tasks}
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
 

@@ -1,10 +1,10 @@
-"""Rounds of seeds for arms with open verdicts: looks fixed beforehand, and what was decided at which.
+"""Rounds of seeds for arms with open verdicts: looks that are fixed beforehand, and what they decided.
 
-Every arm goes through the same looks, each at a number of seeds that was fixed at the start; an arm whose
-comparisons are all decided goes no further. A look takes an arm's first seeds and its control's, whatever
-others there are, and what it decides is final. It spends its level over all comparisons of the sweep that
-nobody has claimed, those of arms that are elsewhere too; so the levels add up to 5 % for either family of
-claims, also where an arm is late because its runs failed (docs/statistics.md).
+Every arm goes through the same looks, each at a number of seeds that was fixed at the start. An arm whose
+comparisons are all decided goes no further. A look uses the first seeds of an arm and of its control,
+whatever other seeds there are, and what it decides is final. It spends its level over all comparisons of the
+sweep that nobody has claimed, including those of arms that are at another look. So the levels add up to 5 %
+for either family of claims, also where an arm is late because its runs failed (docs/statistics.md).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from memmlp.tables.effects import (
 )
 from memmlp.tables.table import Effect, Key
 
-MOST = 13  # seeds of an arm, where nothing else is asked for
+MOST = 13  # the largest number of seeds of an arm by default
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,12 @@ class Finding:
     """What a look found of a comparison.
 
     Attributes:
-        label, mode, metric: of the comparison. verdict: final unless it is open.
-        mean, p: the difference and its p-value; None with one group of clips, where nothing can be decided.
-        holm, equal: p-values of difference and equivalence, corrected, to be compared with the look's level.
+        label, mode, metric: which comparison it is.
+        verdict: the verdict, final unless it is open.
+        mean: the mean difference.
+        p: its p-value; None with one group of clips, where nothing can be decided.
+        holm: the corrected p-value of the difference, to be compared with the look's level.
+        equal: the corrected p-value of equivalence, to be compared with the look's level.
     """
 
     label: str
@@ -55,12 +58,12 @@ class Finding:
 
     @property
     def key(self) -> Key:
-        """The comparison's."""
+        """The key of the comparison."""
         return Key(self.label, self.mode, self.metric)
 
     @property
     def open(self) -> bool:
-        """Whether more seeds may decide it."""
+        """Whether more seeds may decide the comparison."""
         return self.verdict is Verdict.OPEN and self.p is not None
 
 
@@ -69,9 +72,10 @@ class Look:
     """A look that was taken.
 
     Attributes:
-        seeds: of each arm. level: what it spent.
-        runs: by the labels of the arms that were looked at, what tells the runs, theirs and their controls'.
-        found: the comparisons that were open before.
+        seeds: how many seeds of each arm were looked at.
+        level: the level that the look spent.
+        runs: by the label of each arm that was looked at, a digest of its runs and its control's.
+        found: what was found of the comparisons that were open before.
     """
 
     seeds: int
@@ -85,8 +89,11 @@ class Rounds:
     """The rounds of a sweep.
 
     Attributes:
-        subject: what the looks are of (`subject`). seeds: all that may be spent, in order.
-        looks: seeds after each round. levels: what each look spends. taken: the looks that were taken.
+        subject: what the verdicts are about (`subject`).
+        seeds: all seeds that may be spent, in order.
+        looks: the number of seeds at each look.
+        levels: the level that each look spends.
+        taken: the looks that were taken.
     """
 
     subject: Mapping[str, Any]
@@ -96,15 +103,18 @@ class Rounds:
     taken: tuple[Look, ...] = ()
 
     def position(self, label: str) -> int:
-        """How many looks an arm went through."""
+        """Return how many looks an arm went through."""
         return sum(label in look.runs for look in self.taken)
 
     def latest(self) -> dict[Key, tuple[Finding, Look]]:
-        """The last finding of each comparison, which for a decided one is where it was decided."""
+        """Return the last finding of each comparison, with its look; a decided one was decided there."""
         return {finding.key: (finding, look) for look in self.taken for finding in look.found}
 
     def next_looks(self, sweep: Sweep) -> dict[str, int]:
-        """The number of the next look of each arm that has one: an open comparison, and looks left."""
+        """Return, by label, the number (from 0) of the next look of each arm that has one.
+
+        An arm has one while looks are left and it has an open comparison, or had no look yet.
+        """
         going = {finding.label for finding, _ in self.latest().values() if finding.open}
         found = {arm.label: self.position(arm.label) for arm, _ in _compared(sweep)}
         return {
@@ -114,7 +124,10 @@ class Rounds:
         }
 
     def counts(self, sweep: Sweep) -> dict[str, int]:
-        """Seeds that each arm had or needs for the next look, its own or one that it is the control of."""
+        """Return how many seeds each arm has spent or needs for a next look.
+
+        The look may be its own or that of an arm that it is the control of.
+        """
         ahead = self.next_looks(sweep)
         found = {arm.label: self.looks[0] for arm in sweep.runnable()}
         for arm, other in _compared(sweep):
@@ -124,7 +137,7 @@ class Rounds:
         return found
 
     def spent(self, sweep: Sweep) -> Sweep:
-        """The sweep with each arm's own seeds: those that were spent on it, and those of the next look."""
+        """Return the sweep with seeds for each arm: those spent on it, and those that its next look needs."""
         counts = self.counts(sweep)
         arms = tuple(
             replace(arm, seeds=self.seeds[: counts[arm.label]]) if arm.label in counts else arm
@@ -133,17 +146,20 @@ class Rounds:
         return replace(sweep, arms=arms, seeds=self.seeds[: max(counts.values())])
 
     def family(self, sweep: Sweep) -> list[Key]:
-        """All comparisons: those that were found and, of arms that had no look yet, all there may be."""
+        """Return all comparisons: those that were found and, for arms without a look, all possible ones."""
         new = [arm for arm, _ in _compared(sweep) if not self.position(arm.label)]
         return list(dict.fromkeys([*self.latest(), *(key for arm in new for key in _keys(sweep, arm))]))
 
     def unseen(self, sweep: Sweep) -> list[Key]:
-        """Comparisons of arms that were looked at, of which there was nothing: no numbers, or one run."""
+        """Return the comparisons of arms that were looked at for which there was nothing to find.
+
+        Their runs have no numbers, or are one and the same.
+        """
         looked = [arm for arm, _ in _compared(sweep) if self.position(arm.label)]
         return [key for arm in looked for key in _keys(sweep, arm) if key not in self.latest()]
 
     def judged(self, effects: Mapping[Key, Effect]) -> dict[Key, Effect]:
-        """Effects with the verdicts of the looks in place of those of a fixed number of seeds."""
+        """Return the effects with the verdicts of the looks in place of those of a fixed number of seeds."""
         latest = self.latest()
         return {
             key: _as_found(effect, *latest.get(key, (None, None))) if effect.verdict else effect
@@ -152,7 +168,7 @@ class Rounds:
 
 
 def subject(sweep: Sweep) -> dict[str, Any]:
-    """What verdicts are of, as JSON holds it: what can't change between two looks."""
+    """Return what the verdicts are about, in types that JSON holds. It must not change between two looks."""
     return {
         "arms": {
             arm.label: {
@@ -168,7 +184,7 @@ def subject(sweep: Sweep) -> dict[str, Any]:
 
 
 def begin(sweep: Sweep, most: int = MOST) -> Rounds:
-    """The rounds of a sweep with up to so many seeds: its own first, then the numbers that follow."""
+    """Return new rounds of a sweep with up to so many seeds: its own first, then the numbers that follow."""
     following = itertools.count(max(sweep.seeds) + 1)
     seeds = tuple(itertools.islice(itertools.chain(sweep.seeds, following), most))
     schedule = looks(most)
@@ -176,14 +192,16 @@ def begin(sweep: Sweep, most: int = MOST) -> Rounds:
 
 
 def advanced(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], named: Mapping[str, str]) -> Rounds:
-    """The rounds after the next look that can be taken; the same where none can.
+    """Return the rounds after the next look that can be taken; the same rounds where none can.
 
-    An arm can be looked at when it and its control have all seeds of its next look. Of arms that are at
-    different looks, because runs failed, the ones that are behind come first.
+    A look at an arm can be taken when the arm and its control have all seeds of its next look. Where runs
+    failed, arms may be at different looks; then those that are behind come first.
 
     Args:
-        sweep: as it was begun with. runs: the finished runs by label and seed.
-        named: what tells the runs of an arm and its control up to its next look, by label.
+        rounds: the rounds so far.
+        sweep: the sweep as it was begun with.
+        runs: the finished runs by label and seed.
+        named: by label, a digest of the runs of an arm and its control up to its next look.
     """
     numbers = rounds.next_looks(sweep)
     ready = [label for label, number in numbers.items() if _ready(rounds, sweep, runs, label, number)]
@@ -197,10 +215,10 @@ def advanced(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], named: Mapp
 
 
 def outlook(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs]) -> dict[Key, int | None]:
-    """The seeds that would decide each open comparison of arms without a next look, with 80 % power.
+    """Return how many seeds would decide each open comparison of arms that have no next look.
 
-    If its effect is what was measured, at one look for all, corrected over what nobody has claimed. None
-    where no number of seeds would do with these clips.
+    The numbers are for 80 % power if the effect is as measured, at a single look, corrected over what nobody
+    has claimed. None where no number of seeds would do with these clips.
     """
     latest, ahead = rounds.latest(), rounds.next_looks(sweep)
     still = [key for key, (finding, _) in latest.items() if finding.open and key.label not in ahead]
@@ -217,12 +235,12 @@ def outlook(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs]) -> dict[Key,
 
 
 def as_json(rounds: Rounds) -> dict[str, Any]:
-    """What a file holds of them."""
+    """Return the rounds in types that JSON holds."""
     return asdict(rounds)
 
 
 def of_json(content: Mapping[str, Any]) -> Rounds:
-    """The rounds of a file. Raises KeyError, TypeError or ValueError where it holds none."""
+    """Return the rounds of a file's content. Raises KeyError, TypeError or ValueError if it holds none."""
     taken = [
         Look(
             **{
@@ -237,7 +255,7 @@ def of_json(content: Mapping[str, Any]) -> Rounds:
 
 
 def _compared(sweep: Sweep) -> Iterator[tuple[Arm, Arm]]:
-    """The arms that have a control and something to compare, with it."""
+    """Yield the arms that have a control and metrics to compare, with their controls."""
     for arm in sweep.runnable():
         other = control_arm(sweep, arm)
         if other is not None and set(sweep.metrics) - set(COSTS):
@@ -245,24 +263,24 @@ def _compared(sweep: Sweep) -> Iterator[tuple[Arm, Arm]]:
 
 
 def _keys(sweep: Sweep, arm: Arm) -> list[Key]:
-    """All comparisons that an arm may have."""
+    """Return all comparisons that an arm may have."""
     metrics = [metric for metric in sweep.metrics if metric not in COSTS]
     return [Key(arm.label, mode, metric) for mode, metric in itertools.product(MODES, metrics)]
 
 
 def _ready(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], label: str, number: int) -> bool:
-    """Whether the runs of an arm's look are all there."""
+    """Return whether all runs that an arm's look needs are finished."""
     wanted = set(rounds.seeds[: rounds.looks[number]])
     return all(wanted <= set(runs[one]) for one in pair_of(sweep, label))
 
 
 def pair_of(sweep: Sweep, label: str) -> tuple[str, str]:
-    """The labels of an arm and its control."""
+    """Return the labels of an arm and its control."""
     return next((arm.label, other.label) for arm, other in _compared(sweep) if arm.label == label)
 
 
 def _found(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], look: Look) -> list[Finding]:
-    """What a look finds of the comparisons of its arms that are not decided."""
+    """Return what a look finds of the comparisons of its arms that are not decided yet."""
     before = {key: finding.verdict for key, (finding, _) in rounds.latest().items()}
     seen = _seen(rounds, sweep, runs, look)
     fresh = {key: e for key, e in seen.items() if before.get(key, Verdict.OPEN) is Verdict.OPEN}
@@ -282,7 +300,7 @@ def _found(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], look: Look) -
 
 
 def _seen(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], look: Look) -> dict[Key, Effect]:
-    """All comparisons of a look's arms over exactly its seeds."""
+    """Return all comparisons of a look's arms, over exactly the look's seeds."""
     seeds = rounds.seeds[: look.seeds]
     cut = {label: {s: found[s] for s in seeds if s in found} for label, found in runs.items()}
     pairs = paired(with_existing_branches(sweep, cut), cut, MODES)
@@ -292,9 +310,12 @@ def _seen(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], look: Look) ->
 def _corrected(
     fresh: Sequence[Effect], elsewhere: Sequence[Verdict], level: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """P-values of differences and of equivalences (K,), corrected over fresh comparisons and all others.
+    """Correct p-values of differences and of equivalences (K,), over the fresh comparisons and all others.
 
-    elsewhere: the verdicts of the others, decided before or open where their arms are at another look.
+    Args:
+        fresh: the comparisons (K) that the look decides on.
+        elsewhere: the verdicts of the others, decided before, or open where their arms are at another look.
+        level: what the look spends.
     """
     none = [Verdict.OPEN] * len(fresh)
     same = np.array([said is Verdict.EQUIVALENT for said in [*none, *elsewhere]], bool)
@@ -310,7 +331,7 @@ def _corrected(
 
 
 def _as_found(effect: Effect, finding: Finding | None, look: Look | None) -> Effect:
-    """The effect as its last look found it; open where there was none."""
+    """Return the effect with what its last look found; open where there was no look."""
     if finding is None or look is None:
         return replace(effect, holm=None, equal=None, verdict=Verdict.OPEN)
     decided = None if finding.verdict is Verdict.OPEN else look.seeds

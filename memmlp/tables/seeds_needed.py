@@ -1,4 +1,4 @@
-"""How many seeds the paper's printed effects would need here, from the runs that are there."""
+"""How many seeds the paper's printed effects would need here, judged by the runs that there are."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from memmlp.tables.effects import Runs, paired, paper_effect, with_existing_bran
 
 
 class Need(NamedTuple):
-    """What a comparison would need for the paper's effect to be seen with 80 % power.
+    """What a comparison would need for an effect of the paper's size to be seen with 80 % power.
 
     Attributes:
-        label, mode, metric: of the cell. paper, measured: the differences.
-        have: seeds. seeds: needed; None where no number of seeds would do with these clips.
+        label, mode, metric: which comparison it is.
+        paper: the paper's difference.
+        measured: the measured mean difference.
+        have: how many seeds there are.
+        seeds: how many are needed; None where no number of seeds would do with these clips.
     """
 
     label: str
@@ -28,10 +31,10 @@ class Need(NamedTuple):
 
 
 def needs(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str] = MODES) -> list[Need]:
-    """Of every arm and metric whose effect the paper prints, in the table's order.
+    """Return the needs of every arm and metric whose effect the paper prints, in the table's order.
 
-    The correction is over the comparisons that the runs allow today. Under two seeds or two groups of clips
-    there is nothing to learn the spread from, and the arm is left out.
+    The correction is over the comparisons that the runs allow today. With fewer than two seeds or two groups
+    of clips there is nothing to learn the spread from, and the comparison is left out.
     """
     seen = with_existing_branches(sweep, runs)
     pairs, arms = paired(seen, runs, modes), {arm.label: arm for arm in seen.arms}

@@ -15,7 +15,7 @@ LEVEL = 0.05
 
 
 class Key(NamedTuple):
-    """The place of a cell."""
+    """Which cell of a table: its arm, mode of evaluation and metric."""
 
     label: str
     mode: str
@@ -24,16 +24,21 @@ class Key(NamedTuple):
 
 @dataclass(frozen=True)
 class Effect:
-    """An arm's difference from its control over the seeds and clips that both have.
+    """An arm's difference from its control, over the seeds and clips that both have.
+
+    What a comparison does not have is None; costs have the mean alone.
 
     Attributes:
-        mean, low, high: the difference and its 95 % interval. p, holm: p-value, alone and corrected over the
-            table's comparisons; equal: the corrected p-value of equivalence (see `memmlp.statistics`).
-        verdict: what follows from them. detectable: the smallest difference that this comparison would have
-            called significant with 80 % power. All of these are None where there are none, as of costs.
+        mean: the mean difference.
+        low, high: its 95 % interval.
+        p: its p-value, not corrected.
+        holm: its p-value, corrected over the table's comparisons.
+        equal: the corrected p-value of equivalence (see `memmlp.statistics`).
+        verdict: what follows from these.
+        detectable: the smallest difference that this comparison would have found with 80 % power.
         seeds, clips, groups: how many were paired.
-        level: what the corrected p-values are compared with. decided: of a verdict that is final since a look
-            at so many seeds, those.
+        level: what the corrected p-values are compared with.
+        decided: the number of seeds of the look that decided the verdict for good; None without such a look.
     """
 
     mean: float
@@ -52,13 +57,13 @@ class Effect:
 
     @property
     def significant(self) -> bool:
-        """Whether it is significant at its level after the correction."""
+        """Whether the difference is significant after the correction."""
         return self.holm is not None and self.holm < self.level
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A metric of an arm: the values by seed, the paper's value, and both differences from the control."""
+    """A metric of an arm: its values by seed, the paper's value, and both differences from the control."""
 
     values: Mapping[int, float]
     paper: float | None = None
@@ -67,12 +72,12 @@ class Cell:
 
     @property
     def mean(self) -> float | None:
-        """Mean over seeds."""
+        """The mean over seeds."""
         return math.fsum(self.values.values()) / len(self.values) if self.values else None
 
     @property
     def sd(self) -> float | None:
-        """Standard deviation over seeds (n - 1); None under two."""
+        """The standard deviation over seeds (n - 1); None with fewer than two."""
         if self.mean is None or len(self.values) < 2:
             return None
         squares = math.fsum((value - self.mean) ** 2 for value in self.values.values())
@@ -80,9 +85,9 @@ class Cell:
 
     @property
     def agrees(self) -> bool | None:
-        """Whether the paper's effect holds (True) or its opposite (False); None where neither is known.
+        """True where the paper's effect holds, False where its opposite does; None where neither is known.
 
-        Of an effect by its verdict; of a cost, which has none, by its sign.
+        The verdict tells it; a cost has no verdict, so that its sign tells it.
         """
         if self.effect is None or not self.paper_effect or not self.effect.mean:
             return None
@@ -93,13 +98,16 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """An arm.
+    """An arm of a table.
 
     Attributes:
-        label, note: of the sweep's arm. branch: whose errors are shown. against: the label of its control,
-            None for the sweep's control.
-        found, wanted: seeds; none is wanted of a row that is the paper's alone.
-        cells: by mode and metric.
+        label: the arm's label.
+        branch: whose errors are shown.
+        against: the label of its control; None for the sweep's control and the paper's own rows.
+        note: a remark; None for none.
+        found: the seeds of its finished runs.
+        wanted: the seeds that it should have; none for a row that is the paper's alone.
+        cells: its cells by mode and metric.
     """
 
     label: str
@@ -121,14 +129,19 @@ class Table:
     """A sweep's arms side by side.
 
     Attributes:
-        name, title, number: of the sweep; the number is that in the paper.
-        modes: of evaluation; one where only costs are shown. metrics: the columns.
-        control: label of the arm that the others are compared with, where they name no other.
-        branch_source: how it is known which branch the paper's values are of; None where it prints none.
+        name: the sweep's name.
+        title: the sweep's title.
+        number: the table's number in the paper; None if it is not the paper's.
+        modes: the modes of evaluation; a single one where only costs are shown.
+        metrics: the columns.
+        control: the label of the arm that the others are compared with, where they name no other.
+        branch_source: how we know which branch the paper's values belong to; None where it prints none.
         smallest: the smallest effect of interest by metric.
         comparisons: how many p-values the correction is over.
-        notes: about the paper's values. flags: what a reader has to know of these runs.
-        looks: at how many seeds and which levels verdicts were decided; none at a fixed number of seeds.
+        rows: the arms.
+        notes: remarks on the paper's values.
+        flags: what a reader has to know of these runs.
+        looks: pairs of the seeds and the level of each look; empty for a fixed number of seeds.
     """
 
     name: str
@@ -147,23 +160,23 @@ class Table:
 
     @property
     def measured_metrics(self) -> tuple[str, ...]:
-        """The columns that are errors and no costs."""
+        """The columns that are errors, not costs."""
         return tuple(metric for metric in self.metrics if metric not in COSTS)
 
     def effects(self, mode: str) -> Iterator[tuple[Row, str, Cell, Effect]]:
-        """The cells of a mode whose effects have a verdict, with their row and metric."""
+        """Yield the effects of a mode that have a verdict, with their rows, metrics and cells."""
         for row in self.rows:
             for metric, cell in row.cells[mode].items():
                 if cell.effect is not None and cell.effect.verdict is not None:
                     yield row, metric, cell, cell.effect
 
     def verdicts(self, mode: str) -> Counter[Verdict]:
-        """How many of the effects that the paper has come to which verdict in a mode."""
+        """Count by verdict the effects of a mode for which the paper has one, too."""
         found = (effect.verdict for _, _, cell, effect in self.effects(mode) if cell.paper_effect)
         return Counter(verdict for verdict in found if verdict is not None)
 
     def detectable(self, mode: str, metric: str) -> float | None:
-        """The smallest difference that every arm's comparison would have seen with 80 % power."""
+        """Return the smallest difference that every arm's comparison would have found with 80 % power."""
         known = [
             effect.detectable
             for _, name, _, effect in self.effects(mode)

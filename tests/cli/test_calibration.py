@@ -1,4 +1,4 @@
-"""`memmlp bench calibration`: what it simulates is what it says, and it can say no."""
+"""`memmlp bench calibration` simulates what it says, and reports promises that are broken."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from memmlp.cli.bench.calibration import SHARES, GridRow, Shares, Simulated, bro
 from memmlp.common.files import read_json
 from memmlp.statistics.crossed import error
 
-MODULE = sys.modules["memmlp.cli.bench.calibration"]  # the package has the command by that name
+MODULE = sys.modules["memmlp.cli.bench.calibration"]  # in the package this name is the command's
 
 
 def test_the_grid_is_all_that_have_two_groups():

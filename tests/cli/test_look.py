@@ -27,7 +27,7 @@ from memmlp.runs.run import Run
 
 @pytest.fixture
 def finished(home: Path, memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """That run, in the folder of which the commands run."""
+    """Change into the folder of the tiny run, where commands then run, and return the run."""
     monkeypatch.chdir(home)
     return next(found for found in list_runs("outputs") if found.manifest["kind"] == "memmlp")
 
@@ -38,7 +38,7 @@ def clips(finished: Run) -> list[str]:
 
 
 def rows(run: Run) -> list[dict[str, Any]]:
-    """The test clips in stream mode."""
+    """Return the rows of the test clips in stream mode."""
     (report,) = run.evaluations.glob("stream-*.json")
     return json.loads(report.read_text())["clips"]
 
@@ -141,7 +141,7 @@ class Watched:
         self.port = int(re.findall(r"http://127.0.0.1:(\d+)/", self.greeting)[0])
 
     def frames(self) -> Iterator[dict]:
-        """The frames that it sends."""
+        """Yield the frames that it sends."""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
         connection.request("GET", "/events")
         for line in connection.getresponse():
@@ -149,7 +149,7 @@ class Watched:
                 yield json.loads(line[6:])
 
     def interrupt(self) -> tuple[int, str, str]:
-        """What Ctrl-C makes of it: exit code, and the rest of what it wrote."""
+        """Interrupt it as Ctrl-C does, and return its exit code and the rest of its output."""
         self.process.send_signal(signal.SIGINT)
         out, err = self.process.communicate(timeout=60)
         return self.process.returncode, out, err
@@ -175,7 +175,7 @@ def test_ctrl_c_ends_it_and_leaves_nothing(home: Path, finished: Run, source: st
 
 @pytest.mark.parametrize("kind", ["--udp", "--osc"])
 def test_a_clip_that_is_sent_is_predicted(home: Path, finished: Run, kind: str):
-    """In a space that both name: the body stands upright on the floor."""
+    """In a space that sender and receiver name alike, the body stands upright on the floor."""
     free = PacketSource("any", 0, lambda data: Packet((None, None, None)), "amass")
     free.close()
     at = [kind, str(free.port), "--space", "unity"]

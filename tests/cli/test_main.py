@@ -21,7 +21,7 @@ from memmlp.config.shipped import shipped
 
 @pytest.fixture
 def jobs(monkeypatch: pytest.MonkeyPatch) -> list[DictConfig]:
-    """The configs that `memmlp train` would train."""
+    """Collect the configs that `memmlp train` would train, in place of training them."""
     seen: list[DictConfig] = []
     monkeypatch.setattr("memmlp.cli.train.run_training", seen.append)
     return seen

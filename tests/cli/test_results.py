@@ -15,7 +15,7 @@ from memmlp.sweep.spec import Sweep
 
 @pytest.fixture
 def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    """Stands in for composing: the runs of seed 0 alone where `half=1` is said."""
+    """Replace planning: every run of a sweep is there, but for Table 10, which has none."""
 
     def plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
         find = fake_sweep(tmp_path / sweep.name, sweep)
@@ -54,7 +54,7 @@ def test_check_names_the_page_that_differs(memmlp: Memmlp, planned: None):
 
 
 def test_pages_without_data_go(memmlp: Memmlp, planned: None):
-    """And what is no page of the command's stays."""
+    """Generated pages are removed with their data; a page that was written by hand stays."""
     memmlp("results", "save", "14", "--name", "small")
     memmlp("results", "docs")
     Path("docs/results/notes.md").write_text("by hand\n")

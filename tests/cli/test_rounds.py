@@ -1,4 +1,4 @@
-"""`memmlp sweep --until-decided`, on runs that were not trained and, once, on such as were and are killed."""
+"""`memmlp sweep --until-decided`, on made-up runs and, once, on trained ones whose processes are killed."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ FACTORS = {"worse": 1.5, "newer": 1.4}
 
 
 class Runs:
-    """Stands in for planning and training: runs of made-up numbers, and which were made."""
+    """Replaces planning and training by runs of made-up numbers, and remembers which were made."""
 
     def __init__(self, outputs: Path):
         self.outputs, self.made, self.version = outputs, [], ""
         self.groups: dict[str, str] | None = None
         self.failing: set[str] = set()
-        self.patience = 1000  # runs until it is interrupted
+        self.patience = 1000  # how many runs are made before Ctrl-C
 
     def name(self, label: str) -> str:
         return f"{label}{self.version}"

@@ -21,7 +21,7 @@ RESULTS = {
 
 @pytest.fixture
 def outputs(tmp_path: Path) -> Path:
-    """Two finished runs and one that is not."""
+    """Make a folder with two finished runs and one that is not finished."""
     folder = tmp_path / "outputs"
     for name, seed in ((A, 0), (B, 1), (C, 2)):
         run = Run.of(folder, name)
@@ -35,7 +35,7 @@ def outputs(tmp_path: Path) -> Path:
 
 
 def lines_up(ran: Ran, width: int) -> bool:
-    """No line is wider than the screen, and no table is torn: all its lines are equally wide."""
+    """Return whether no line is wider than the screen, and all lines of a table are equally wide."""
     widths = {len(line) for line in ran.out.splitlines() if line.strip()}
     return ran.code == 0 and max(widths) <= width
 

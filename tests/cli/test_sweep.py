@@ -31,7 +31,7 @@ ARMS = {"full": [], "none": ["memory=none"], "wild": ["optim.lr=1e30"]}
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory) -> Path:
-    """A folder where a sweep of three arms, one of which diverges, was run."""
+    """Run a sweep of three arms, one of which diverges, in a folder of its own."""
     folder = tmp_path_factory.mktemp("sweep")
     write(folder, ARMS)
     (folder / "first.txt").write_text(run_apart(folder, "sweep", "trial.yaml", *TINY, code=1))
@@ -119,10 +119,10 @@ def test_the_first_failure_ends_the_sweep_where_that_is_wanted(tmp_path: Path):
     assert "failing seed 0: failed, loss is nan" in said
     assert re.search(r"^failed: run .*: loss is nan", said, re.M)
     runs = list_runs(tmp_path / "outputs")
-    assert len(runs) <= 2  # the last arm's was not begun
+    assert len(runs) <= 2  # the last arm's run was not begun
     wait_for(lambda: not any(run.status == "running" for run in runs))
     assert [run.status for run in runs].count("failed") == 1
-    assert "0 of 3 runs done" in run_apart(tmp_path, *words, code=1)  # what failed once still ends it
+    assert "0 of 3 runs done" in run_apart(tmp_path, *words, code=1)  # a run that failed before ends it again
     assert len(list_runs(tmp_path / "outputs")) == len(runs)
 
 
@@ -251,7 +251,7 @@ def test_runs_of_an_older_recipe_are_said_and_made_again(home: Path, monkeypatch
         "trial.yaml",
         *TINY,
         "optim.log_every=3",
-    )  # which changes no result, but is another plan
+    )  # the override changes no result, but makes another plan
     said = " ".join(run(home, *words).split())
     assert "missing: 'none' seed 0, 'wild' seed 0" in said
     known = next(

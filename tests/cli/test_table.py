@@ -17,7 +17,7 @@ from memmlp.sweep.spec import Sweep
 
 @pytest.fixture
 def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    """Stands in for composing: every sweep's runs are there, those of Table 1 cannot be known."""
+    """Replace planning: every sweep's runs are there, except those of Table 1, which can't be planned."""
 
     def plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
         if sweep.table == 1 or "bad=1" in sweep.extra:

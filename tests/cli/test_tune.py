@@ -22,7 +22,7 @@ TINY = [*BASE, "optim.validate_every=3"]
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a search of three trials."""
+    """Run a search of three trials in a folder of its own."""
     folder = tmp_path_factory.mktemp("tune")
     (folder / "said.txt").write_text(run_apart(folder, "tune", *TINY, "search.n_trials=3", "--workers", "2"))
     return folder
@@ -43,7 +43,7 @@ def test_a_search_ends_with_its_best_trial_and_the_command_for_it(home: Path):
     (words,) = re.findall(r"next: memmlp (.*)", said)
     trained = command(home, *words.split())
     assert f"outputs/runs/{best['run']}" in trained
-    assert len(list((home / "outputs/runs").iterdir())) == 4  # the VQ-VAE's and three: none was made anew
+    assert len(list((home / "outputs/runs").iterdir())) == 4  # a VQ-VAE and three trials, none made anew
 
 
 def test_the_same_command_does_nothing_and_status_shows_the_same(home: Path):
@@ -64,7 +64,7 @@ def test_the_best_is_an_arm_of_table_5(home: Path):
 
 
 def test_a_trial_of_two_seeds_goes_on_from_a_search_of_one(home: Path, tmp_path: Path):
-    """The first trial's first run is the one that the search of a seed made; the others follow its seed."""
+    """The first trial's first run is that of a search with one seed; its other run has the next seed."""
     shutil.copytree(home / "outputs/runs", tmp_path / "outputs/runs")
     shutil.copytree(home / "outputs/data", tmp_path / "outputs/data", copy_function=shutil.copy2)
     words = ["search.n_trials=1", "search.seeds=2", "--workers", "2"]
@@ -139,7 +139,7 @@ def test_what_counts_gives_a_search_of_its_own(tmp_path: Path):
 
 
 def test_a_search_is_named_after_what_its_trials_follow_from(tmp_path: Path):
-    """When a run is validated changes no run, but which trials are pruned; how it is used, what they show."""
+    """The interval of validations decides which trials are pruned, how a network is used what they show."""
     names = {
         prepared([*TINY, *words], None, tmp_path).folder.name
         for words in (

@@ -1,4 +1,4 @@
-"""Every shipped config composes, and every bad command line is one line that names the key."""
+"""Every shipped config composes, and every bad command line gives one line that names the key."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ OPTIONS = [f"{group}={name}" for group, names in GROUPS.items() for name in name
 
 @pytest.fixture
 def needed(tmp_path: Path) -> dict[str, list[str]]:
-    """The values that some options leave to the user."""
+    """Return, by option, overrides for the values that the option leaves to the user."""
     root, lists = f"data.root={tmp_path}", f"data.split.folder={tmp_path}"
     return {
         "data=mocap": [root],

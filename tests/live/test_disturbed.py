@@ -1,7 +1,7 @@
-"""A boxer with disturbed trackers: how far the body goes from the undisturbed one.
+"""A boxer with disturbed trackers: how far the body strays from the undisturbed stream's.
 
-The network is small, with random weights and no memory, in which a code-vector may change at a touch.
-Bounds are a little above what was measured, which a comment beside each says.
+The network is small, with random weights and no memory (in which the smallest change may choose another
+code-vector). Bounds are a little above what was measured, which a comment beside each bound gives.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SECONDS = 4
 
 @pytest.fixture(scope="module")
 def boxer() -> wearer.Person:
-    """Trackers at 60 Hz."""
+    """Return the boxer's trackers at 60 Hz."""
     clip = synthesize_clip("punching", 0, seconds=SECONDS + 1 / 60)
     return wearer.of_poses(torch.tensor(clip.poses).double(), torch.tensor(clip.trans).double())
 
@@ -46,7 +46,7 @@ def undisturbed(file, boxer) -> np.ndarray:
 
 
 def at(boxer: wearer.Person, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The trackers at other times, between the samples."""
+    """Return the trackers at other times, interpolated between the samples."""
     known = np.arange(len(boxer.positions)) / 60
     positions = np.stack(
         [np.interp(times, known, column) for column in boxer.positions.reshape(len(known), -1).T], -1
@@ -56,7 +56,7 @@ def at(boxer: wearer.Person, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def deviation(poses: list[Pose], undisturbed: np.ndarray) -> np.ndarray:
-    """Mean distance of the joints of each fresh frame from the undisturbed one of its time, cm."""
+    """Return each fresh frame's mean distance of the joints from the undisturbed frame of its time, cm."""
     found = {round(60 * pose.time): pose for pose in poses if pose.fresh}
     return wearer.apart(wearer.joints(list(found.values())), undisturbed[list(found)])
 
@@ -86,7 +86,7 @@ def test_half_a_second_without_a_tracker(tracker, mean, how, file, boxer, undist
     found = deviation(poses, undisturbed)
     assert found[:120].max() == 0
     assert found[120:150].mean() < mean
-    assert found[180:].max() < 1e-3  # half a second after its return all is as if nothing had been
+    assert found[180:].max() < 1e-3  # half a second after the tracker's return the loss has left no trace
 
 
 def test_repeated_timestamps_change_nothing(file, boxer, undisturbed):

@@ -1,4 +1,4 @@
-"""The whole way as one ONNX file: that of evaluation, and that of the live stream."""
+"""The whole way as one ONNX file: it equals that of evaluation, and the live stream."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def network():
 
 @pytest.fixture(scope="module")
 def folder(network, tmp_path_factory) -> Path:
-    """The network's own file, and the whole way in Unity's space."""
+    """Export the network's own file, and the whole way in Unity's space."""
     folder = tmp_path_factory.mktemp("full")
     export(streaming(network), folder / "step.onnx", RUN)
     export_full(streaming(network), folder / "unity.onnx", RUN, "unity")
@@ -44,7 +44,7 @@ def folder(network, tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize("name", SPACES)
 def test_it_is_the_stream(name, network, folder: Path):
-    """In every space, from a fresh start and after a reset; of the whole graph but in Unity's."""
+    """It holds in every space, from a fresh start and after a reset."""
     file, space = folder / f"{name}.onnx", SPACES[name]
     if not file.exists():
         export_full(network, file, RUN, name)

@@ -1,4 +1,4 @@
-"""The NumPy forms compute what the torch forms do."""
+"""The NumPy functions compute what the torch functions do."""
 
 from __future__ import annotations
 

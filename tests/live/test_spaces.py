@@ -1,4 +1,4 @@
-"""Frames of reference: what they mean, and there and back."""
+"""Frames of reference: what they mean, and the way there and back."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_there_and_back(name, point, turn):
 
 @given(names, points, turns, turns)
 def test_a_chain_of_joints_is_the_same_in_every_space(name, offset, root, local):
-    """A child at a rest offset: turned and placed in AMASS' world, or all of it in the space."""
+    """A child at a rest offset, turned and moved in AMASS' world or in the space, is the same point."""
     space = SPACES[name]
     there_root, there_local = space.pose_out(np.stack([root, local]))
     there_offset = offset * space.body  # the T-pose's axes
@@ -48,7 +48,7 @@ def test_the_axes(name, forward, up, left):
     space = SPACES[name]
     for there, here in ((forward, FORWARD), (up, UP), (left, LEFT)):
         np.testing.assert_allclose(space.positions_in(np.array(there, float)), here)
-    # who stands upright and looks forward has the identity: SMPL's +Z is forward, its +X left
+    # the identity is a person upright who looks forward: SMPL's +Z is forward, its +X left
     upright = space.rotations_in(np.eye(3))
     np.testing.assert_allclose(upright @ [0, 0, 1], FORWARD, atol=1e-12)
     np.testing.assert_allclose(upright @ [0, 1, 0], UP, atol=1e-12)
@@ -62,7 +62,7 @@ def test_amass_is_amass():
 
 
 def test_a_head_that_turns_left_turns_left_everywhere():
-    """90 degrees: about +Y in openxr (right-handed), about -Y in unity (left-handed)."""
+    """90 degrees to the left are about +Y in openxr (right-handed) and about -Y in unity (left-handed)."""
     for name, sign in (("openxr", 1), ("unity", -1)):
         turn = Rotation.from_rotvec([0, sign * np.pi / 2, 0]).as_matrix()
         np.testing.assert_allclose(SPACES[name].rotations_in(turn) @ [0, 0, 1], LEFT, atol=1e-12)

@@ -1,7 +1,7 @@
 """The live stream: the numbers of evaluation, in every space, and what happens to disturbed trackers.
 
-Bounds are a little above what was measured, which a comment beside each says, with what it is without the
-treatment.
+Bounds are a little above what was measured. A comment beside each bound gives that, and what it would be
+without the treatment that is tested.
 """
 
 from __future__ import annotations
@@ -59,12 +59,15 @@ def file(network, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def undisturbed(file) -> np.ndarray:
-    """Joints (240, 22, 3) of the 60 Hz stream."""
+    """Return the joints (240, 22, 3) of the undisturbed 60 Hz stream."""
     return wearer.joints(wearer.play(Stream(file), PERSON.positions, PERSON.rotations))
 
 
 def largest_difference(network, file: Path, person: wearer.Person) -> float:
-    """Between a stream and evaluation, over rotations, positions and joints of a person's frames."""
+    """Return the largest difference between a stream and evaluation over a person's frames.
+
+    It is over rotations, positions and joints.
+    """
     poses = wearer.play(Stream(file), person.positions, person.rotations)[1:]
     motion = stream(network, [person.frames])[0]
     pairs = [
@@ -135,7 +138,7 @@ def test_inverse_kinematics_bring_the_pose_to_the_position_branch(network, file)
 
 
 CHANGING = np.concatenate([np.arange(0, 1, 1 / 90), np.arange(1, 2, 1 / 30), np.arange(2, 4, 1 / 120)])
-RATES = {  # Hz: bounds on mean and most, cm; measured, and with the newest sample in each frame's place
+RATES = {  # Hz: times, bounds on mean and most, cm; beside: measured; with the newest sample as frame
     "30": (np.arange(0, 4, 1 / 30), 1.6, 7.5),  # 1.54, 7.18; 16.8, 34.2
     "72": (np.arange(0, 4, 1 / 72), 0.12, 0.85),  # 0.112, 0.827; 7.5, 32.6
     "90": (np.arange(0, 4, 1 / 90), 0.18, 0.95),  # 0.166, 0.896; 10.1, 28.5
@@ -158,7 +161,10 @@ def test_other_rates(rate, file, undisturbed):
 
 
 def test_a_slow_tracker_moves_the_network_at_60_hz(file):
-    """Two frames a sample: the network's past is as long as it is, and time=None goes on by one frame."""
+    """There are two frames a sample, so that the network's past keeps its length in seconds.
+
+    With time=None the next sample is one frame later.
+    """
     stream = Stream(file)
     poses = wearer.play(stream, PERSON.positions[::2], PERSON.rotations[::2], TIMES[::2])
     assert all(pose.fresh for pose in poses)
@@ -170,7 +176,7 @@ def test_a_slow_tracker_moves_the_network_at_60_hz(file):
 
 
 def test_what_is_not_newer_is_ignored(file):
-    """At 72 Hz, where each sample but the ignored ones counts for the frames around it."""
+    """At 72 Hz each sample that is not ignored counts for the frames on both sides of it."""
     times = np.arange(0, 1, 1 / 72)
     person = wearer.person(times)
     expected = wearer.joints(wearer.play(Stream(file), person.positions, person.rotations, times))
@@ -186,7 +192,7 @@ def test_what_is_not_newer_is_ignored(file):
 
 
 def test_times_in_whole_milliseconds_make_a_frame_a_sample(file, undisturbed):
-    """Without room for rounding every third frame would come a sample late."""
+    """Without a tolerance for rounding, every third frame would come a sample late."""
     times = np.round(TIMES, 3)
     person = wearer.person(times)
     poses = wearer.play(Stream(file), person.positions, person.rotations, times)
@@ -196,7 +202,7 @@ def test_times_in_whole_milliseconds_make_a_frame_a_sample(file, undisturbed):
 
 @pytest.mark.parametrize("jump", [0.6, -0.6, 1e6])
 def test_after_a_gap_all_begins_anew(file, undisturbed, jump):
-    """Exactly as a new stream; a clock that is set back is a gap too."""
+    """The stream is exactly as a new one. A clock that is set back is a gap, too."""
     stream = Stream(file)
     wearer.play(stream, PERSON.positions[100:160], PERSON.rotations[100:160], TIMES[:60])
     poses = wearer.play(stream, PERSON.positions[:60], PERSON.rotations[:60], TIMES[59] + jump + TIMES[:60])
@@ -205,7 +211,7 @@ def test_after_a_gap_all_begins_anew(file, undisturbed, jump):
 
 
 def test_a_short_gap_is_bridged(file, undisturbed):
-    """12 frames missing. Mean from there on 0.50 cm; 0.57 when it begins anew instead."""
+    """12 frames are missing. The mean from there on is 0.50 cm; 0.57 if it began anew instead."""
     kept = np.r_[0:100, 112:FRAMES]
     poses = wearer.play(Stream(file), PERSON.positions[kept], PERSON.rotations[kept], TIMES[kept])
     assert not any(pose.restarted for pose in poses[1:])
@@ -228,7 +234,10 @@ def test_reset_is_a_new_stream(file, undisturbed):
     [((1,), 8, 3000), ((0,), 48, 4500)],
 )
 def test_lost_trackers_are_held_and_come_back(trackers, during, speed, file, undisturbed):
-    """Half a second. Without a smooth return the fastest joint has 7585 and 12736 cm/s; undisturbed 1340."""
+    """They are lost for half a second.
+
+    Without a smooth return the fastest joint would have 7585 and 12736 cm/s; undisturbed it has 1340.
+    """
     lost = {index: trackers for index in range(100, 130)}
     poses = wearer.play(Stream(file), PERSON.positions, PERSON.rotations, lost=lost)
     names = tuple(("head", "left", "right")[tracker] for tracker in trackers)
@@ -263,7 +272,7 @@ def test_what_counts_as_lost(gone, file):
 
 @pytest.mark.parametrize("seen", [(), (0,), (1, 2)])
 def test_trackers_that_were_never_there(seen, file):
-    """They stand in a T-pose, finite, until they come."""
+    """They stand in a T-pose, finite, until they are seen."""
     lost = {index: [k for k in range(3) if k not in seen] for index in range(20)}
     poses = wearer.play(Stream(file), PERSON.positions[:60], PERSON.rotations[:60], lost=lost)
     assert all(len(pose.held) == 3 - len(seen) for pose in poses[:20])
@@ -276,7 +285,7 @@ def test_trackers_that_were_never_there(seen, file):
 
 @pytest.mark.parametrize("name", SPACES)
 def test_calibration_finds_how_the_devices_sit(name, file):
-    """In any heading; positions up to the devices' mean distance, which a T-pose cannot tell."""
+    """It does so in any heading; positions up to the devices' mean distance, which a T-pose can't tell."""
     space, stream = SPACES[name], Stream(file, space=name)
     turns = Rotation.random(3, rng=4).as_matrix()
     sits = np.array([[0, 0.08, 0.1], [0.05, 0.02, 0], [-0.05, 0.02, 0]])  # metres from the joints, body axes

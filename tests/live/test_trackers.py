@@ -1,4 +1,4 @@
-"""Trackers alone: what the network gets to see of samples that come late, seldom or not at all."""
+"""Trackers alone: what the network sees of samples that come late, seldom or not at all."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ SAMPLES = [Tracked(*sample) for sample in zip(TIMES, PERSON.positions, PERSON.ro
 
 
 def frames_of(times: np.ndarray) -> list[Tracked]:
-    """The frames at 60 Hz of samples of the person at those times."""
+    """Return the frames at 60 Hz of samples of the person at those times."""
     trackers, person = Trackers(SKELETON, 60), wearer.person(times)
     samples = zip(times, person.positions, person.rotations, strict=True)
     return [frame for sample in samples for frame in trackers.take(*sample, NOBODY).frames]
 
 
 def filled(lost: tuple[bool, ...], first: int, count: int, hold: Hold) -> np.ndarray:
-    """Positions (240, 3, 3) of all trackers, some lost from a frame on."""
+    """Return the positions (240, 3, 3) of all trackers, some of which are lost for a while."""
     gone = range(first, first + count)
     return np.stack([hold(s, lost if i in gone else NOBODY).positions for i, s in enumerate(SAMPLES)])
 
 
 def speed(positions: np.ndarray) -> float:
-    """The fastest tracker, m/s."""
+    """Return the speed of the fastest tracker, m/s."""
     return float(60 * np.linalg.norm(np.diff(positions, axis=0), axis=-1).max())
 
 
 @pytest.mark.parametrize(("rate", "millimetres"), [(30, 7), (72, 1.2), (90, 0.8), (120, 1e-6), (60, 1e-6)])
 def test_frames_lie_between_samples(rate, millimetres):
-    """Measured: 6.63, 1.11, 0.74 mm at 30, 72, 90 Hz."""
+    """The errors were measured as 6.63, 1.11 and 0.74 mm at 30, 72 and 90 Hz."""
     frames = frames_of(np.arange(0, 4, 1 / rate))
     times = np.array([frame.time for frame in frames])
     np.testing.assert_allclose(times, np.arange(len(frames)) / 60, atol=1e-9)
@@ -57,7 +57,7 @@ def test_frames_lie_between_samples(rate, millimetres):
 
 
 def test_no_frame_is_lost_in_an_hour_of_unix_time():
-    """60 Hz from a clock with 2e-7 s to a tick: one frame a sample, at the sample."""
+    """Such times have a resolution of 2e-7 s; at 60 Hz each sample still makes one frame, at its own time."""
     trackers, start = Trackers(SKELETON, 60), 1.7e9
     for index in range(216_000):
         taken = trackers.take(start + index / 60, *SAMPLES[0][1:], NOBODY)
@@ -66,7 +66,7 @@ def test_no_frame_is_lost_in_an_hour_of_unix_time():
 
 @pytest.mark.parametrize("lost", [(False, True, False), (True, False, False), (False, True, True)])
 def test_a_return_is_no_jump(lost):
-    """Lost for half a second. The fastest tracker afterwards: 4.38 to 4.61 m/s; with a jump 48 to 53."""
+    """After a loss of half a second the fastest tracker has 4.38 to 4.61 m/s; with a jump 48 to 53."""
     undisturbed = speed(PERSON.positions[129:160])
     blended = speed(filled(lost, 100, 30, Hold(SKELETON))[129:160])
     jumped = speed(filled(lost, 100, 30, Hold(SKELETON, recovery=0))[129:160])

@@ -1,4 +1,4 @@
-"""Figures and films: their sizes, counts and colours, and nothing left of what was broken off."""
+"""Figures and films: their sizes, counts and colours, and that a broken one leaves no file."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ OFF = np.array([0.0, 0.0, 0.08])
 
 @pytest.fixture
 def take() -> Take:
-    """Half a second, with a good and a bad prediction."""
+    """Make a take of half a second, with a good and a bad prediction."""
     return Take("clips/one", TRUTH, {"good": TRUTH + OFF / 8, "bad": TRUTH + OFF}, start=60)
 
 
 @pytest.fixture
 def short() -> Take:
-    """A sixth of a second of it, for films."""
+    """Make a take of a sixth of a second, for films."""
     return Take("clips/one", TRUTH[:11], {"good": TRUTH[:11] + OFF / 8, "bad": TRUTH[:11] + OFF}, start=60)
 
 
@@ -42,7 +42,7 @@ def camera(take: Take) -> Camera:
 
 
 def colour(picture: np.ndarray) -> np.ndarray:
-    """Mean colour (3,) of what is not white or grey."""
+    """Return the mean colour (3,) of all pixels that are not white or grey."""
     vivid = picture.max(-1).astype(int) - picture.min(-1) > 60
     return picture[vivid].mean(0)
 
@@ -76,7 +76,7 @@ def test_the_truth_has_no_colour(camera: Camera):
 
 
 def test_the_nearer_body_part_is_seen(camera: Camera):
-    """With a hand before the chest and with it behind, other joints' colours are seen there."""
+    """A hand before the chest is seen there in its own colour, a hand behind it is not."""
     seen = []
     for away in (0.35, -0.35):
         joints = TRUTH[0].copy()

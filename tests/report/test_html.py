@@ -1,4 +1,4 @@
-"""The report's page, in the text and in a browser."""
+"""The report's page, as text and in a browser."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NAMES = ("table01", "table04", "table06", "table14", "table17")
 
 
 def measured(outputs: Path, name: str) -> Chapter:
-    """A chapter whose runs are all there."""
+    """Make a chapter whose runs are all there."""
     sweep = load_sweep(SHIPPED / f"{name}.yaml")
     find = fake_sweep(outputs, sweep, {"2": 1.1, "no Multi-Head, no Memory-Block": 1.2}, log=True)
     return Chapter(sweep, table_of(sweep, find), runs_of(sweep, find))
@@ -60,7 +60,7 @@ def test_systems_of_both_tables():
 
 
 def test_page_needs_nothing_else(text: str):
-    """No address is loaded: of scripts, styles, images or fonts."""
+    """The page loads nothing by address: no scripts, styles, images or fonts."""
     assert not re.search(r"<script|<link(?! rel=\"icon\" href=\"data:)|@import|url\((?!#)|src=|<img", text)
     addresses = set(re.findall(r"https?://[^\"'\s<)]+", text))
     assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
@@ -68,7 +68,7 @@ def test_page_needs_nothing_else(text: str):
 
 @pytest.mark.parametrize("count", [2, 12, 13])
 def test_points_of_ours_are_named_where_they_are_few(count: int):
-    """One that two tables share once."""
+    """A point that two tables share is named once."""
     points = [figures.Point(f"arm {number};", 100.0 + number, 4.0) for number in range(count)]
     svg = figures.accuracy({"one": points, "other": points[:1]}, [figures.Point("theirs", 72, 3)], "MPJRE")
     assert svg.count("theirs") == 1
@@ -100,7 +100,7 @@ def test_ids_are_unique_and_links_lead_somewhere(text: str):
 
 
 def test_distributions_by_hand(tmp_path: Path):
-    """Interquartile means and probabilities of improvement of one metric, and the profile's fractions."""
+    """Interquartile means, probabilities of improvement and profile of a metric are as computed here."""
     sweep = load_sweep(SHIPPED / "table14.yaml")
     find = fake_sweep(tmp_path, sweep, {"2": 1.02})
     found = {one.label: one for one in distributions(sweep, runs_of(sweep, find), "stream")["MPJPE"]}
@@ -156,7 +156,7 @@ def test_nothing_measured_is_said():
 
 
 def browser(tmp_path: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Chromium without a window and without a network."""
+    """Run Chromium without a window and without a network."""
     if CHROMIUM is None:
         pytest.skip("Chromium is not installed (apt-get install chromium)")
     command = [
@@ -170,7 +170,7 @@ def browser(tmp_path: Path, *arguments: str) -> subprocess.CompletedProcess[str]
 
 
 def console(ran: subprocess.CompletedProcess[str]) -> list[str]:
-    """What the page wrote to the browser's console."""
+    """Return what the page wrote to the browser's console."""
     return [line for line in ran.stderr.splitlines() if "CONSOLE" in line]
 
 
@@ -193,7 +193,7 @@ def test_browser_shows_the_page(tmp_path: Path, text: str, chapters: list[Chapte
 
 
 def test_browser_tells_of_errors(tmp_path: Path):
-    """The test above sees what a page's script throws, and what it cannot load."""
+    """What a page's script throws is seen, so that the test above can fail."""
     path = tmp_path / "bad.html"
     path.write_text("<script>throw new Error('loud')</script><img src='http://example.invalid/x.png'>")
     assert any("loud" in line for line in console(browser(tmp_path, "--dump-dom", path.as_uri())))
@@ -208,7 +208,7 @@ def test_browser_prints_and_takes_a_picture(tmp_path: Path, text: str):
 
 @pytest.fixture
 def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Stands in for composing: the runs of Tables 5 and 6 are there, none of the others can be known."""
+    """Replace planning: the runs of Tables 5 and 6 are there, those of the others can't be planned."""
 
     def plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
         if sweep.table not in (5, 6):

@@ -42,7 +42,7 @@ def source(sweep: Sweep, kept: Kept) -> KeptTable:
 
 
 def test_kept_results_make_the_runs_table(sweep: Sweep, kept: Kept, tmp_path: Path):
-    """To six digits, with every origin and every group."""
+    """The table is the same to six digits, with every origin and every group."""
     save(tmp_path / "kept.json", kept)
     read = load_kept(tmp_path / "kept.json")
     assert (read.sweep, read.overrides, read.command) == (
@@ -97,7 +97,7 @@ def test_kept_results_that_were_edited_are_refused(kept: Kept, tmp_path: Path):
 
 
 def test_kept_results_have_the_same_bytes(kept: Kept, tmp_path: Path):
-    """Whatever order the runs are found in, and after being read."""
+    """The bytes don't depend on the order of the runs, or on being read and written again."""
     turned = {label: dict(reversed(runs.items())) for label, runs in reversed(kept.runs.items())}
     assert dumps(replace(kept, runs=turned)) == dumps(kept)
     save(tmp_path / "kept.json", kept)
@@ -106,7 +106,7 @@ def test_kept_results_have_the_same_bytes(kept: Kept, tmp_path: Path):
 
 
 def test_results_of_several_machines_add_up(sweep: Sweep, kept: Kept, tmp_path: Path):
-    """Arms and seeds of both; a cell that both have is the newer one's, and the replaced run is gone."""
+    """Arms and seeds of both are there. A cell that both have is the newer one's; the other run is gone."""
     one = {label: {0: runs[0]} for label, runs in kept.runs.items()}
     newer = fake_run(tmp_path, "again", 0)
     other = runs_of(replace(sweep, seeds=(0,)), lambda arm, seed: newer if arm.label == "2" else None)
@@ -236,7 +236,7 @@ def test_pages_of_the_clone_are_made_again_byte_for_byte():
 
 
 def test_every_interval_of_the_clone_follows_from_what_is_kept():
-    """The pages' intervals, made by hand of the per-clip results: as many, and to the last printed digit."""
+    """As many intervals as the pages print are computed here from the per-clip results, and are equal."""
     for name, one in sources(DOCS).items():
         text, printed = (DOCS / f"{name}.md").read_text(encoding="utf-8"), []
         content = json.loads((DOCS / "data" / f"{name}.json").read_text())
@@ -251,7 +251,7 @@ def test_every_interval_of_the_clone_follows_from_what_is_kept():
 
 
 def by_hand(content: dict, row, table, mode: str, metric: str) -> tuple[float, float]:
-    """The interval of a row's difference from its control, from a file's content alone."""
+    """Compute the interval of a row's difference from its control, from a file's content alone."""
     branches = {other.label: other.branch for other in table.rows}
     seeds = sorted(set(content["cells"][row.label]) & set(content["cells"][row.against]))
     sides, groups = [], []
@@ -286,7 +286,7 @@ def test_the_way_from_the_first_arm_to_the_last_is_the_sum_of_its_steps(sweep: S
 
 
 def test_results_of_an_arm_that_was_another_are_refused(sweep: Sweep, kept: Kept):
-    """Its numbers would stand under a name that means something else now."""
+    """Otherwise its numbers would stand under a label that means something else now."""
     arms = [replace(arm, overrides=("memory=gru",)) if arm.label == "2" else arm for arm in sweep.arms]
     other = replace(sweep, arms=tuple(arms))
     with pytest.raises(InputError, match="arm '2' was made with the overrides"):
@@ -301,7 +301,7 @@ def test_prose_claims_nothing_by_hand():
 
 
 def test_by_hand_is_what_a_page_has(sweep: Sweep, kept: Kept):
-    """The test of the clone's intervals sees them: of results made here."""
+    """What the test of the committed pages computes is checked on results made here, too."""
     content, table = json.loads(dumps(kept)), source(sweep, kept).table
     row = table.rows[0]
     effect = row.cells["stream"]["MPJPE"].effect

@@ -1,4 +1,4 @@
-"""The study and its director: trials counted, pruned, failed and resumed, with runs that tests write."""
+"""The study and its director: trials counted, pruned, failed and resumed, with runs written by the tests."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def director(study: Study, folder: Path, composed: Callable = compose) -> Direct
 
 
 def error(config: Mapping[str, Any]) -> float:
-    """A bowl with its lowest point at weights of 2 and 0.2; each seed lies 0.3 above the one before."""
+    """Return a trial's error: lowest at weights of 2 and 0.2, and 0.3 higher with each further seed."""
     values = config["values"]
     return 5 + abs(values["loss.rotation"] - 2) + abs(values["loss.hand"] - 0.2) + 0.3 * config["seed"]
 
@@ -115,7 +115,7 @@ def test_capacity_is_kept_and_each_plan_holds_what_is_under_way(tmp_path: Path):
 def test_a_director_killed_while_it_asks_loses_and_repeats_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int
 ):
-    """Before the first value of a new trial, between its values, after them, and after its run is known."""
+    """It dies before a new trial's first value, between its values, after them, or once its run is known."""
     study = open_run(tmp_path)
     one = director(study, tmp_path)
     finish(one.look(1))
@@ -201,7 +201,7 @@ def test_mending_leaves_a_whole_journal_alone(tmp_path: Path):
 
 
 def begun(plan: Plan) -> Run:
-    """The run of a plan's only task, begun."""
+    """Begin the run of a plan's only task, and return it."""
     (task,) = plan.tasks
     run = plan.run_of(task)
     run.begin("memmlp", task.config, data="d", upstream=None)
@@ -349,9 +349,9 @@ def test_pruning_is_by_the_first_seed_alone(tmp_path: Path):
             run.finish([])
     run = begun(one.look(1))
     log(run, 10, 50.0)
-    run.finish([])  # before anyone looks: what is done is not pruned
+    run.finish([])  # done before the director looks, so that it is not pruned
     second = begun(replace(plan := one.look(1), tasks=tuple(plan.left())))
-    log(second, 20, 50.0)  # a seed on which the trial is bad is part of its mean, and no reason to end it
+    log(second, 20, 50.0)  # a further bad seed enters the mean, but doesn't end the trial
     assert second.id in {task.id for task in one.look(1).left()}
     assert study.trials[2].intermediate_values == {10: 50.0}
     second.fail("not of interest here")

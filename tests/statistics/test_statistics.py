@@ -28,10 +28,10 @@ from memmlp.statistics import (
 )
 from memmlp.statistics.crossed import error, skewed
 
-TABLE = 24  # comparisons
-SHARES = {  # of the mean's variance: seeds, clips' groups, clips, exponential clips, noise
+TABLE = 24  # comparisons of a table
+SHARES = {  # of seeds, clips' groups, clips, exponential clips and noise in the mean's variance
     "equal": (1, 0, 1, 0, 1),
-    "values": (40 / 3, 0, 1, 0, 1 / 3),  # equal for single values, of 3 seeds on 40 clips
+    "values": (40 / 3, 0, 1, 0, 1 / 3),  # equal variances in a single value, for 3 seeds and 40 clips
     "seeds": (1, 0, 0, 0, 0),
     "groups": (0, 1, 0, 0, 0),
     "noise": (0, 0, 0, 0, 1),
@@ -43,7 +43,7 @@ GRID = [(3, 4, 1), (3, 40, 1), (5, 10, 2), (10, 4, 1), (5, 40, 10)]
 
 
 def differences(seeds: int, clips: int, size: int, shares: tuple[float, ...], tables: int) -> np.ndarray:
-    """True nulls (tables * TABLE, S, C), whose means have a variance of 1."""
+    """Draw differences (tables * TABLE, S, C) whose true means are 0; the means have a variance of 1."""
     rng = np.random.default_rng([seeds, clips, size])
     group = np.arange(clips) // size
     weights = np.bincount(group) / clips
@@ -61,12 +61,12 @@ def groups(clips: int, size: int) -> np.ndarray:
 
 
 def starred(p: np.ndarray) -> float:
-    """The share of tables of true nulls with a star."""
+    """Return the share of tables with a star, where all true differences are 0."""
     return float(np.mean([(holm(row) <= 0.05).any() for row in p.reshape(-1, TABLE)]))
 
 
 def satterthwaite(d: np.ndarray) -> np.ndarray:
-    """P-values as they were: one t of both variances, with Welch and Satterthwaite's degrees of freedom."""
+    """Return p-values by an earlier method: one t of both variances, Satterthwaite's degrees of freedom."""
     a, b = (side.var(1, ddof=1) / side.shape[1] for side in (d.mean(2), d.mean(1)))
     freedom = (a + b) ** 2 / (a**2 / (d.shape[1] - 1) + b**2 / (d.shape[2] - 1))
     return 2 * stats.t.sf(np.abs(d.mean((1, 2))) / np.sqrt(a + b), freedom)

@@ -1,4 +1,4 @@
-"""Executors: submitit's local and debug modes for real, Slurm's by its sbatch file, Ray where it is."""
+"""Executors: submitit's local and debug modes, Slurm's by its sbatch file, Ray where it is installed."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class Living(Dead):
 
 
 class Shelf:
-    """An executor that hands out what it was given."""
+    """An executor whose workers are objects of a given class; it remembers them."""
 
     def __init__(self, kind):
         self.kind, self.handles = kind, []

@@ -1,7 +1,8 @@
 """The shipped sweep files: they load, their arms differ, and their paper values are those printed.
 
-What is printed is transcribed in paper_values.yaml, apart from the sweeps; that it is so, its own facts tell:
-rows that stand in several tables, numbers of the paper's text, and sums that errors of metrics keep to.
+paper_values.yaml has the printed values, transcribed apart from the sweeps. Facts of its own tell whether the
+transcription is right: rows that stand in several tables, numbers in the paper's text, and sums that the
+errors' definitions imply.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from memmlp.training.network import MotionTask
 FOLDER = Path(__file__).parent.parent.parent / "sweeps"
 FILES = sorted(FOLDER.glob("*.yaml"))
 TABLES = [path for path in FILES if path.stem.startswith("table")]
-OURS = ("no Multi-Head, no Memory-Block, Mem-MLP's loss",)  # rows of the tables that the paper has not
+OURS = ("no Multi-Head, no Memory-Block, Mem-MLP's loss",)  # rows of the tables that are not the paper's
 LABELLED = (1, 2, 3, 11, 14, 15, 16, 17)  # tables whose labels are the printed ones
 PRINTED: dict[int, dict[str, Any]] = yaml.safe_load(
     Path(__file__).with_name("paper_values.yaml").read_text(encoding="utf-8")
@@ -57,7 +58,7 @@ OTHER_SIZE = ("MMD", "HDM-Poser", "Mem-MLP-41 (Ours)", "Mem-MLP-60 (Ours)")  # m
 
 
 def rows(table: int) -> list[dict[str, Any]]:
-    """The printed rows, by metric and with their label; values that are not there left out."""
+    """Return the printed rows of a table: a label and the values that are there, by metric."""
     keys = ["label", *PRINTED[table]["columns"]]
     found = [dict(zip(keys, row, strict=True)) for row in PRINTED[table]["rows"]]
     return [{key: value for key, value in row.items() if value is not None} for row in found]
@@ -90,7 +91,7 @@ def test_every_table_of_the_paper_is_there():
 
 @pytest.mark.parametrize("path", TABLES, ids=lambda path: path.stem)
 def test_values_are_those_printed(path: Path):
-    """Row by row, no value more and none less."""
+    """Each row has the printed values, and none beside them."""
     sweep = load_sweep(path)
     assert sweep.table
     arms = [(arm.label, dict(arm.paper)) for arm in sweep.arms if arm.paper]
@@ -113,7 +114,7 @@ AFTER_IK = {"MPJPE": 3.08, "Jitter": 6.03}  # Table 6, "Rotation + Position Bran
 
 @pytest.mark.parametrize("path", TABLES[:15], ids=lambda path: path.stem)
 def test_rows_with_table_6s_combined_values_show_the_combined_branch(path: Path):
-    """And the file says how we know; a network of one head, which has no other, shows its rotations."""
+    """The file also says how we know the branch. A network with rotations alone shows these."""
     sweep = load_sweep(path)
     assert sweep.branch_source
     full = [arm for arm in sweep.arms if AFTER_IK.items() <= (arm.paper or {}).items()]
@@ -142,7 +143,7 @@ DECOMPOSITION = load_sweep(FOLDER / "decomposition.yaml")
 
 
 def test_the_decomposition_changes_one_ingredient_a_step():
-    """Each arm's config differs from its control's in what its label names, or in the branch alone."""
+    """Each arm's config differs from its control's in what its label names, or only its branch does."""
     arms = {arm.label: arm for arm in DECOMPOSITION.arms}
     configs = {
         label: flatten(OmegaConf.to_container(composed([*DECOMPOSITION.overrides(arm)]), resolve=True))
@@ -177,12 +178,12 @@ def test_the_decomposition_changes_one_ingredient_a_step():
 
 
 def _trained(config: dict[str, object]) -> dict[str, object]:
-    """What of a config the training depends on."""
+    """Return the part of a config that the training depends on."""
     return {key: value for key, value in config.items() if not key.startswith("evaluation.ik")}
 
 
 def test_the_backbone_is_agrols_mlp_of_ten_blocks():
-    """With one head and no memory: the same function of the same weights."""
+    """Without memory and with one head, it computes the same function of the same weights."""
     small = ["model.frames=41", "profile=tiny", "frame.coordinates=world", "frame.normalize=false"]
     mem = untrained([*small, "memory=none", "predictor=rotation_only", "hand=off", "loss=agrol"])
     agrol = untrained([*small, "model=agrol_mlp", "model.depth=10"])
@@ -198,7 +199,7 @@ def test_the_backbone_is_agrols_mlp_of_ten_blocks():
 
 @pytest.mark.parametrize("arm", DECOMPOSITION.arms, ids=lambda arm: arm.label)
 def test_an_arm_of_the_decomposition_trains(arm: Arm):
-    """A step of each changes the weights, under the loss that its label names."""
+    """A step of each arm changes the weights, under the loss that its label names."""
     experiment = build_experiment(composed([*DECOMPOSITION.overrides(arm), "profile=tiny"]))
     torch.manual_seed(0)
     architecture, frames = experiment.architecture, tiny.frames((60, 70))
@@ -226,7 +227,7 @@ TERMS = {
 }
 
 
-# What the transcription tells of itself
+# Facts that tell whether the transcription is right
 
 
 @pytest.mark.parametrize("table", FULL)
@@ -253,7 +254,7 @@ def test_rows_that_stand_in_two_tables_are_the_same():
 
 @pytest.mark.parametrize("table", [1, 3, 6])
 def test_a_mean_over_the_body_lies_between_its_halves(table: int):
-    """MPJPE is that of the 13 upper and the 9 lower joints, to what rounding leaves (0.015 at one row)."""
+    """MPJPE is the mean over 13 upper and 9 lower joints, up to rounding (0.015 in one row)."""
     for found in rows(table):
         if "Upper PE" in found and found["label"] not in OTHERS_JOINTS:
             both = (UPPER_JOINTS * found["Upper PE"] + LOWER_JOINTS * found["Lower PE"]) / 22
@@ -285,7 +286,7 @@ def test_numbers_of_the_papers_text_stand_in_its_tables():
 
 
 def best(table: int, metric: str) -> str:
-    """The label of the row with the lowest value."""
+    """Return the label of the row with the lowest value."""
     return min(rows(table), key=lambda found: found[metric])["label"]
 
 

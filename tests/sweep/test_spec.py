@@ -1,4 +1,4 @@
-"""Sweep files: what they say, and one line for what they must not."""
+"""Sweep files: what they mean, and the one-line errors about what they must not hold."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Workers: each run exactly once, whoever dies, on plans without any training."""
+"""Workers do each run exactly once, whoever dies; the plans here need no training."""
 
 from __future__ import annotations
 

@@ -36,11 +36,11 @@ SWEEP = parse_sweep(
 )
 TRUTH = {"full": 0.0, "worse": 2.0, "same": 0.0, "unsure": 0.09}  # the smallest effect of interest is 0.1
 
-Draw = Callable[[str, int, str], np.ndarray]  # by label, seed, and mode and metric: an error of each clip
+Draw = Callable[[str, int, str], np.ndarray]  # (label, seed, "mode metric") -> the error on each clip
 
 
 def run(label: str, seed: int, draw: Draw, metrics: tuple[str, ...], groups: Mapping[str, str]) -> Measured:
-    """A finished run with those errors in both modes."""
+    """Make a finished run with these errors in both modes."""
     modes = ("stream", "window")
     numbers = {mode: {m: draw(label, seed, f"{mode} {m}") for m in metrics} for mode in modes}
     clips = {
@@ -52,7 +52,7 @@ def run(label: str, seed: int, draw: Draw, metrics: tuple[str, ...], groups: Map
 
 
 def planted(label: str, seed: int, metric: str) -> np.ndarray:
-    """The arm's true error, and noise by seed and clip; of one arm more."""
+    """Return the arm's true error with noise by seed and clip; the arm "unsure" has more noise."""
     noise = np.random.default_rng([seed, *label.encode(), *metric.encode()]).normal(size=len(CLIPS))
     return 5 + TRUTH[label] + (0.4 if label == "unsure" else 0.005) * noise
 
@@ -121,7 +121,7 @@ def test_open_arms_and_their_control_alone_go_on():
 
 
 def test_what_is_decided_stays_though_later_data_would_reverse_it():
-    """`other` is the control of an open arm and so gets seeds after it was found worse."""
+    """`other` is the control of an open arm, and so gets more seeds after it was found to be worse."""
     arms = {"full": [], "other": ["a=1"], "unsure": {"overrides": ["a=3"], "against": "other"}}
     sweep = parse_sweep("chain", {"seeds": [0], "metrics": ["MPJPE"], "arms": arms})
 
@@ -142,7 +142,7 @@ def test_what_is_decided_stays_though_later_data_would_reverse_it():
 
 
 def test_a_decided_comparison_of_an_open_arm_is_not_looked_at_again():
-    """Worse in stream mode at three seeds, better after them; window mode stays open."""
+    """The arm is worse in stream mode at three seeds and better after them; its window mode stays open."""
     sweep = parse_sweep("mixed", {"seeds": [0], "metrics": ["MPJPE"], "arms": {"full": [], "other": ["a=1"]}})
 
     def draw(label: str, seed: int, metric: str) -> np.ndarray:
@@ -198,7 +198,7 @@ def test_a_file_holds_all_of_it():
 
 
 def test_corrections_are_over_all_that_nobody_has_claimed():
-    """Of 6 comparisons two differences are claimed at the first look; then one of 4 is corrected by 4."""
+    """Of 6 comparisons, 2 differences are claimed at the first look; the next corrects by 4."""
     rounds = World().look(World().look(begin(SWEEP)))
     first, second = rounds.taken
     plain = {finding.key: finding for finding in first.found}
@@ -226,9 +226,10 @@ def test_the_table_shows_rounds(tmp_path):
 
 
 def false_claims(truth: float, noise: float, spend: Callable[[Rounds], Rounds], times: int = 200) -> float:
-    """The share of sweeps with a false claim; differences of seeds alone, where the p-values are exact.
+    """Return the share of sweeps with a false claim.
 
-    truth: of all arms' differences; 0, or the smallest effect of interest of 1, where none is equivalent.
+    Differences vary by seed alone, where the p-values are exact. `truth` is the true difference of all arms:
+    0, or 1, the smallest effect of interest, where a claim of equivalence is false.
     """
     arms = {"full": [], **{f"arm {number}": [f"a={number}"] for number in range(5)}}
     sweep = parse_sweep("null", {"metrics": ["MPJPE"], "smallest": {"MPJPE": 1.0}, "arms": arms})
@@ -246,7 +247,7 @@ def false_claims(truth: float, noise: float, spend: Callable[[Rounds], Rounds], 
 
 
 def wasteful(rounds: Rounds) -> Rounds:
-    """The whole 5 % at every look."""
+    """Spend the whole 5 % at every look."""
     return replace(rounds, levels=(0.05,) * len(rounds.looks))
 
 

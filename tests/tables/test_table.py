@@ -101,7 +101,7 @@ def test_correction_is_over_all_modes_and_metrics(table: Table):
         c.effect for row in table.rows for cells in row.cells.values() for c in cells.values() if c.effect
     ]
     tested = [effect for effect in effects if effect.p is not None]
-    assert table.comparisons == len(tested) == 2 * 3 + 2 * 2  # by position has no MPJRE
+    assert table.comparisons == len(tested) == 2 * 3 + 2 * 2  # the arm "by position" has no MPJRE
     smallest = min(tested, key=lambda effect: effect.p)
     assert smallest.holm == pytest.approx(min(1, smallest.p * len(tested)))
 
@@ -114,14 +114,14 @@ def test_signs_against_the_paper(table: Table):
 
 
 def test_each_of_the_papers_effects_counts_once(table: Table):
-    """Those of one mode: MPJRE holds, MPJPE does not; the paper's Jitter has no difference to count."""
+    """The effects of one mode are counted: MPJRE holds, MPJPE does not, and for Jitter the paper has none."""
     assert table.verdicts("stream") == {Verdict.HOLDS: 1, Verdict.OPPOSITE: 1}
     assert cell(table, "no | memory", "Jitter").effect.verdict == Verdict.HIGHER
     assert "of 2 effects in stream mode: 1 holds, 1 opposite" in " ".join(printed(table, 100).split())
 
 
 def test_verdicts_follow_from_the_statistics(sweep: Sweep, tmp_path: Path):
-    """Interval, correction, equivalence and verdict are those of the differences, put together by hand."""
+    """Interval, correction, equivalence and verdict equal those that are put together here by hand."""
     find = fake_sweep(tmp_path, sweep, {"no | memory": 1.004, "by position": 1.05})
     table, keys = (
         table_of(sweep, find),
@@ -176,7 +176,7 @@ def test_a_row_has_its_own_control(sweep: Sweep, tmp_path: Path):
 
 
 def test_one_head_is_told_by_its_positions(tmp_path: Path):
-    """Those of a network without a position branch are its rotations', to rounding."""
+    """Without a position branch both branches have the errors of the rotations, up to rounding."""
     run = fake_run(tmp_path, "a")
     assert not load(run.folder).one_head
     for mode in ("stream", "window"):
@@ -211,7 +211,7 @@ def test_another_branch_and_what_has_one_head(sweep: Sweep, tmp_path: Path):
 
 
 def test_a_branch_that_was_not_evaluated_is_no_other(sweep: Sweep, tmp_path: Path):
-    """What has two heads but no inverse kinematics yet is not shown by its rotation branch."""
+    """A network with two heads and no inverse kinematics yet is not shown by its rotation branch instead."""
     find = fake_sweep(tmp_path, sweep, branches=["rotation", "position"])
     table = table_of(sweep.with_branch("combined"), find, command="memmlp sweep 11")
     assert cell(table, "full_model", "MPJPE").mean is None
@@ -222,7 +222,7 @@ def test_a_branch_that_was_not_evaluated_is_no_other(sweep: Sweep, tmp_path: Pat
 
 
 def test_what_the_table_could_have_seen(table: Table, sweep: Sweep, tmp_path: Path):
-    """The largest over the arms, and most of what is larger is found."""
+    """A table could have seen the largest of what its arms could, and here a larger effect."""
     least = [cell(table, label, "MPJPE").effect.detectable for label in ("no | memory", "by position")]
     assert table.detectable("stream", "MPJPE") == max(least)
     assert f"MPJPE: could have seen {max(least):.2g} (stream)" in printed(table, 200)
@@ -305,7 +305,7 @@ def test_unequal_clips_are_flagged_and_left_out(sweep: Sweep, tmp_path: Path):
     effect = cell(table, "no | memory", "MPJPE").effect
     assert effect is not None
     assert effect.clips == 2
-    assert abs(effect.mean) < 0.3  # the clip that is far harder than the others is not compared with them
+    assert abs(effect.mean) < 0.3  # the clip that is far harder than the others is in one arm alone
     assert sum("unequal test clips" in flag and "share 2 of 4" in flag for flag in table.flags) == 2
 
 
@@ -387,7 +387,7 @@ def test_equal_origins_are_not_flagged(table: Table):
 
 
 def test_what_an_evaluation_ran_on_counts_too(sweep: Sweep, tmp_path: Path):
-    """Its numbers are no less a result of that than the weights."""
+    """An evaluation's numbers depend on code and device as the weights do."""
     other = {"device": "cuda:0", "made_by": {**ORIGIN, "git": {"commit": "fedcba98", "dirty": True}}}
     runs = {
         arm.label: fake_run(tmp_path, arm.label, evaluated=other if arm.label == "by position" else None)
@@ -400,12 +400,12 @@ def test_what_an_evaluation_ran_on_counts_too(sweep: Sweep, tmp_path: Path):
 
 
 def test_arms_that_are_one_run_are_not_compared(sweep: Sweep, tmp_path: Path):
-    """They would be equivalent with certainty, whatever the paper says of them."""
+    """Compared with itself an arm would be equivalent with certainty, whatever the paper says."""
     runs = {seed: fake_run(tmp_path, "one", seed) for seed in sweep.seeds}
     table = table_of(sweep, lambda arm, seed: runs[seed])
     assert cell(table, "no | memory", "MPJPE").effect is None
     assert any("'no | memory' and 'full_model' are one run" in flag for flag in table.flags)
-    assert cell(table, "by position", "MPJPE").effect is not None  # another branch of it
+    assert cell(table, "by position", "MPJPE").effect is not None  # it shows another branch
 
 
 def test_a_comparison_of_one_seed_among_others_of_more_is_said(sweep: Sweep, tmp_path: Path):
@@ -488,7 +488,7 @@ def test_costs_that_are_no_numbers_are_left_out(tmp_path: Path):
 
 
 def test_the_evaluations_of_a_table_are_its_own(tmp_path: Path):
-    """Of two evaluations of one mode each table has the one it asks for."""
+    """Where a run has two evaluations of one mode, each table reads the one that it asks for."""
     run = fake_run(tmp_path, "a")
     report = json.loads(run.evaluation("stream-0").read_text())
     other = {"mode": "stream", "mean": {"combined": {"MPJPE": 1.0}}, "clips": report["clips"]}
@@ -507,7 +507,7 @@ def test_only_costs_need_one_block(tmp_path: Path):
 
 
 def test_costs_show_how_many_times_the_controls_they_are(tmp_path: Path):
-    """Of the fake arms' 0.8, 0.88, 0.96 ms, and of the paper's 6.0 and 30.1."""
+    """The fake arms take 0.8, 0.88 and 0.96 ms, the paper's 6.0 and 30.1 ms."""
     sweep = load_sweep(SHIPPED / "table17.yaml")
     text = printed(table_of(sweep, fake_sweep(tmp_path, sweep)), 100)
     table = table_of(sweep, fake_sweep(tmp_path, sweep))
@@ -591,7 +591,7 @@ def test_json_has_the_values_of_each_seed(table: Table):
 
 
 def test_collect_reads_each_run_once(sweep: Sweep, tmp_path: Path):
-    """The work is linear in the runs: one reading a run, though each is in many comparisons."""
+    """The work is linear in the runs: each is read once, though it is in many comparisons."""
     many = parse_sweep("many", {"axes": {"optim.lr": list(range(1, 41))}, "seeds": [0, 1]})
     find, open_run = fake_sweep(tmp_path, many), []
 
@@ -604,7 +604,7 @@ def test_collect_reads_each_run_once(sweep: Sweep, tmp_path: Path):
 
 
 def test_tables_need_no_torch():
-    """Nor scipy.stats or matplotlib: together seconds to import, more than two thousand runs take."""
+    """Tables need no scipy.stats, matplotlib or Hydra either, for these take seconds to import."""
     code = "import sys, memmlp.cli.table, memmlp.tables.formats as r; print(*sys.modules)"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"torch", "scipy.stats", "matplotlib", "hydra"} & set(ran.stdout.split())
@@ -621,7 +621,7 @@ def test_without_runs_the_papers_values_and_the_reason_are_shown():
 
 
 def test_the_correction_is_the_same_whichever_mode_is_shown(sweep: Sweep, tmp_path: Path):
-    """No star comes of looking at one mode alone."""
+    """Nobody gets a star by looking at one mode alone."""
     find = fake_sweep(tmp_path, sweep, EFFECTS)
     both, one = table_of(sweep, find), table_of(sweep, find, modes=("stream",))
     assert one.modes == ("stream",)

@@ -1,4 +1,4 @@
-"""`memmlp bench`: claims about speed, sweeps under kills and verdicts, measured on this machine."""
+"""`memmlp bench`: measurements on this machine of speed, of sweeps under kills, and of the verdicts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from memmlp.cli.bench.latency import latency
 
 @click.group("bench")
 def bench() -> None:
-    """Measure speed on this machine, as rates and as ratios within one run."""
+    """Measure this machine: speed as rates and as ratios within one run, sweeps under kills, verdicts."""
 
 
 for command in (prepare, stream, latency, avatar, soak, chaos, chaos_tune, calibration):

@@ -1,4 +1,4 @@
-"""`memmlp bench avatar` and `memmlp bench soak`: the live stream's time, and a long stream."""
+"""`memmlp bench avatar` and `memmlp bench soak`: the time of a live frame, and a stream of many hours."""
 
 from __future__ import annotations
 
@@ -36,10 +36,11 @@ def avatar(
     outputs: Path,
     overrides: tuple[str, ...],
 ) -> None:
-    """A frame of the live stream beside the network's session alone: milliseconds, and the ratio.
+    """Time a frame of the live stream.
 
-    The two take turns, frame by frame. OVERRIDES are those of `memmlp train`, for random weights; the
-    default is profile=paper. Their graph is the streaming one, where the network has it.
+    It is timed beside the network's session alone: milliseconds, and the ratio. The two take turns, frame by
+    frame. OVERRIDES are those of `memmlp train`, for random weights; the default is profile=paper. Their
+    graph is the streaming one, where the network has it.
     """
     import tempfile
 
@@ -66,7 +67,11 @@ def avatar(
 
 
 def _alternate(stream: Stream, onnx: Path, frames: int) -> tuple[float, float]:
-    """Median milliseconds of the session alone and of the stream's step, in turn, over random trackers."""
+    """Time the session alone and the stream's step in turn, over random trackers.
+
+    Returns:
+        The median milliseconds of each.
+    """
     import time
 
     import numpy as np
@@ -93,7 +98,7 @@ def _alternate(stream: Stream, onnx: Path, frames: int) -> tuple[float, float]:
 
 
 def _random(overrides: tuple[str, ...], path: Path) -> Path:
-    """The ONNX file of a network with random weights."""
+    """Export a network with random weights to an ONNX file, and return the file."""
     from memmlp.config.build import untrained
     from memmlp.deploy.deployment import GRAPHS
     from memmlp.deploy.export import export
@@ -108,11 +113,12 @@ def _random(overrides: tuple[str, ...], path: Path) -> Path:
 @click.option("--hours", default=1.0, show_default=True, help="Of motion, at least.")
 @outputs_option
 def soak(run: str | None, onnx: Path | None, hours: float, outputs: Path) -> None:
-    """Stream RUN's test clips, one after the other and over again, for hours of motion without a reset.
+    """Stream for hours of motion without a reset.
 
-    Whole repetitions, a multiple of ten, so that every tenth holds the same frames: prints whether all
-    numbers were finite, the MPJPE of the first and the last tenth, and the growth of memory between their
-    ends. Without RUN the motion is synthetic.
+    RUN's test clips are streamed one after the other and over again; without RUN the motion is synthetic. It
+    is repeated as a whole, a multiple of ten times, so that every tenth holds the same frames. Printed are
+    whether all numbers were finite, the MPJPE of the first and of the last tenth, and how much memory grew
+    between their ends.
     """
     from memmlp.common.errors import InputError
     from memmlp.live.soak import repetitions
@@ -137,7 +143,7 @@ def soak(run: str | None, onnx: Path | None, hours: float, outputs: Path) -> Non
 
 
 def _test_clips(outputs: Path, run: str) -> MotionDataset:
-    """The test clips of a run's data."""
+    """Return the test clips of a run's data."""
     from memmlp.config.build import build_experiment, config_of
     from memmlp.runs.lookup import find_run
 
@@ -145,7 +151,7 @@ def _test_clips(outputs: Path, run: str) -> MotionDataset:
 
 
 def _synthetic() -> MotionDataset:
-    """Test clips of synthetic motion."""
+    """Return test clips of synthetic motion."""
     import tempfile
 
     from memmlp.motion.dataset import MotionDataset
@@ -161,7 +167,7 @@ def _synthetic() -> MotionDataset:
 
 
 def _motion(frames: MotionDataset) -> TrackedMotion:
-    """All clips one after the other, as trackers and truth."""
+    """Join all clips into one motion of trackers and true joints."""
     from memmlp.live.full_graph import trackers_of
     from memmlp.live.soak import TrackedMotion
     from memmlp.motion.body import N_JOINTS, POSITION, SPARSE_DIM

@@ -1,4 +1,7 @@
-"""`memmlp bench calibration`: do the verdicts' intervals and p-values keep their promises? In simulations."""
+"""`memmlp bench calibration`: simulate tables to see whether the verdicts' promises are kept.
+
+The arrays' axes are: K comparisons (T tables of TABLE each), S seeds, C clips, G groups of clips.
+"""
 
 from __future__ import annotations
 
@@ -17,22 +20,29 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 SEEDS, CLIPS, SIZES = (2, 3, 5, 10), (4, 10, 40, 536), (1, 2, 10)
-QUICK = 40  # clips at most with --quick
+QUICK = 40  # the largest number of clips with --quick
 ARMS, METRICS = 6, 4
-TABLE = ARMS * METRICS  # comparisons
+TABLE = ARMS * METRICS  # comparisons of a table
 LEVEL = 0.05
-CHUNK = 4_000_000  # numbers simulated at once
+CHUNK = 4_000_000  # numbers that are drawn at once, which bounds the memory
 
 ERROR, LEAST, MOST = 0.06, 0.93, 0.995
-"""The promises: family-wise error at most, coverage at least, and at most from 3 seeds and 5 groups on."""
+"""The promises that are tested.
+
+A family-wise error of at most ERROR and a coverage of at least LEAST everywhere; from 3 seeds and 5 groups on
+also a coverage of at most MOST, so that intervals are not too wide.
+"""
 
 MARGIN, EFFECT = 8.0, 16.0
-"""Where half of the arms differ: the smallest effect of interest and theirs, in standard errors."""
-CAMPAIGNS = 200  # tables with effects, a cell
+"""The smallest effect of interest, and the effect that half of the arms have in simulated campaigns.
+
+Both are in standard errors.
+"""
+CAMPAIGNS = 200  # tables with effects for each cell of the grid
 
 
 class Shares(NamedTuple):
-    """Of the variance of a mean over seeds and clips, what each brings."""
+    """The share of each source in the variance of a mean over seeds and clips; only their ratios matter."""
 
     seeds: float = 0
     groups: float = 0
@@ -64,14 +74,18 @@ SHARES = {
 
 
 def choices(cell: GridRow) -> dict[str, Shares]:
-    """The shares that are simulated; "values" has them equal for a single value, not for the mean."""
+    """Return the shares that are simulated in a cell of the grid, by name.
+
+    SHARES divide the variance of the mean. "values" instead gives every source the same variance in a single
+    value d[s, c], so that in the mean seeds count 1 / S, groups one over their number, and so on.
+    """
     seeds, clips, size = cell
     values = Shares(seeds=1 / seeds, groups=size / clips, clips=1 / clips, noise=1 / seeds / clips)
     return SHARES | {"values": values}
 
 
 class GridRow(NamedTuple):
-    """A row of the grid."""
+    """A cell of the simulated grid: a number of seeds, of clips, and of clips in each group."""
 
     seeds: int
     clips: int
@@ -84,23 +98,35 @@ class GridRow(NamedTuple):
 
     @property
     def capped(self) -> bool:
-        """Whether intervals may not be too wide."""
+        """Whether the promise that intervals are not too wide is made for this cell."""
         return self.seeds >= 3 and self.groups[-1] >= 4
 
 
 class SimulatedLook(NamedTuple):
-    """Of K comparisons' first seeds; every kind of effect gives the mean of all seeds a variance of 1."""
+    """What a look at the first seeds of K comparisons needs, for effects in any shares.
 
-    noise: np.ndarray  # the seeds' means (K, S) of it
-    variance: np.ndarray  # E of it (K,)
-    covariances: np.ndarray  # of the means of groups: groups, clips, skewed, noise (K, 4, 4)
+    Every kind of effect is scaled so that, with all seeds, it gives the mean a variance of 1.
+
+    Attributes:
+        noise: the means (K, S) of the noise over clips, by seed.
+        variance: the variance E (K,) of the noise alone (`memmlp.statistics.crossed`).
+        covariances: of the groups' means of the effects of groups, clips, skewed clips and noise (K, 4, 4).
+    """
+
+    noise: np.ndarray
+    variance: np.ndarray
+    covariances: np.ndarray
 
 
 class Simulated:
-    """Simulated differences of K comparisons, kept as what a mixture of their effects in any shares needs."""
+    """Simulated differences of K comparisons without a true effect.
+
+    Drawing is slow and there are many choices of shares. So each kind of effect is drawn once, and what is
+    kept of it is enough to mix the kinds in any shares afterwards.
+    """
 
     def __init__(self, rng: np.random.Generator, cell: GridRow, comparisons: int):
-        """Draw the effects of all seeds, groups, clips and cells."""
+        """Draw the effects of all seeds, groups and clips, and the noise of all single values."""
         self.seeds = np.sqrt(cell.seeds) * rng.normal(size=(comparisons, cell.seeds))
         fixed, noise, self.weights = draw(rng, cell, comparisons)
         self.means = fixed @ self.weights  # (K, 3)
@@ -108,6 +134,13 @@ class Simulated:
         self.looks = {n: self._look(fixed, noise[:, :n], variances[:, :n]) for n in looks(cell.seeds)}
 
     def _look(self, fixed: np.ndarray, noise: np.ndarray, variances: np.ndarray) -> SimulatedLook:
+        """Return what a look needs at its seeds.
+
+        Args:
+            fixed: the groups' means of the effects of groups, clips and skewed clips (K, 3, G).
+            noise: the groups' means of the noise (K, S, G), of the look's seeds.
+            variances: the variance of each seed's noise over groups (K, S).
+        """
         effects = np.concatenate([fixed, noise.mean(1, keepdims=True)], 1)
         effects -= effects.mean(2, keepdims=True)
         covariances = effects @ effects.transpose(0, 2, 1) / (len(self.weights) - 1)
@@ -116,7 +149,12 @@ class Simulated:
         return SimulatedLook(noise @ self.weights, e, covariances)
 
     def mixed(self, shares: Shares, seeds: int) -> tuple[Error, np.ndarray]:
-        """Error and mean (K,) by the first so many seeds; the mean's variance is 1 with all of them."""
+        """Mix the kinds of effects, and return the estimated error of the mean and the mean (K,).
+
+        Args:
+            shares: the shares of the kinds in the mean's variance, which is 1 with all seeds.
+            seeds: how many seeds, the first ones, are looked at.
+        """
         weights = np.sqrt(np.array(shares) / sum(shares))
         look = self.looks[seeds]
         by_seed = weights[0] * self.seeds[:, :seeds] + weights[4] * look.noise
@@ -127,7 +165,12 @@ class Simulated:
 
 
 def draw(rng: np.random.Generator, cell: GridRow, comparisons: int) -> tuple[np.ndarray, ...]:
-    """Effects of groups, clips and skewed clips as means by group (K, 3, G), noise too (K, S, G); weights."""
+    """Draw the effects that are not the seeds', scaled so that each kind gives the mean a variance of 1.
+
+    Returns:
+        The groups' means of the effects of groups, clips and skewed clips (K, 3, G); the groups' means of the
+        noise (K, S, G); the groups' weights (G,).
+    """
     seeds, clips, _ = cell
     by_clip = np.sqrt(clips) * np.stack(
         [rng.normal(size=(comparisons, clips)), rng.exponential(size=(comparisons, clips)) - 1], 1
@@ -141,8 +184,15 @@ def draw(rng: np.random.Generator, cell: GridRow, comparisons: int) -> tuple[np.
 
 
 class Counts(NamedTuple):
-    """Of true nulls: whether intervals cover (K,), tables have a star (T,), at once or at any look; half the
-    width at Holm's first step less the mean (K,), which is the smallest effect that would have been found."""
+    """What happened in simulated tables whose true differences are all zero.
+
+    Attributes:
+        covered: whether the 95 % interval covers the truth (K,).
+        starred: whether a table has any star (T,), so a false one, with all seeds at once.
+        in_looks: the same where seeds are added in looks (T,).
+        found: the smallest true effect that would have been found (K,): half the interval's width at Holm's
+            first step, less the simulated mean.
+    """
 
     covered: np.ndarray
     starred: np.ndarray
@@ -151,7 +201,10 @@ class Counts(NamedTuple):
 
 
 def count(sample: Simulated, shares: Shares) -> Counts:
-    """Count over one sample. Of true nulls alone, Holm calls one significant where its first step does."""
+    """Count what happens in one sample with effects in these shares.
+
+    All nulls are true, so that Holm has a star in a table exactly where its first step has one.
+    """
     in_looks = np.zeros(len(sample.seeds), bool)
     for seeds, level in spent(sample):
         known, mean = sample.mixed(shares, seeds)
@@ -162,17 +215,21 @@ def count(sample: Simulated, shares: Shares) -> Counts:
 
 
 def spent(sample: Simulated) -> Iterator[tuple[int, float]]:
-    """The seeds of each look, and its level."""
+    """Return the seeds of each look with the level that it may spend."""
     return zip(sample.looks, spending(len(sample.looks)), strict=True)
 
 
 def _any(claims: np.ndarray) -> np.ndarray:
-    """Whether a table has any, (T,)."""
+    """Return, of claims (K,), whether each table has any (T,)."""
     return np.any(claims.reshape(-1, TABLE), axis=1)
 
 
 def summary(counts: Sequence[Counts]) -> dict[str, float]:
-    """Rates, and the power where an oracle, who knows the variances, finds the effect in 80 % of tables."""
+    """Return the rates over all samples, and the power.
+
+    Power is the share of comparisons in which an effect is found that an oracle, who knows the variances,
+    finds in 80 % of tables. `effect_ratio` is the effect found in 80 % of tables, over the oracle's.
+    """
     from scipy.special import ndtri
 
     covered, starred, in_looks, found = map(np.concatenate, zip(*counts, strict=True))
@@ -187,8 +244,14 @@ def summary(counts: Sequence[Counts]) -> dict[str, float]:
 
 
 class Campaign(NamedTuple):
-    """Of tables that spend seeds until all is decided: seeds of each arm (T, ARMS), whether comparisons are
-    decided (T, TABLE), whether with all seeds at once (T, TABLE), and whether a claim is false (T,)."""
+    """What happened in simulated tables that spend seeds until all is decided.
+
+    Attributes:
+        seeds: the seeds that each arm spent (T, ARMS).
+        decided: whether each comparison was decided in looks (T, TABLE).
+        at_once: whether each is decided with all seeds at once (T, TABLE).
+        false: whether a table made any false claim in looks (T,).
+    """
 
     seeds: np.ndarray
     decided: np.ndarray
@@ -197,7 +260,10 @@ class Campaign(NamedTuple):
 
 
 def campaign(sample: Simulated, shares: Shares) -> Campaign:
-    """Whole sequential tables. Half of the arms differ; an arm stops when all its comparisons are decided."""
+    """Simulate tables that spend seeds in looks, where half of the arms differ by EFFECT.
+
+    An arm stops when all of its comparisons are decided.
+    """
     tables = len(sample.seeds) // TABLE
     truth = np.repeat(np.arange(ARMS) % 2 * EFFECT, METRICS)
     differ, same = np.zeros((2, tables, TABLE), bool)
@@ -216,13 +282,20 @@ def campaign(sample: Simulated, shares: Shares) -> Campaign:
 
 
 def _claimed(p: np.ndarray, before: np.ndarray, closed: np.ndarray, level: float) -> np.ndarray:
-    """What a family claims after a look (T, TABLE)."""
+    """Return what a family of claims has claimed after a look (T, TABLE).
+
+    Args:
+        p: p-values at the look (T, TABLE).
+        before: what the family claimed at earlier looks (T, TABLE).
+        closed: what the other family has claimed (T, TABLE).
+        level: what the look may spend.
+    """
     rows = zip(p, before, closed & ~before, strict=True)
     return np.array([sequential(*row) <= level for row in rows])
 
 
 def simulate(cell: GridRow, tables: int, seed: int) -> dict[str, Any]:
-    """All that is reported of a cell."""
+    """Simulate a cell of the grid and return everything that is reported of it."""
     rng = np.random.default_rng([seed, *cell])
     size = max(1, CHUNK // (TABLE * cell.seeds * cell.clips))
     every = choices(cell)
@@ -244,7 +317,7 @@ def simulate(cell: GridRow, tables: int, seed: int) -> dict[str, Any]:
 
 
 def told(campaigns: Sequence[Campaign]) -> dict[str, float]:
-    """Means over tables that spend seeds until all is decided."""
+    """Return means over simulated tables that spend seeds until all is decided."""
     names = ("seeds", "decided", "decided_at_once", "error")
     return {
         name: float(np.concatenate(part).mean())
@@ -253,12 +326,12 @@ def told(campaigns: Sequence[Campaign]) -> dict[str, float]:
 
 
 def extreme(row: dict[str, Any], what: str, pick: Any) -> tuple[float, str]:
-    """The least or largest of a row's rates, and the shares that it is of."""
+    """Return a row's least or largest rate (`pick` is min or max), with the name of its shares."""
     return pick((rates[what], name) for name, rates in row["shares"].items())
 
 
 def broken(row: dict[str, Any], capped: bool) -> list[str]:
-    """The promises that a cell breaks, by more than two standard errors of the simulation."""
+    """List the promises that a cell breaks by more than two standard errors of the simulation."""
     tables = row["tables"]
     limits = [
         ("coverage", min, LEAST, -1, TABLE),
@@ -280,7 +353,7 @@ HEADER = (
 
 
 def columns(row: dict[str, Any]) -> list[str]:
-    """A row of the table."""
+    """Return the words of a row of the printed table."""
     least, most = (100 * extreme(row, "coverage", pick)[0] for pick in (min, max))
     error, worst = extreme(row, "error", max)
     equal, spent = row["shares"]["equal"], row["campaign"]
@@ -298,7 +371,7 @@ def columns(row: dict[str, Any]) -> list[str]:
 
 
 def remarks(rows: Sequence[dict[str, Any]], seed: int) -> list[str]:
-    """What the columns say."""
+    """Return the lines that explain the columns."""
     tables = rows[0]["tables"]
     star, covered = (100 * np.sqrt(LEVEL * (1 - LEVEL) / number) for number in (tables, tables * TABLE))
     return [
@@ -315,7 +388,7 @@ def remarks(rows: Sequence[dict[str, Any]], seed: int) -> list[str]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> Table:
-    """For a terminal."""
+    """Return the rows as a table for the terminal."""
     from rich import box
     from rich.table import Table
 
@@ -328,7 +401,7 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
 
 
 def markdown(rows: Sequence[dict[str, Any]], seed: int) -> str:
-    """For the documentation."""
+    """Return the rows and remarks as Markdown, for docs/statistics.md."""
     lines = [HEADER, ["---" if name == "of" else "---:" for name in HEADER], *map(columns, rows)]
     text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     return "\n".join([text, "", *(f"- {line}" for line in remarks(rows, seed))]) + "\n"
@@ -341,9 +414,10 @@ def markdown(rows: Sequence[dict[str, Any]], seed: int) -> str:
 @click.option("--json", "file", type=click.Path(path_type=Path), help="Write all rates to this file.")
 @click.option("--markdown", "as_markdown", is_flag=True, help="Print the table as Markdown.")
 def calibration(tables: int, quick: bool, seed: int, file: Path | None, as_markdown: bool) -> None:
-    """How often the verdicts' claims are false, over a grid of seeds, clips, groups and shares of variance.
+    """Simulate how often verdicts are wrong.
 
-    Exits with 1 where a cell breaks a promise by more than two standard errors of the simulation.
+    The simulation covers a grid of seeds, clips, groups and shares of variance. Exits with 1 where a cell
+    breaks a promise by more than two standard errors of the simulation.
     """
     from rich.console import Console
 
@@ -370,6 +444,6 @@ def calibration(tables: int, quick: bool, seed: int, file: Path | None, as_markd
 
 
 def grid() -> list[GridRow]:
-    """All cells that have two groups at least."""
+    """Return all cells of the grid that have at least two groups."""
     cells = itertools.starmap(GridRow, itertools.product(SEEDS, CLIPS, SIZES))
     return [cell for cell in cells if cell.groups[-1] > 0]

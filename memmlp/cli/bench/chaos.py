@@ -1,4 +1,7 @@
-"""`memmlp bench chaos`: sweeps whose processes are killed at random end as undisturbed ones do."""
+"""`memmlp bench chaos` and `chaos-tune`: sweeps and searches whose processes are killed at random.
+
+They must end as undisturbed ones do.
+"""
 
 from __future__ import annotations
 
@@ -26,9 +29,9 @@ from memmlp.runs.run import Run
 
 OVERRIDES = ["profile=tiny", "data.synth.minutes=1", "tracking=none", "threads=1"]
 PAUSES = (0.5, 3.0)  # seconds between kills of a sweep's processes
-LONG_PAUSES = (3.0, 9.0)  # of a search's: one controller, which has to come to its feet in between
+LONG_PAUSES = (3.0, 9.0)  # of a search's, whose one controller has to start again in between
 
-ENDS = ("complete", "pruned")  # of trials whose runs can't fail
+ENDS = ("complete", "pruned")  # how a trial may end whose runs can't fail
 
 Launch = Callable[[], subprocess.Popen[bytes]]
 
@@ -40,9 +43,10 @@ Launch = Callable[[], subprocess.Popen[bytes]]
 @click.option("--seed", default=0, show_default=True, help="Of the killer.")
 @click.argument("overrides", nargs=-1)
 def chaos(runs: int, kills: int, controllers: int, seed: int, overrides: tuple[str, ...]) -> None:
-    """A sweep by several controllers under random SIGKILLs, beside an undisturbed one.
+    """Run a sweep under random SIGKILLs.
 
-    Every run must be finished exactly once, with bit-identical weights. Exits with 1 where one isn't.
+    Several controllers work on it, beside an undisturbed sweep. Every run must be finished exactly once, with
+    bit-identical weights. Exits with 1 where one isn't.
     """
     with tempfile.TemporaryDirectory() as folder:
         sweep = Path(folder) / "chaos.yaml"
@@ -67,9 +71,10 @@ def chaos(runs: int, kills: int, controllers: int, seed: int, overrides: tuple[s
 @click.option("--seed", default=0, show_default=True, help="Of the killer.")
 @click.argument("overrides", nargs=-1)
 def chaos_tune(trials: int, kills: int, seed: int, overrides: tuple[str, ...]) -> None:
-    """A search whose controller and workers are killed at random.
+    """Run a search under random SIGKILLs.
 
-    It must end with exactly the trials it should have, none repeated, none lost. Exits with 1 otherwise.
+    Its controller and workers are killed. It must end with exactly the trials it should have, none repeated,
+    none lost. Exits with 1 otherwise.
     """
     with tempfile.TemporaryDirectory() as folder:
         outputs = Path(folder) / "outputs"
@@ -83,7 +88,7 @@ def chaos_tune(trials: int, kills: int, seed: int, overrides: tuple[str, ...]) -
 
 
 def judge(problems: Sequence[str], what: str) -> None:
-    """Say what is wrong; exits with 1 where something is."""
+    """Print the problems and a verdict; exit with 1 where there is a problem."""
     for problem in problems:
         click.echo(problem)
     click.echo(f"{'' if not problems else 'NOT '}{what}: {len(problems)} differences")
@@ -92,7 +97,7 @@ def judge(problems: Sequence[str], what: str) -> None:
 
 
 def start(words: Sequence[str], outputs: Path, workers: int) -> subprocess.Popen[bytes]:
-    """A `memmlp` process that works on a sweep or search."""
+    """Start a `memmlp` process that works on a sweep or search."""
     line = [sys.executable, "-c", "from memmlp.cli.main import main; main()", *words]
     line += ["--workers", str(workers), "--outputs", str(outputs)]
     return subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -101,7 +106,13 @@ def start(words: Sequence[str], outputs: Path, workers: int) -> subprocess.Popen
 def storm(
     launches: Sequence[Launch], outputs: Path, kills: int, pauses: tuple[float, float], dice: random.Random
 ) -> int:
-    """Keep the processes at their work to its end, killing on the way; how many kills there were."""
+    """Keep the processes at work until all have ended well, and kill at random on the way.
+
+    A process that was killed, or that ended before all kills were made, is started again.
+
+    Returns:
+        The number of kills.
+    """
     processes = [launch() for launch in launches]
     killed = 0
     while killed < kills or any(process.poll() != 0 for process in processes):
@@ -117,7 +128,7 @@ def storm(
 
 
 def choose(processes: Sequence[subprocess.Popen[bytes]], outputs: Path, dice: random.Random) -> int | None:
-    """The process number of a controller or of a worker that holds a run."""
+    """Choose a process to kill: a controller, or a worker that holds a run. None where there is none."""
     victims = [process.pid for process in processes if process.poll() is None]
     for holder in outputs.glob("runs/*/.holder"):
         try:
@@ -137,7 +148,7 @@ def _exists(pid: int) -> bool:
 
 
 def compare(calm: Path, stormy: Path) -> list[str]:
-    """What is not as it should be in the disturbed sweep's outputs."""
+    """List what is not as it should be in the disturbed sweep's outputs."""
     expected, found = ({run.id: run for run in list_runs(outputs)} for outputs in (calm, stormy))
     problems = [f"run {name} is missing" for name in expected.keys() - found.keys()]
     problems += [f"run {name} should not be" for name in found.keys() - expected.keys()]
@@ -150,7 +161,7 @@ def compare(calm: Path, stormy: Path) -> list[str]:
 
 
 def check(folder: Path) -> list[str]:
-    """What is wrong with a run that should have been finished exactly once."""
+    """List what is wrong with a run that should have been finished exactly once."""
     run = Run(folder)
     if run.status != "done":
         return [f"{run.status}, not done"]
@@ -165,7 +176,7 @@ def check(folder: Path) -> list[str]:
 
 
 def examine(outputs: Path, trials: int) -> list[str]:
-    """What is not as it should be with a search's trials and runs."""
+    """List what is not as it should be with a search's trials and runs."""
     (folder,) = (outputs / "tune").iterdir()
     with open(folder / "trials.csv", encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -182,7 +193,7 @@ def examine(outputs: Path, trials: int) -> list[str]:
 
 
 def _examine(row: dict[str, str], runs: Mapping[str, Run]) -> list[str]:
-    """What is wrong with a complete trial."""
+    """List what is wrong with a complete trial."""
     names = row["run"].split()
     if missing := [name for name in names if name not in runs]:
         return [f"trial {row['trial']}: its run {name} is missing" for name in missing]

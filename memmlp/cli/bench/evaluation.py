@@ -1,4 +1,4 @@
-"""`memmlp bench prepare` and `memmlp bench stream`: the speed of data and of evaluation."""
+"""`memmlp bench prepare` and `memmlp bench stream`: the speed of preparing data and of evaluating."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ import click
 @click.command("prepare")
 @click.option("--minutes", default=60.0, show_default=True, help="Length of the synthetic motion.")
 def prepare(minutes: float) -> None:
-    """Prepare synthetic AMASS-format motion: seconds, frames a second, and peak memory."""
+    """Time the preparation of synthetic motion.
+
+    Printed are seconds, frames a second, and peak memory.
+    """
     import resource
     import tempfile
     import time
@@ -40,8 +43,9 @@ def prepare(minutes: float) -> None:
 @click.option("--device", default="cpu", show_default=True, type=click.Choice(["cpu", "cuda"]))
 @click.argument("overrides", nargs=-1)
 def stream(clips: int, frames: int, rounds: int, device: str, overrides: tuple[str, ...]) -> None:
-    """Stream evaluation side by side against clip by clip: milliseconds a frame of motion, and the ratio.
+    """Time stream evaluation.
 
+    Clips side by side are timed against clip by clip: milliseconds a frame of motion, and the ratio.
     OVERRIDES are those of `memmlp train`; the default is profile=paper. Weights are random.
     """
     import time

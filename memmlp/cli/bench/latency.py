@@ -1,4 +1,4 @@
-"""`memmlp bench latency`: one step of each network, as it was trained, as a stream, in int8; side by side."""
+"""`memmlp bench latency`: a step of each network as it was trained, as its streaming graph, and in int8."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 BASE = ("avatar_poser", "naive")
-"""What the others are compared with: AvatarPoser as published."""
+"""The network and graph that the others are compared with: AvatarPoser as published."""
 
 MODELS: dict[str, tuple[str, ...]] = {
     "avatar_poser": ("model=avatar_poser",),
@@ -35,10 +35,11 @@ VARIANTS = ("naive", "streaming", "int8")
 def latency(
     rounds: int, steps: int, models: str, file: Path | None, profile: str | None, overrides: tuple[str, ...]
 ) -> None:
-    """Milliseconds a step of every network in ONNX Runtime, in turn in one process, on one thread.
+    """Time a step of every network.
 
-    OVERRIDES are those of `memmlp train`; the default is profile=paper. Weights are random: they do not
-    matter for the time. The ratio is to AvatarPoser as published, of each round's medians.
+    All run in ONNX Runtime, in turn in one process, on one thread. OVERRIDES are those of `memmlp train`; the
+    default is profile=paper. Weights are random: they do not matter for the time. The ratio is to AvatarPoser
+    as published, of each round's medians.
     """
     import tempfile
 
@@ -70,7 +71,7 @@ def latency(
 def exported(
     models: list[str], overrides: tuple[str, ...], folder: Path
 ) -> Iterator[tuple[tuple[str, str], Path]]:
-    """The ONNX files of models in all variants, with a bar."""
+    """Export each model in all variants, with a progress bar, and yield (model, variant) with the file."""
     from memmlp.common.progress import track
     from memmlp.config.build import untrained
     from memmlp.deploy.export import export
@@ -90,7 +91,7 @@ def exported(
 
 
 def calibration() -> list[Any]:
-    """A short clip of motion."""
+    """Return one short clip (60, 252) of random frames to calibrate int8 with."""
     import torch
 
     from memmlp.motion.body import FRAME_DIM
@@ -99,7 +100,10 @@ def calibration() -> list[Any]:
 
 
 def timed(paths: dict[tuple[str, str], Path], rounds: int, steps: int) -> list[dict[str, Any]]:
-    """A row of each file: median and p95 milliseconds, the ratio to AvatarPoser and its spread."""
+    """Time all files in turn, and return a row for each.
+
+    A row has the median and 95th percentile in milliseconds, the ratio to AvatarPoser and its spread.
+    """
     import numpy as np
 
     from memmlp.deploy.latency import interleaved
@@ -112,7 +116,14 @@ def timed(paths: dict[tuple[str, str], Path], rounds: int, steps: int) -> list[d
 
 
 def row(model: str, variant: str, seconds: np.ndarray, ratios: np.ndarray) -> dict[str, Any]:
-    """Of the seconds (rounds, steps) and the ratios (rounds,)."""
+    """Make a file's row.
+
+    Args:
+        model: the model's name.
+        variant: "naive", "streaming" or "int8".
+        seconds: the time of each step (rounds, steps).
+        ratios: each round's median over the median of `BASE` in that round (rounds,).
+    """
     import numpy as np
 
     return {
@@ -150,7 +161,7 @@ def show(rows: list[dict[str, Any]], rounds: int) -> None:
 
 
 def show_profile(path: Path) -> None:
-    """Print where a step's time goes, by kind of operation and shape."""
+    """Print where a step's time goes, by the kind of operation and its shape."""
     from rich.console import Console
     from rich.table import Table
 

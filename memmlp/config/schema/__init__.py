@@ -1,6 +1,7 @@
-"""Every key of the config: its type here, its values and their sources in conf/, its limits in `check`.
+"""The schema of the config: the type of every key is declared here.
 
-A dataclass is a group's option; ConfigStore holds it as schema/<group>_<option>, and the YAML file of the
+The values and where they come from stand in conf/, the limits are enforced by `check`. Each dataclass is one
+option of a config group. Hydra's ConfigStore holds it as schema/<group>_<option>, and the YAML file of the
 same name starts from it, so that unknown keys and wrong types are refused when the config is composed.
 """
 

@@ -1,4 +1,4 @@
-"""What is refused before anything runs, each in a line that names the key."""
+"""Checks of a composed config before anything runs; each complaint is one line that names the key."""
 
 from __future__ import annotations
 
@@ -23,7 +23,12 @@ from memmlp.config.schema.training import (
 
 
 def check(cfg: DictConfig) -> None:
-    """Refuse, naming the key, a missing value, one out of range, and an impossible combination."""
+    """Check a composed config.
+
+    Raises:
+        InputError: naming the key, for a missing or unknown key, a value that its rule refuses, or values
+            that don't go together.
+    """
     if OmegaConf.get_type(cfg) is not Config:
         raise InputError(
             "the config does not start from the schema; its defaults list needs /schema/config@_here_"
@@ -35,7 +40,11 @@ def check(cfg: DictConfig) -> None:
 
 
 def _values(node: DictConfig, prefix: str) -> Iterator[tuple[str, Any, Any]]:
-    """Dotted key, value and rule of every key of a typed node; a key that is not in the schema is refused."""
+    """Yield the dotted name, value and rule of every key below a typed node.
+
+    Raises:
+        InputError: for a key that is not in the schema.
+    """
     schema: Any = OmegaConf.get_type(node)
     known = [spec.name for spec in dataclasses.fields(schema)]
     for extra in sorted(set(map(str, node)) - set(known)):
@@ -50,16 +59,17 @@ def _values(node: DictConfig, prefix: str) -> Iterator[tuple[str, Any, Any]]:
 
 
 def unknown_key(name: str, keys: Sequence[str]) -> str:
-    """The line about a dotted key that is not among a node's."""
+    """Return the error line for a dotted key that is not among the keys of its group."""
     own = re.split(r"[./@]", name)[-1]
     near = difflib.get_close_matches(own, keys, n=1)
     hint = f"did you mean {near[0]}? " if near else ""
-    fixed = ("name",) if "_target_" in keys else ()  # what an option of a slot is, and is called
+    fixed = ("name",) if "_target_" in keys else ()  # tells which option of a slot it is
     listed = ", ".join(word for word in keys if not word.startswith("_") and word not in fixed) or "none"
     return f"{name}: no such key; {hint}allowed here: {listed}"
 
 
 def _value(node: DictConfig, own: str, name: str) -> Any:
+    """Return a key's value. Raises InputError where it is missing or can't be resolved."""
     if OmegaConf.is_missing(node, own):
         raise InputError(f"{name}: has no value; give one with {name}=...")
     try:
@@ -70,7 +80,7 @@ def _value(node: DictConfig, own: str, name: str) -> Any:
 
 
 def _show(value: Any) -> str:
-    """A value as it would be typed."""
+    """Return a value as a person would type it."""
     return str(list(value)) if OmegaConf.is_list(value) else str(value)
 
 
@@ -78,7 +88,7 @@ SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "tracking")
 
 
 def _check_names(cfg: DictConfig) -> None:
-    """A component that is not of this package has a name that is not of this package's."""
+    """Refuse a component from outside this package that uses the name of one of this package's options."""
     for slot in SLOTS:
         node = cfg[slot]
         path = node.get("_target_") if node is not None else None
@@ -87,7 +97,7 @@ def _check_names(cfg: DictConfig) -> None:
 
 
 def _check_combinations(cfg: DictConfig) -> None:
-    """What no key alone can tell."""
+    """Check what no key alone can tell: whether the values go together."""
     _check_names(cfg)
     if cfg.optim.final_lr > cfg.optim.lr:
         raise InputError(f"optim.final_lr={cfg.optim.final_lr}: allowed is at most optim.lr={cfg.optim.lr}")
@@ -105,13 +115,16 @@ def _check_combinations(cfg: DictConfig) -> None:
 
 
 def _is(node: DictConfig, schema: type) -> bool:
-    """Whether a group's option is of a schema."""
+    """Return whether a group's option is of this schema."""
     kind = OmegaConf.get_type(node)
     return kind is not None and issubclass(kind, schema)
 
 
 def _check_reference(cfg: DictConfig) -> None:
-    """A network without slots, a history of its own or positions has nothing set that is about them."""
+    """Check the config of a baseline, which has no slots, no history of its own and no positions.
+
+    Nothing may be set that concerns these, and its sizes must fit each other.
+    """
     name = cfg.model._target_.rsplit(".", 1)[-1]
     for group in ("memory", "predictor", "hand"):
         if cfg[group] is not None:
@@ -137,7 +150,10 @@ def _check_reference(cfg: DictConfig) -> None:
 
 
 def _check_foreign_loss(cfg: DictConfig, predictor: str) -> None:
-    """AGRoL's loss is of rotations alone, and so may be that of a network that makes nothing else."""
+    """Refuse the loss of a baseline for Mem-MLP, with one exception.
+
+    AGRoL's loss scores rotations alone, so a Mem-MLP that predicts nothing else may be trained with it.
+    """
     if not _is(cfg.loss, AGRoLLossConfig):
         raise InputError("loss: that of a baseline; allowed is loss=uncertainty or loss=manual")
     if not predictor.startswith("RotationOnly") or not _is(cfg.hand, NoHandConfig):
@@ -148,7 +164,7 @@ def _check_foreign_loss(cfg: DictConfig, predictor: str) -> None:
 
 
 def _check_slots(cfg: DictConfig) -> None:
-    """What stands in Mem-MLP's slots goes together."""
+    """Check that the options in Mem-MLP's slots go together."""
     layers = list(cfg.memory.get("layers", []))
     if layers and max(layers) > cfg.model.depth:
         raise InputError(f"memory.layers={layers}: allowed is up to model.depth={cfg.model.depth}")

@@ -1,4 +1,4 @@
-"""The whole config, and the schemas of all options by name."""
+"""The schema of the whole config, and the schemas of all options by name."""
 
 from __future__ import annotations
 
@@ -73,12 +73,17 @@ from memmlp.config.schema.training import (
 
 @dataclass
 class PathsConfig:
+    """Where runs, caches and sweeps are kept."""
+
     outputs: str = key(Text())
 
 
 @dataclass
 class ProfileConfig:
-    """The sizes that a scale of work needs; the groups read them, and any can be set in its group instead."""
+    """The sizes that fit a scale of work (tests, a CPU, a GPU).
+
+    The other groups read their defaults from here; any of them can be overridden in its own group.
+    """
 
     frames: int = at_least(2)
     width: int = at_least(1)
@@ -113,6 +118,8 @@ class ProfileConfig:
 
 @dataclass
 class EvaluationConfig:
+    """How a trained network is evaluated (conf/evaluation)."""
+
     modes: list[str] = key(EachOf(OneOf(("window", "stream"))))
     batch: int = at_least(1)
     ik: str = one_of("off", "lbfgs")
@@ -121,6 +128,8 @@ class EvaluationConfig:
 
 @dataclass
 class ExportConfig:
+    """How a trained network is shipped and timed (conf/export)."""
+
     latency_steps: int = at_least(1)
     graph: str = one_of("auto", "streaming", "naive")
     precision: str = one_of("fp32", "int8")
@@ -128,6 +137,8 @@ class ExportConfig:
 
 @dataclass
 class TrackingConfig:
+    """Where runs are shown beside their folders (conf/tracking)."""
+
     name: str = key(Text())
     _target_: str = MISSING
 
@@ -147,7 +158,7 @@ class NoTrackingConfig(TrackingConfig):
 
 @dataclass
 class Config:
-    """The whole config."""
+    """The whole config of `memmlp train`."""
 
     seed: int = key(Within(0, 2**63 - 1))
     device: str = one_of("auto", "cpu", "cuda")
@@ -232,13 +243,15 @@ DATA = {"seeded": SeededDataConfig, "lists": ListDataConfig, "subsets": SubsetDa
 
 
 RENAMED = {"tracker": "tracking"}
-"""Groups that runs of version 0.1 know by other names."""
+"""The names of today for groups that runs of version 0.1 recorded under other names."""
 
 
 def restored(config: Mapping[str, Any]) -> DictConfig:
-    """The typed config of a run's record, its classes found where this version has them.
+    """Turn the config that a run recorded back into a typed one, with the classes of this version.
 
-    Raises OmegaConf's errors, or KeyError, where it is none of this version's.
+    Raises:
+        OmegaConfBaseException, KeyError: where the record does not fit this version's schema. (A value of the
+            wrong kind may also raise TypeError or ValueError.)
     """
     cfg = OmegaConf.structured(Config)
     for group, content in ((RENAMED.get(name, name), content) for name, content in config.items()):
@@ -247,7 +260,10 @@ def restored(config: Mapping[str, Any]) -> DictConfig:
 
 
 def _restored(group: str, content: Mapping[str, Any]) -> Any:
-    """A typed group. A component that is not of this package keeps the path of its class."""
+    """Return one group as a typed config.
+
+    A component that is not part of this package keeps the path of its class.
+    """
     if group == "data":
         schema = SynthDataConfig if content["synth"] else DATA[content["split"]["name"]]
         return OmegaConf.merge(OmegaConf.structured(schema), _bare(content))
@@ -257,13 +273,13 @@ def _restored(group: str, content: Mapping[str, Any]) -> Any:
 
 
 def _bare(content: Mapping[str, Any]) -> dict[str, Any]:
-    """A group without the paths of its classes: those are the schema's."""
+    """Return a group without the paths of its classes, which the schema provides."""
     bare = {key: _bare(value) if isinstance(value, Mapping) else value for key, value in content.items()}
     return {key: value for key, value in bare.items() if key != "_target_"}
 
 
 @functools.cache
 def register() -> None:
-    """Make the schemas known to Hydra."""
+    """Make the schemas known to Hydra; later calls do nothing."""
     for name, node in SCHEMAS.items():
         ConfigStore.instance().store(group="schema", name=name, node=node, provider="memmlp")

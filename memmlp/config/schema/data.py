@@ -62,6 +62,8 @@ class SynthConfig:
 
 @dataclass
 class DataConfig:
+    """What all options of conf/data have in common; each adds where the motion is and how it is split."""
+
     name: str = key(Text())
     body: str = key(Existing("file", ("builtin",)))
     min_frames: int = at_least(2)

@@ -1,4 +1,4 @@
-"""The schemas of what makes a network: conf/frame, model, predictor, memory and vqvae."""
+"""The schemas of what makes a network: conf/frame, conf/model, conf/predictor, conf/memory, conf/vqvae."""
 
 from __future__ import annotations
 
@@ -27,12 +27,16 @@ from memmlp.config.schema.rules import (
 
 @dataclass
 class FrameConfig:
+    """The space in which the network sees the motion (conf/frame)."""
+
     coordinates: str = one_of("heading", "head_relative", "world")
     normalize: bool = key()
 
 
 @dataclass
 class ModelConfig:
+    """Mem-MLP's backbone (conf/model)."""
+
     name: str = called("mem_mlp")
     frames: int = at_least(2)
     width: int = at_least(1)
@@ -41,7 +45,7 @@ class ModelConfig:
 
 @dataclass
 class BaselineConfig(ModelConfig):
-    """A network without slots: it leaves memory, predictor and hand empty."""
+    """A baseline network, which has no slots: memory, predictor and hand are null with it."""
 
     name: str = key(Text())
     _target_: str = MISSING
@@ -75,6 +79,8 @@ class AvatarPoserConfig(BaselineConfig):
 
 @dataclass
 class PredictorConfig:
+    """The predictor slot (conf/predictor)."""
+
     name: str = key(Text())
     _target_: str = MISSING
     _partial_: bool = True
@@ -109,6 +115,8 @@ class RotationOnlyMemoryConfig(PredictorConfig):
 
 @dataclass
 class MemoryConfig:
+    """The memory slot (conf/memory)."""
+
     name: str = key(Text())
     _target_: str = MISSING
     _partial_: bool = True
@@ -146,6 +154,8 @@ class JointCodeMemoryConfig(NoCodesMemoryConfig):
 
 @dataclass
 class RecurrentMemoryConfig(MemoryConfig):
+    """What the recurrent memories, LSTM and GRU, have in common."""
+
     layers: list[int] = key(EachOf(Within(1)))
     width: int = at_least(1)
     fusion: str = one_of("residual", "plain")
@@ -165,6 +175,8 @@ class GRUMemoryConfig(RecurrentMemoryConfig):
 
 @dataclass
 class VQVAEConfig:
+    """The VQ-VAE and how it is trained (conf/vqvae); exactly one of `epochs` and `steps` is set."""
+
     codes: int = at_least(1)
     width: int = at_least(1)
     encoder_depth: int = at_least(0)

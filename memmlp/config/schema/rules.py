@@ -1,4 +1,4 @@
-"""What a key of the config may hold, and the helpers that declare it."""
+"""The rules for what a key of the config may hold, and the helpers that declare a key with its rule."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from omegaconf import MISSING
 
 @dataclass(frozen=True)
 class OneOf:
-    """One of some words."""
+    """The rule that a value is one of a few words."""
 
     words: tuple[str, ...]
 
     def allows(self, value: Any) -> bool:
-        """Whether the value is among them."""
+        """Return whether the value is one of the words."""
         return value in self.words
 
     def __str__(self) -> str:
@@ -26,7 +26,10 @@ class OneOf:
 
 @dataclass(frozen=True)
 class Within:
-    """A finite number from `low` (`above` it, if `strict`) to `high`, or one of some words."""
+    """The rule that a value is a finite number within limits, or one of a few words.
+
+    The limits are `low` and `high`, inclusive unless `strict`.
+    """
 
     low: float
     high: float = math.inf
@@ -34,7 +37,7 @@ class Within:
     words: tuple[str, ...] = ()
 
     def allows(self, value: Any) -> bool:
-        """Whether the value is in the range or a word."""
+        """Return whether the value is a number within the limits or one of the words."""
         if not isinstance(value, int | float) or isinstance(value, bool):
             return value in self.words
         inside = self.low < value < self.high if self.strict else self.low <= value <= self.high
@@ -48,13 +51,16 @@ class Within:
 
 @dataclass(frozen=True)
 class EachOf:
-    """A list, not empty unless `empty`, without repetitions, of values that a rule allows."""
+    """The rule that a value is a list without repetitions whose items all obey another rule.
+
+    An empty list is allowed only with `empty`.
+    """
 
     rule: OneOf | Within | None = None
     empty: bool = False
 
     def allows(self, value: Any) -> bool:
-        """Whether all items are allowed and there is one of each."""
+        """Return whether every item is allowed and none occurs twice."""
         items = list(value)
         if not all(isinstance(item, int | float | str) for item in items):
             return False
@@ -68,10 +74,10 @@ class EachOf:
 
 @dataclass(frozen=True)
 class Text:
-    """A word that is not empty."""
+    """The rule that a value is text that is not empty."""
 
     def allows(self, value: Any) -> bool:
-        """Whether there is more than space."""
+        """Return whether the text has more than white space."""
         return bool(value.strip())
 
     def __str__(self) -> str:
@@ -80,13 +86,16 @@ class Text:
 
 @dataclass(frozen=True)
 class Existing:
-    """A file or folder that exists, or one of some words."""
+    """The rule that a value is the path of an existing file or folder, or one of a few words.
+
+    `kind` is "file" or "folder".
+    """
 
     kind: str
     words: tuple[str, ...] = ()
 
     def allows(self, value: Any) -> bool:
-        """Whether it is there."""
+        """Return whether the file or folder exists, or the value is one of the words."""
         path = Path(value)
         return value in self.words or (path.is_dir() if self.kind == "folder" else path.is_file())
 
@@ -95,35 +104,35 @@ class Existing:
 
 
 def key(rule: object = None) -> Any:
-    """A key whose value the YAML file gives."""
+    """Declare a key whose value comes from the YAML file."""
     return field(default=MISSING, metadata={"rule": rule})
 
 
 def target(path: str) -> Any:
-    """The class that a slot's option stands for; fixed."""
+    """Declare the class that an option of a slot stands for, which nobody can change."""
     return field(default=path, metadata={"rule": OneOf((path,))})
 
 
 def called(name: str) -> Any:
-    """The name of a slot's option, by which a run's identity knows it; fixed."""
+    """Declare the name of a slot's option, which nobody can change. It enters the identity of a run."""
     return field(default=name, metadata={"rule": OneOf((name,))})
 
 
 def one_of(*words: str) -> Any:
-    """A key with these words."""
+    """Declare a key that holds one of these words."""
     return key(OneOf(words))
 
 
 def at_least(low: float) -> Any:
-    """A number with a lower limit."""
+    """Declare a number with a lower limit (inclusive)."""
     return key(Within(low))
 
 
 def fraction() -> Any:
-    """A number in [0, 1]."""
+    """Declare a number in [0, 1]."""
     return key(Within(0, 1))
 
 
 def positive() -> Any:
-    """A number above 0."""
+    """Declare a number above 0."""
     return key(Within(0, strict=True))

@@ -1,4 +1,4 @@
-"""The schemas of how it is trained: conf/rollout, loss, hand and optim."""
+"""The schemas of how a network is trained: conf/rollout, conf/loss, conf/hand and conf/optim."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from memmlp.config.schema.rules import Text, Within, at_least, called, key, one_
 
 @dataclass
 class RolloutConfig:
+    """The rollout slot: which history a training step sees (conf/rollout)."""
+
     name: str = key(Text())
     _target_: str = MISSING
 
@@ -40,6 +42,8 @@ class StreamsConfig(RolloutConfig):
 
 @dataclass
 class LossConfig:
+    """The loss (conf/loss)."""
+
     name: str = key(Text())
     _target_: str = MISSING
 
@@ -64,7 +68,7 @@ class ManualConfig(LossConfig):
 
 @dataclass
 class BaselineLossConfig(LossConfig):
-    """A whole loss, where the others are weights of Mem-MLP's terms."""
+    """The loss of a baseline: a complete loss, whereas the other options only weight Mem-MLP's loss terms."""
 
 
 @dataclass
@@ -86,6 +90,8 @@ class AvatarPoserLossConfig(BaselineLossConfig):
 
 @dataclass
 class HandConfig:
+    """The hand term of Mem-MLP's loss (conf/hand)."""
+
     name: str = key(Text())
     _target_: str = MISSING
 
@@ -110,6 +116,8 @@ class NoHandConfig(HandConfig):
 
 @dataclass
 class OptimConfig:
+    """How the network is trained (conf/optim)."""
+
     steps: int = at_least(1)
     batch: int = at_least(1)
     lr: float = positive()

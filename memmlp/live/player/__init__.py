@@ -1,1 +1,1 @@
-"""`memmlp live`: a network on a clip or on live trackers, watched on a local page."""
+"""`memmlp live`: a network fed by a clip or by live trackers, watched on a local page."""

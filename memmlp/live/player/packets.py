@@ -5,8 +5,10 @@ A pose is seven numbers, `x y z qx qy qz qw`: metres and a unit quaternion. In J
     {"time": 12.25, "seq": 735, "head": [x, y, z, qx, qy, qz, qw], "left": null, "right": [...]}
 
 In OSC a bundle has the messages `/memmlp/head`, `/memmlp/left`, `/memmlp/right` (seven floats each),
-`/memmlp/time` (a double or float) and `/memmlp/seq` (an integer). A tracker that is null or missing is lost;
-without a time the time of arrival counts; seq, the number of the sample, only serves to count lost packets.
+`/memmlp/time` (a double or float) and `/memmlp/seq` (an integer).
+
+A tracker that is null or missing is lost. Without a time the time of arrival counts. The sample's number,
+seq, only serves to count lost packets.
 """
 
 from __future__ import annotations
@@ -22,9 +24,9 @@ import numpy as np
 from memmlp.common.errors import InputError
 
 TRACKERS = ("head", "left", "right")
-POSE = 7  # numbers
+POSE = 7  # numbers of a pose
 PREFIX = "/memmlp/"
-FARTHEST = 1e6  # of any number in a pose
+FARTHEST = 1e6  # the largest absolute value of a number in a pose
 
 Tracker = tuple[np.ndarray, np.ndarray] | None
 Trackers = tuple[Tracker, Tracker, Tracker]
@@ -34,9 +36,10 @@ class Packet(NamedTuple):
     """One sample of the trackers.
 
     Attributes:
-        trackers: head, left and right: position (3,), metres, and quaternion xyzw (4,); None if lost.
+        trackers: head, left and right, each a position (3,), metres, and a quaternion xyzw (4,); None if
+            lost.
         time: seconds of the sender's clock; None where it sent none.
-        seq: the sample's number; None where it sent none.
+        seq: the sample's number; None where the sender gave none.
     """
 
     trackers: Trackers
@@ -48,7 +51,7 @@ Parse = Callable[[bytes], Packet]
 
 
 def from_json(datagram: bytes) -> Packet:
-    """The packet of a JSON datagram. Raises ValueError for anything else."""
+    """Read the packet of a JSON datagram. Raises ValueError for anything else."""
     try:
         fields = json.loads(datagram)
     except RecursionError:
@@ -59,12 +62,12 @@ def from_json(datagram: bytes) -> Packet:
 
 
 def to_json(packet: Packet) -> bytes:
-    """The JSON datagram of a packet."""
+    """Return the JSON datagram of a packet."""
     return json.dumps(_fields(packet)).encode()
 
 
 def from_osc(datagram: bytes) -> Packet:
-    """The packet of an OSC bundle. Raises ValueError for anything else."""
+    """Read the packet of an OSC bundle. Raises ValueError for anything else."""
     from pythonosc.osc_bundle import OscBundle
     from pythonosc.osc_message import OscMessage
 
@@ -81,7 +84,7 @@ def from_osc(datagram: bytes) -> Packet:
 
 
 def to_osc(packet: Packet) -> bytes:
-    """The OSC bundle of a packet."""
+    """Return the OSC bundle of a packet."""
     from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
     from pythonosc.osc_message_builder import OscMessageBuilder
 
@@ -97,7 +100,7 @@ def to_osc(packet: Packet) -> bytes:
 
 
 def packet(fields: Mapping[str, Any]) -> Packet:
-    """The packet of named values. Raises ValueError for what is none."""
+    """Return the packet of named values. Raises ValueError where they make none."""
     if not any(name in fields for name in TRACKERS):
         raise ValueError(f"none of {', '.join(TRACKERS)}")
     time, seq = fields.get("time"), fields.get("seq")
@@ -120,6 +123,7 @@ def needs_osc() -> None:
 
 
 def _tracker(name: str, values: Any) -> Tracker:
+    """Return a tracker from its seven numbers. Raises ValueError where they are no pose."""
     if values is None:
         return None
     if not isinstance(values, list) or len(values) != POSE or not all(map(_number, values)):

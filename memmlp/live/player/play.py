@@ -1,4 +1,4 @@
-"""The loop of `memmlp live`: samples from a source through the stream to whoever watches."""
+"""The loop of `memmlp live`: samples go from a source through the stream to all who watch."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from memmlp.live.stream import Stream
 from memmlp.motion.body import FPS, JOINTS
 from memmlp.render.mannequin import HEAT, LIMBS
 
-SHOWN = SPACES["openxr"]  # three.js has the same axes
+SHOWN = SPACES["openxr"]  # the page's axes: those of three.js
 TOP = 20  # cm at the top of the page's colour scale
 
 Publish = Callable[[dict[str, Any]], None]
 
 
 def greeting(source: PoseSource, network: str) -> dict[str, Any]:
-    """What the page must know before the first frame."""
+    """Return what the page must know before the first frame."""
     limbs = [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS]
     words = {"network": network, "source": source.name, "fps": FPS, "joints": JOINTS}
     return words | {"limbs": limbs, "heat": HEAT, "top": TOP}
 
 
 def play(stream: Stream, source: PoseSource, publish: Publish, stopped: threading.Event) -> None:
-    """Bring each sample through the stream and publish the frames, until it is stopped.
+    """Feed each sample to the stream and publish the frames, until `stopped` is set.
 
-    A message has the frame's number and time (s), the step's time (ms), what was dropped and malformed so
-    far, the trackers that are held, and joints (66 whole millimetres, axes of openxr) predicted and true.
-    Malformed packets are told of at once, by a message of the counts alone.
+    A message has the frame's number and time (s), the step's time (ms), how many samples were dropped or
+    malformed so far, the trackers that are held, and the joints, predicted and true (66 whole millimetres,
+    axes of openxr). Malformed packets are reported at once, by a message that has the counts alone.
     """
     space, number, dropped, refused = SPACES[source.space], 0, 0, 0
     counts = {"dropped": 0, "malformed": 0}
@@ -64,7 +64,7 @@ def play(stream: Stream, source: PoseSource, publish: Publish, stopped: threadin
 
 
 def millimetres(space: Space, joints: np.ndarray | None) -> list[int] | None:
-    """Joints (22, 3) of a space, in metres, as whole millimetres in the page's axes, one after the other."""
+    """Return joints (22, 3) of a space, in metres, as a flat list of whole millimetres in the page's axes."""
     if joints is None:
         return None
     shown = SHOWN.positions_out(space.positions_in(np.asarray(joints, np.float64)))

@@ -1,6 +1,6 @@
-"""The page's server: its files, and the frames as server-sent events. Nothing but the standard library.
+"""The server of the page: its files, and the frames as server-sent events, by the standard library alone.
 
-It listens on 127.0.0.1 alone. Watchers come and go; one that is slow misses frames, and holds up nobody.
+It listens on 127.0.0.1 only. Watchers come and go; a slow one misses frames, and holds up nobody.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import Any
 
 from memmlp.live.player.sources import HOST, bound
 
-QUEUED = 240  # frames that wait for a watcher; then its oldest ones are dropped
-QUIET = 2.0  # seconds without a frame after which a line of comment shows that the line still stands
+QUEUED = 240  # the most frames that wait for a watcher; beyond, its oldest are dropped
+QUIET = 2.0  # seconds without a frame after which a comment shows that the connection lives
 FILES = {
     "": ("index.html", "text/html; charset=utf-8"),
     **{name: (name, "text/javascript; charset=utf-8") for name in ("main.js", "stage.js", "history.js")},
@@ -31,7 +31,7 @@ FILES = {
 
 
 class Hub:
-    """Frames to all watchers.
+    """Hands frames to all watchers.
 
     Args:
         greeting: what each watcher gets first.
@@ -52,7 +52,7 @@ class Hub:
 
     @contextlib.contextmanager
     def watch(self) -> Iterator[queue.Queue[bytes | None]]:
-        """A watcher's queue of events, for as long as it watches; None is the end."""
+        """Give a watcher a queue of events for as long as it watches; None in it is the end."""
         watcher: queue.Queue[bytes | None] = queue.Queue(QUEUED)
         watcher.put(self.greeting)
         with self.lock:
@@ -74,7 +74,7 @@ class Hub:
 
 
 def _put(watcher: queue.Queue[bytes | None], line: bytes | None) -> None:
-    """Append a line; where the queue is full its oldest one goes."""
+    """Append a line to a watcher's queue; where that is full, its oldest line goes."""
     try:
         watcher.put_nowait(line)
     except queue.Full:
@@ -84,22 +84,22 @@ def _put(watcher: queue.Queue[bytes | None], line: bytes | None) -> None:
 
 
 def event(name: str, value: Mapping[str, Any]) -> bytes:
-    """A server-sent event."""
+    """Return a server-sent event."""
     return f"event: {name}\ndata: {json.dumps(value, separators=(',', ':'))}\n\n".encode()
 
 
 class Handler(BaseHTTPRequestHandler):
-    """One request of a page."""
+    """Answers one request of a page."""
 
     server: Server
 
     def do_GET(self) -> None:
-        """A file of the page, or the events."""
+        """Send a file of the page, or the events until the end."""
         name = self.path.partition("?")[0].lstrip("/")
-        if self.headers.get("Host", "").partition(":")[0] not in (HOST, "localhost"):  # another site's page
+        if self.headers.get("Host", "").partition(":")[0] not in (HOST, "localhost"):  # DNS rebinding
             self.send_error(403)
             return
-        with contextlib.suppress(ConnectionError):  # the page was closed
+        with contextlib.suppress(ConnectionError):  # raised when the page was closed
             if name == "events":
                 self._events()
             elif name in FILES:
@@ -113,6 +113,7 @@ class Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def _events(self) -> None:
+        """Send the greeting and all frames as they come, until the page or the server is closed."""
         self._head("text/event-stream", {})
         with self.server.hub.watch() as watcher:
             while True:
@@ -131,14 +132,15 @@ class Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Nothing: requests are no news."""
+        """Log nothing, for requests are no news."""
 
 
 class Server(ThreadingHTTPServer):
-    """Serves the page from threads of its own, between `with` and its end.
+    """Serves the page, from threads of its own, inside a `with` block.
 
     Args:
-        hub: whose frames the pages get. port: 0 for any free one.
+        hub: gives the frames to the pages.
+        port: the port; 0 for any free one.
 
     Raises:
         InputError: where the port is taken.
@@ -165,7 +167,7 @@ class Server(ThreadingHTTPServer):
         return f"http://{HOST}:{self.server_port}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Nothing: what a page breaks off concerns nobody else."""
+        """Ignore the error, for what one page breaks off does not concern the others."""
 
     def __enter__(self) -> Server:
         self.thread = threading.Thread(target=self.serve_forever, args=(0.05,), daemon=True)

@@ -1,4 +1,4 @@
-"""Where tracker poses come from: a clip that is played, or packets that arrive on this machine."""
+"""Sources of tracker poses: a clip that is played, or packets that arrive at this machine."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from memmlp.motion.body import (
 
 HOST = "127.0.0.1"
 WAIT = 0.25  # seconds that `read` waits at most
-PAUSE = 1.0  # seconds without a sample between two rounds of a clip: the stream begins anew
-LARGEST = 65_536  # bytes of a datagram
-FORGOTTEN = 10_000  # numbers left out that are no lost packets but another sender
+PAUSE = 1.0  # seconds between two rounds of a clip, so long that the stream begins anew
+LARGEST = 65_536  # the largest datagram, bytes
+FORGOTTEN = 10_000  # so many missing numbers are not lost packets but another sender
 
 
 class PoseSample(NamedTuple):
-    """What a source gives: the trackers at a time (seconds), and how many samples were lost before it."""
+    """What a source gives: a time (seconds), the trackers, and how many samples were lost before this one."""
 
     time: float
     trackers: Trackers
@@ -42,11 +42,12 @@ class PoseSample(NamedTuple):
 
 
 class PoseSource(Protocol):
-    """Tracker poses, one sample after the other.
+    """Gives tracker poses, one sample after the other.
 
     Attributes:
-        name: in words. space: frame of reference of its poses.
-        malformed: how many packets were none.
+        name: the source in words.
+        space: the frame of reference of its poses.
+        malformed: how many packets could not be read.
     """
 
     name: str
@@ -54,20 +55,21 @@ class PoseSource(Protocol):
     malformed: int
 
     def read(self) -> PoseSample | None:
-        """The next sample; None where none came within `WAIT` seconds."""
+        """Return the next sample; None where none came within `WAIT` seconds."""
 
     def truth(self, time: float) -> np.ndarray | None:
-        """True joints (22, 3), metres, at a time; None where they are not known."""
+        """Return the true joints (22, 3), metres, at a time; None where they are not known."""
 
     def close(self) -> None:
-        """Let go of what it holds."""
+        """Release what the source holds."""
 
 
 class TrackedClip:
-    """A clip of tracker poses and true joints, at any time.
+    """A clip whose tracker poses and true joints can be had at any time.
 
     Args:
-        name: of the clip. frames: [X | Theta] (N, 252) at 60 Hz, world (`memmlp.motion.body`).
+        name: the clip's name.
+        frames: [X | Theta] (N, 252) at 60 Hz, world (`memmlp.motion.body`).
     """
 
     def __init__(self, name: str, frames: np.ndarray):
@@ -79,7 +81,7 @@ class TrackedClip:
         self.seconds = (len(frames) - 1) / FPS
 
     def trackers(self, time: float) -> Trackers:
-        """Position and quaternion xyzw of head, left and right wrist at a time, between frames."""
+        """Return position and quaternion (xyzw) of head, left and right wrist at a time, interpolated."""
         first, _ = self._place(time)
         a, b = (Tracked(i / FPS, self.positions[i], self.rotations[i]) for i in (first, first + 1))
         sample = between(a, b, time)
@@ -87,18 +89,18 @@ class TrackedClip:
         return head, left, right
 
     def truth(self, time: float) -> np.ndarray:
-        """Joints (22, 3), metres, world, at a time."""
+        """Return the joints (22, 3), metres, world, at a time, interpolated."""
         first, weight = self._place(time)
         return self.joints[first] + weight * (self.joints[first + 1] - self.joints[first])
 
     def _place(self, time: float) -> tuple[int, float]:
-        """The frame before a time, and how far on to the next one it is."""
+        """Return the index of the frame before a time, and the fraction of the way to the next frame."""
         first = min(max(int(time * FPS), 0), len(self.joints) - 2)
         return first, time * FPS - first
 
 
 def in_space(trackers: Trackers, space: Space) -> Trackers:
-    """Trackers of AMASS' world, positions and quaternions xyzw, in a space."""
+    """Bring trackers, positions and quaternions (xyzw), from AMASS' world to a space."""
     positions, rotations = (np.stack(part) for part in zip(*filter(None, trackers), strict=True))
     matrices = space.rotations_out(quaternion_to_matrix(rotations))
     head, left, right = zip(space.positions_out(positions), matrix_to_quaternion(matrices), strict=True)
@@ -106,13 +108,16 @@ def in_space(trackers: Trackers, space: Space) -> Trackers:
 
 
 class ClipSource:
-    """A clip as a headset would send it: at a rate, in real time, over and over.
+    """Plays a clip as a headset would send it: at a rate, in real time, over and over.
 
     A sample that is due while the last one is still being worked on is dropped, as a device's would be.
 
     Args:
-        clip: what is played. hz: samples a second. rounds: how often; endlessly by default.
-        clock, sleep: of the machine.
+        clip: the clip.
+        hz: samples a second.
+        rounds: how often it is played; endlessly by default.
+        clock: returns the time, seconds; the machine's by default.
+        sleep: waits so many seconds; the machine's by default.
     """
 
     space = "amass"
@@ -138,7 +143,7 @@ class ClipSource:
         return self.next >= self.rounds * self.count
 
     def read(self) -> PoseSample | None:
-        """The sample that is due; waits for it."""
+        """Wait for the sample that is due next, and return it."""
         now = self.clock()
         self.began = now if self.began is None else self.began
         due = int((now - self.began) * self.hz + 1e-6)
@@ -151,22 +156,25 @@ class ClipSource:
 
     @property
     def round(self) -> float:
-        """Seconds from one round's beginning to the next one's."""
+        """The seconds from the beginning of a round to that of the next."""
         return (self.count - 1) / self.hz + PAUSE
 
     def truth(self, time: float) -> np.ndarray:
-        """True joints (22, 3), metres, AMASS' world."""
+        """Return the true joints (22, 3), metres, AMASS' world."""
         return self.clip.truth(time % self.round)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing, for nothing is held."""
 
 
 class PacketSource:
-    """Packets that arrive at a UDP port of this machine (127.0.0.1).
+    """Takes packets that arrive at a UDP port of this machine (127.0.0.1).
 
     Args:
-        name: in words. port: 0 for any free one. parse: a datagram's packet. space: frame of reference.
+        name: what kind of packets, in words.
+        port: the port; 0 for any free one.
+        parse: reads the packet of a datagram, or raises ValueError.
+        space: the frame of reference of the poses.
 
     Raises:
         InputError: where the port is taken.
@@ -182,7 +190,7 @@ class PacketSource:
         self.last: int | None = None
 
     def read(self) -> PoseSample | None:
-        """The next packet; what is none is counted and passed over."""
+        """Return the next packet's sample; None where none came in time, or what came could not be read."""
         try:
             datagram = self.socket.recv(LARGEST)
         except TimeoutError:
@@ -196,7 +204,7 @@ class PacketSource:
         return PoseSample(arrival, packet.trackers, self._dropped(packet))
 
     def _dropped(self, packet: Packet) -> int:
-        """How many samples are missing between the last packet's number and this one's."""
+        """Return how many numbers are missing between the last packet and this one."""
         last, self.last = self.last, packet.seq
         if last is None or packet.seq is None:
             return 0
@@ -204,15 +212,15 @@ class PacketSource:
         return missing if 0 < missing < FORGOTTEN else 0
 
     def truth(self, time: float) -> None:
-        """Nobody knows."""
+        """Return None, for the truth is not known."""
 
     def close(self) -> None:
-        """Give the port back."""
+        """Release the port."""
         self.socket.close()
 
 
 def bound(listener: socket.socket, port: int) -> None:
-    """Bind a socket to a port of this machine alone. Raises InputError where it is taken."""
+    """Bind a socket to a port of this machine alone. Raises InputError where the port is taken."""
     try:
         listener.bind((HOST, port))
     except OSError as error:
@@ -225,9 +233,10 @@ def bound(listener: socket.socket, port: int) -> None:
 
 
 def send(source: ClipSource, port: int, pack: Callable[[Packet], bytes], space: Space) -> int:
-    """Send a clip's samples, in a space, to a UDP port of this machine until its rounds are over.
+    """Send a clip's samples, in a space, to a UDP port of this machine until all rounds are played.
 
-    Returns how many were sent.
+    Returns:
+        How many were sent.
     """
     sent = 0
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:

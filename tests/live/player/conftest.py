@@ -19,7 +19,7 @@ PERSON = wearer.person(np.arange(121) / 60)
 
 @pytest.fixture(scope="session")
 def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Random weights about a person who stands, as a file."""
+    """Export a network with random weights whose pose is near that of a person who stands."""
     path = tmp_path_factory.mktemp("player") / "step.onnx"
     export(streaming(wearer.at_ease(tiny.model(NoMemory), PERSON.frames)), path, "0123456789abcdef")
     return path
@@ -27,5 +27,5 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def clip() -> TrackedClip:
-    """Two seconds."""
+    """Return a clip of two seconds."""
     return TrackedClip("person", PERSON.frames.numpy())

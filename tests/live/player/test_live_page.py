@@ -21,7 +21,7 @@ NEWEST = "Number(document.querySelector('#scrub').max)"
 
 @pytest.fixture
 def url(network: Path, clip: TrackedClip) -> Iterator[str]:
-    """A clip that plays."""
+    """Serve a page on which a clip plays, and yield its address."""
     stopped, source = threading.Event(), ClipSource(clip, 60)
     with Server(Hub(greeting(source, "tiny")), 0) as server:
         loop = threading.Thread(target=play, args=(Stream(network), source, server.hub.publish, stopped))
@@ -38,7 +38,7 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
 
 
 def stage(browser: Browser) -> np.ndarray:
-    """The picture's part with the person."""
+    """Return the part of the picture with the person."""
     x, y, width, height = browser.value(
         "(b => [b.x, b.y, b.width, b.height])(document.querySelector('#stage').getBoundingClientRect())"
     )

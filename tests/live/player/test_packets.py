@@ -1,4 +1,4 @@
-"""JSON and OSC packets: there and back, and whatever else may arrive."""
+"""JSON and OSC packets: written and read again, and whatever else may arrive at the port."""
 
 from __future__ import annotations
 

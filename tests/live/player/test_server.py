@@ -20,7 +20,7 @@ from memmlp.live.stream import Stream
 
 
 class Instant(ClipSource):
-    """A clip whose time passes at once; at its end it stops the loop."""
+    """A clip that is played without waiting, by a clock of its own; at its end it stops the loop."""
 
     def __init__(self, clip: TrackedClip, hz: float, stopped: threading.Event):
         self.now, self.stopped = 0.0, stopped
@@ -37,7 +37,7 @@ class Instant(ClipSource):
 
 
 class Losing(Instant):
-    """Loses the left hand in the middle, and sends what is no rotation once."""
+    """A clip in which the left hand is lost for a while, and a rotation is malformed once."""
 
     def read(self) -> PoseSample | None:
         sample = super().read()
@@ -50,7 +50,7 @@ class Losing(Instant):
 
 
 def played(network: Path, clip: TrackedClip, hz: float, kind: type[Instant] = Instant) -> list[dict]:
-    """The messages of a clip."""
+    """Return the messages about a clip."""
     stopped, messages = threading.Event(), []
     play(Stream(network), kind(clip, hz, stopped), messages.append, stopped)
     return messages
@@ -100,7 +100,7 @@ def get(server: Server, path: str) -> http.client.HTTPResponse:
 
 
 def events(response: http.client.HTTPResponse) -> Iterator[tuple[str, dict]]:
-    """The events of a stream."""
+    """Yield the events of a stream."""
     name = ""
     for line in response:
         key, _, value = line.decode().strip().partition(": ")
@@ -144,7 +144,7 @@ def test_the_pages_files_are_there(server: Server):
 
 
 def test_the_page_needs_no_network(server: Server):
-    """Nothing that the page loads is elsewhere."""
+    """The page loads nothing from elsewhere."""
     for name in FILES:
         if not name.startswith("three/"):
             assert "//" not in get(server, f"/{name}").read().decode().replace("// ", ""), name
@@ -164,7 +164,7 @@ def test_only_this_machine_is_served(server: Server):
 
 
 def test_a_page_of_another_site_gets_nothing(server: Server):
-    """Whose name was made to mean this machine."""
+    """The other site's name was made to lead to this machine (DNS rebinding)."""
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
     connection.request("GET", "/events", headers={"Host": f"elsewhere.example:{server.server_port}"})
     assert connection.getresponse().status == 403
@@ -183,4 +183,4 @@ def test_the_end_leaves_the_port_and_no_thread(clip: TrackedClip):
     assert list(response)[-1:] == [b"\n"]
     with Server(Hub({}), port):
         pass
-    assert threading.active_count() <= before + 1  # the watcher's own may still be on its way out
+    assert threading.active_count() <= before + 1  # the watcher's own thread may still be ending

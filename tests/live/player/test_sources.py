@@ -1,4 +1,4 @@
-"""Clips in real time and packets from a port, on a clock of the test's own."""
+"""Clips in real time, by a clock of the tests' own, and packets from a port."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PACKETS = {"udp": (to_json, from_json), "osc": (to_osc, from_osc)}
 
 
 class Clock:
-    """A time that passes when somebody sleeps, or works."""
+    """A clock that advances when somebody sleeps or works."""
 
     def __init__(self) -> None:
         self.now = 100.0

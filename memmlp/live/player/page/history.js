@@ -1,6 +1,6 @@
-// The frames that came, the oldest forgotten; what is shown is the newest one, or the one that was chosen.
+// Keeps the frames of the last minutes, and knows which is shown: the newest one, or one that was chosen.
 
-const KEPT = 60 * 180; // frames: three minutes
+const KEPT = 60 * 180; // the largest number of frames, which is three minutes
 
 export class History {
   frames = [];
@@ -23,7 +23,7 @@ export class History {
   choose(number) { this.chosen = Math.min(Math.max(number, this.first), this.last); }
   resume() { this.chosen = null; }
 
-  // Median and 95th percentile of the steps' milliseconds over the last frames.
+  // The median and 95th percentile of the steps' milliseconds over the last frames.
   timing(count = 300) {
     const sorted = this.frames.slice(-count).map(frame => frame.ms).sort((a, b) => a - b);
     const at = part => sorted[Math.min(Math.floor(part * sorted.length), sorted.length - 1)];
@@ -31,7 +31,7 @@ export class History {
   }
 }
 
-// The frame in metres, with the joints' errors in cm where the truth is known.
+// Returns the frame in metres, with the joints' errors in cm where the truth is known.
 function measured(frame) {
   const joints = Float32Array.from(frame.joints, mm => mm / 1000);
   if (!frame.truth) return { ...frame, joints, errors: null, mean: null };

@@ -1,4 +1,4 @@
-// Frames in, by server-sent events; the newest or the chosen one out, as a picture and in numbers.
+// Receives frames as server-sent events, and shows the newest or the chosen one as a picture and in numbers.
 
 import { History } from './history.js';
 import { Stage } from './stage.js';
@@ -16,7 +16,7 @@ events.addEventListener('greeting', event => greet(JSON.parse(event.data)));
 events.addEventListener('frame', event => {
   const frame = JSON.parse(event.data);
   ({ malformed } = frame);
-  if (!frame.joints) return; // the counts alone
+  if (!frame.joints) return; // the message has the counts alone
   if (frame.number <= history.last && history.frames.length) begin(); // the command was started again
   history.add(frame);
   arrived = performance.now();

@@ -3,11 +3,11 @@
 import * as THREE from 'three';
 import { OrbitControls } from './three/OrbitControls.js';
 
-const ROUND = 20; // sides of a limb
-const RINGS = 6; // along a limb, so that its colour follows the scale
+const ROUND = 20; // the number of a limb's sides
+const RINGS = 6; // the number of rings along a limb, so that its colour follows the scale
 const UP = new THREE.Vector3(0, 1, 0);
-const SUN = new THREE.Vector3(1.4, 4, 1.8); // from there too
-const START = new THREE.Vector3(1.1, 0.5, 3.2); // of the camera, from the person's middle
+const SUN = new THREE.Vector3(1.4, 4, 1.8); // where the light stands, from the person's middle
+const START = new THREE.Vector3(1.1, 0.5, 3.2); // where the camera stands at first, from the person's middle
 
 export class Stage {
   constructor(canvas, greeting) {
@@ -41,7 +41,7 @@ export class Stage {
     this.scene.add(this.sun, this.sun.target, this.floor);
   }
 
-  // The page's colours, light or dark.
+  // Take over the page's colours, light or dark.
   themed() {
     const style = getComputedStyle(document.documentElement);
     const colour = name => new THREE.Color(style.getPropertyValue(name).trim());
@@ -62,7 +62,7 @@ export class Stage {
     this.follow(truth ?? joints, frame.restarted);
   }
 
-  // Camera and light stay where they are from the person's middle; a jump is not followed slowly.
+  // Camera and light move along with the person's middle, smoothly but for a jump.
   follow(joints, jump) {
     const lowest = Math.min(...joints.filter((_, i) => i % 3 === 1));
     this.ground = Math.min(lowest, this.ground ?? lowest);
@@ -79,7 +79,7 @@ export class Stage {
     this.grid.position.set(Math.round(2 * target.x) / 2, this.ground - 0.03, Math.round(2 * target.z) / 2);
   }
 
-  // The camera's place from the person's middle, so that she is seen from the front, a little from the side.
+  // Where the camera stands, from the person's middle, to see the person from the front, a little from the side.
   front(joints) {
     const left = new THREE.Vector3(joints[3] - joints[6], 0, joints[5] - joints[8]); // from right to left hip
     return START.clone().applyAxisAngle(UP, Math.atan2(-left.z, left.x));
@@ -100,7 +100,7 @@ export class Stage {
   }
 }
 
-// A person of round limbs; a slim one is inside of another at the same place.
+// A person of round limbs. A slim one hides inside another with the same pose.
 class Body {
   constructor(limbs, opacity, slim) {
     const material = new THREE.MeshStandardMaterial({
@@ -110,13 +110,13 @@ class Body {
     this.group = new THREE.Group().add(...this.limbs.map(limb => limb.mesh));
   }
 
-  // Joints: 66 metres; paint: (joint, other joint, part of the way) -> a colour.
+  // joints: 22 positions as 66 numbers, metres; paint: (joint, other joint, part of the way) -> a colour.
   pose(joints, paint) {
     for (const limb of this.limbs) limb.pose(joints, paint);
   }
 }
 
-// A round limb: one surface, turned from a half circle at each end and the line between.
+// A round limb: one surface of revolution, with a half circle at each end and a line between.
 class Limb {
   constructor({ start, end, radii, tip }, material, slim) {
     Object.assign(this, { start, end, tip });
@@ -141,7 +141,7 @@ class Limb {
     this.colour(paint);
   }
 
-  // The line between the ends is as long as the limb; the ends keep their form.
+  // Make the line between the ends as long as the limb; the round ends keep their form.
   stretch(length) {
     if (Math.abs(length - this.length) < 1e-4) return;
     this.length = length;
@@ -163,7 +163,7 @@ class Limb {
   }
 }
 
-// From end to end: radius x, height y above the point that is `part` of the way along.
+// The limb's outline from end to end: at radius x, y above the point that is `part` of the way along.
 function outline(start, end) {
   const quarter = Array.from({ length: 7 }, (_, i) => (Math.PI / 12) * i);
   const cap = (radius, side, part) =>
@@ -173,7 +173,7 @@ function outline(start, end) {
   return [...cap(start, -1, 0), ...between, ...cap(end, 1, 1).reverse()];
 }
 
-// (errors, joint, other joint, part of the way) -> the colour of the error there.
+// Returns (errors, joint, other joint, part of the way) -> the colour of the error there.
 function heatmap(colours, top) {
   const anchors = colours.map(colour => new THREE.Color(colour));
   return (errors, a, b, part) => {
