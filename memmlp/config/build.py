@@ -84,14 +84,14 @@ def untrained(overrides: Sequence[str]) -> WindowModel:
     architecture = build_architecture(composed(list(overrides)))
     torch.manual_seed(0)
     codes = architecture.vqvae() if architecture.uses_codes else None
-    frame = Normalizer.raw(architecture.coordinates, torch.as_tensor(builtin_rest_joints()))
-    return architecture.build(frame, codes).eval()
+    normalizer = Normalizer.raw(architecture.coordinates, torch.as_tensor(builtin_rest_joints()))
+    return architecture.build(normalizer, codes).eval()
 
 
 def build_tracking(cfg: DictConfig) -> Tracking:
     """Build what shows the config's runs elsewhere, in MLflow or nowhere."""
-    places = {"outputs": Path(cfg.paths.outputs)} if "uri" in cfg.tracking else {}
-    return built(cfg.tracking, **places)
+    folder = {"outputs": Path(cfg.paths.outputs)} if "uri" in cfg.tracking else {}
+    return built(cfg.tracking, **folder)
 
 
 def device(name: str) -> torch.device:

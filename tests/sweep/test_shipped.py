@@ -187,8 +187,8 @@ def test_the_backbone_is_agrols_mlp_of_ten_blocks():
     small = ["model.frames=41", "profile=tiny", "frame.coordinates=world", "frame.normalize=false"]
     mem = untrained([*small, "memory=none", "predictor=rotation_only", "hand=off", "loss=agrol"])
     agrol = untrained([*small, "model=agrol_mlp", "model.depth=10"])
-    names = [name for name in mem.state_dict() if not name.startswith("frame.")]
-    theirs = [name for name in agrol.state_dict() if not name.startswith("frame.")]
+    names = [name for name in mem.state_dict() if not name.startswith("normalizer.")]
+    theirs = [name for name in agrol.state_dict() if not name.startswith("normalizer.")]
     ours = {name: mem.state_dict()[other] for name, other in zip(theirs, names, strict=True)}
     agrol.load_state_dict(ours, strict=False)
     inputs = torch.randn(2, 41, 54, generator=torch.Generator().manual_seed(0))

@@ -102,7 +102,7 @@ def _check_combinations(cfg: DictConfig) -> None:
     if cfg.optim.final_lr > cfg.optim.lr:
         raise InputError(f"optim.final_lr={cfg.optim.final_lr}: allowed is at most optim.lr={cfg.optim.lr}")
     if _is(cfg.model, BaselineConfig):
-        _check_reference(cfg)
+        _check_baseline(cfg)
     else:
         _check_slots(cfg)
     if (cfg.vqvae.epochs is None) == (cfg.vqvae.steps is None):
@@ -120,7 +120,7 @@ def _is(node: DictConfig, schema: type) -> bool:
     return kind is not None and issubclass(kind, schema)
 
 
-def _check_reference(cfg: DictConfig) -> None:
+def _check_baseline(cfg: DictConfig) -> None:
     """Check the config of a baseline, which has no slots, no history of its own and no positions.
 
     Nothing may be set that concerns these, and its sizes must fit each other.
