@@ -145,9 +145,13 @@ class Words:
         printed = self._cell(name, arm, self._table(name).modes[0], metric).paper_effect
         return "not printed" if printed is None else f"{printed:+.2f}".replace("-", MINUS)
 
-    def seen(self, name: str, mode: str, metric: str) -> str:
-        """Return the difference that a table could have seen in every arm with 80 % power."""
-        least = self._table(name).detectable(mode, metric)
+    def seen(self, name: str, mode: str, metric: str, arm: str | None = None) -> str:
+        """Return the difference that the table could have seen with 80 % power, in an arm or in every one."""
+        if arm is None:
+            least = self._table(name).detectable(mode, metric)
+        else:
+            effect = self._cell(name, arm, mode, metric).effect
+            least = effect.detectable if effect else None
         return "unknown" if least is None else f"{number_words(least)} {unit(metric)}".rstrip()
 
     def table(self, name: str) -> str:
