@@ -298,7 +298,7 @@ def checked_offsets(offsets: Offsets) -> Offsets:
         positions, rotations = (np.asarray(part, np.float64) for part in offsets)
     except (TypeError, ValueError):
         raise InputError(
-            "offsets: allowed are memmlp.live.Offsets, positions (3, 3) and rotations (3, 3, 3)"
+            "offsets: allowed are memmlp.Offsets, positions (3, 3) and rotations (3, 3, 3)"
         ) from None
     if positions.shape != (3, 3) or rotations.shape != (3, 3, 3):
         shapes = f"{positions.shape} and {rotations.shape}"
