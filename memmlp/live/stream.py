@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from memmlp.common.errors import InputError
 from memmlp.live.exported import ExportedNetwork
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
-from memmlp.live.spaces import space_of
+from memmlp.live.spaces import SpaceName, space_of
 from memmlp.live.trackers import Features, Lost, Trackers, t_pose
 from memmlp.runs.run import Run
 
@@ -30,6 +30,7 @@ LATEST = 1e10  # seconds; at much more frames of 1/60 s can't be told apart
 UNIT = 1e-2  # by how much a quaternion's norm, or a matrix' columns, may be off
 
 Tracker = tuple[ArrayLike, ArrayLike] | None
+RotationFormat = Literal["matrix", "quaternion"]
 
 
 class Pose(NamedTuple):
@@ -95,8 +96,8 @@ class Stream:
         self,
         source: str | PathLike[str] | Run,
         *,
-        space: str = "amass",
-        rotations: str = "matrix",
+        space: SpaceName = "amass",
+        rotations: RotationFormat = "matrix",
         offsets: Offsets | None = None,
         ik: LBFGS | None = None,
     ):
