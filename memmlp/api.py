@@ -1,14 +1,14 @@
 """What a script or a notebook does with finished runs: open, compare, predict, draw, stream.
 
-Its names are those of the package (`memmlp.load_run`). Reading runs and results needs no torch; it is imported
-where a network is.
+Its names are those of the package (`memmlp.load_run`). Reading runs and results needs no torch, which is
+imported where a network is.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args, overload
@@ -101,8 +101,9 @@ class Runs(Sequence["TrainedRun"]):
 class TrainedRun(os.PathLike[str]):
     """A finished run of a motion network: its config, its results, its network.
 
-    Made by `load_run` and `Runs`. Config and results need the run's folder alone. `clips` and `predict` need
-    the prepared data too; a relative path in the config counts from the current folder, as it did in training.
+    Made by `load_run` and `Runs`. Config and results need the run's folder alone. `clips`, `model` and
+    `predict` need its data too; a relative path in the config counts from the current folder, as it did in
+    training.
 
     Attributes:
         id: 16 hex digits.
@@ -139,7 +140,7 @@ class TrainedRun(os.PathLike[str]):
         """
         return {
             mode: {branch: _numbers(errors) for branch, errors in branches.items()}
-            for mode, branches in load(self.folder).means.items()
+            for mode, branches in sorted(load(self.folder).means.items())
         }
 
     def per_clip(self) -> pd.DataFrame:
@@ -217,7 +218,7 @@ class TrainedRun(os.PathLike[str]):
     def _rows(self) -> Iterator[dict[str, Any]]:
         """The rows of `per_clip`."""
         measured = load(self.folder)
-        for mode, branches in measured.means.items():
+        for mode, branches in sorted(measured.means.items()):
             for branch in branches:
                 for clip, modes in measured.clips.items():
                     facts = {"clip": clip, "group": measured.group(clip), "frames": modes[mode]["frames"]}
@@ -242,11 +243,11 @@ class Prediction:
     run: str
     clip: str
     mode: Mode
-    true_positions: np.ndarray
-    true_rotations: np.ndarray
-    positions: np.ndarray
-    rotations: np.ndarray
-    joints: np.ndarray | None
+    true_positions: np.ndarray = field(repr=False)
+    true_rotations: np.ndarray = field(repr=False)
+    positions: np.ndarray = field(repr=False)
+    rotations: np.ndarray = field(repr=False)
+    joints: np.ndarray | None = field(repr=False)
 
     def __len__(self) -> int:
         """N."""
@@ -288,7 +289,8 @@ class Prediction:
 
         file = Path(path)
         check_picture(file)
-        _check("poses", poses, range(1, 21))
+        if poses not in range(1, 21):
+            raise InputError(f"poses {poses}: allowed are 1 to 20")
         first, last = span(len(self), self.clip, begin, end)
         write_picture(file, self._take(branch, first, last), poses)
         return file

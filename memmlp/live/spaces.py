@@ -21,7 +21,6 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 
-
 SpaceName = Literal["amass", "openxr", "unity"]
 
 
