@@ -56,8 +56,8 @@ def three(run: memmlp.TrainedRun, tmp_path: Path) -> memmlp.Runs:
 
 
 def refused(*words: str) -> contextlib.AbstractContextManager[object]:
-    """An InputError of one line with these words in this order."""
-    pattern = "(?s)^(?!.*\n).*" + ".*".join(map(re.escape, words))
+    """An InputError of one line that begins with the first of these words and has the others after it."""
+    pattern = r"^(?![\s\S]*\n)" + ".*".join(map(re.escape, words))
     return pytest.raises(memmlp.InputError, match=pattern)
 
 
@@ -91,7 +91,7 @@ def test_what_is_no_trained_network_is_refused(run: memmlp.TrainedRun):
 def test_an_unfinished_run_is_none_of_the_runs(run: memmlp.TrainedRun, three: memmlp.Runs, tmp_path: Path):
     (tmp_path / "runs" / run.id / "DONE").unlink()
     assert [found.seed for found in memmlp.Runs(tmp_path)] == [1, 2]
-    with refused(run.id, "not a finished"):
+    with refused(f"run {run.id}", "not a finished"):
         memmlp.load_run(run.id, tmp_path)
 
 
@@ -165,7 +165,7 @@ def test_a_damaged_file_of_results_is_named(three: memmlp.Runs):
 
 def test_without_pandas_one_line_says_so(run: memmlp.TrainedRun, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with refused("pandas", "memmlp[notebook]"):
+    with refused("per_clip: needs pandas", "memmlp[notebook]"):
         run.per_clip()
 
 
@@ -238,13 +238,14 @@ def test_a_film_is_of_the_piece(prediction: memmlp.Prediction, tmp_path: Path):
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [
-        ("a.avi", {}, ("a.avi", ".png, .gif, .mp4")),
-        ("no/a.png", {}, ("no folder", "no")),
+        ("a.avi", {}, ("path ", "a.avi", ".png, .gif, .mp4")),
+        ("no/a.png", {}, ("path ", "no folder", "no")),
         ("a.png", {"branch": "combined"}, ("branch combined", "rotation, position")),
         ("a.png", {"begin": 900}, ("begin 900", "nothing between")),
         ("a.png", {"begin": -1}, ("begin -1", "nothing between")),
         ("a.png", {"begin": float("nan")}, ("begin nan", "nothing between")),
         ("a.png", {"begin": 1, "end": 1}, ("begin 1 end 1", "nothing between")),
+        ("a.png", {"begin": 0.501, "end": 0.505}, ("begin 0.501 end 0.505", "nothing between")),
         ("a.png", {"poses": 0}, ("poses 0", "1 to 20")),
     ],
 )
@@ -272,7 +273,7 @@ def test_streams_refuse_as_ever(run: memmlp.TrainedRun, three: memmlp.Runs):
     with refused("space=blender"):
         run.stream(space="blender")  # type: ignore[arg-type]
     shutil.rmtree(three[0].folder / "deployments")
-    with refused("step.onnx"):
+    with refused(str(three[0].folder), "step.onnx"):
         three[0].stream()
 
 
