@@ -1,13 +1,38 @@
 """Mem-MLP: full-body motion from three tracked points, and the platform for its ablations."""
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from memmlp.api import Prediction, Runs, TrainedRun, load_run
+    from memmlp.common.errors import InputError
+    from memmlp.live.stream import Offsets, Pose, Stream
 
 __version__ = "0.1.0"
 
+__all__ = ["InputError", "Offsets", "Pose", "Prediction", "Runs", "Stream", "TrainedRun", "load_run"]
 
-def __getattr__(name: str) -> Any:
-    """`memmlp.Stream`, imported when it is asked for."""
-    if name == "Stream":
-        return import_module("memmlp.live.stream").Stream
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+_HOMES = {
+    "InputError": "memmlp.common.errors",
+    "Offsets": "memmlp.live.stream",
+    "Pose": "memmlp.live.stream",
+    "Prediction": "memmlp.api",
+    "Runs": "memmlp.api",
+    "Stream": "memmlp.live.stream",
+    "TrainedRun": "memmlp.api",
+    "load_run": "memmlp.api",
+}
+
+
+def __dir__() -> list[str]:
+    """The public names."""
+    return __all__
+
+
+if not TYPE_CHECKING:  # to a type checker it would say that every name is there
+
+    def __getattr__(name):
+        """A public name, imported when it is asked for, so that the import of the package is quick."""
+        if name in _HOMES:
+            return getattr(import_module(_HOMES[name]), name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

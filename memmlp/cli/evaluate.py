@@ -48,6 +48,5 @@ def evaluate(
     if json_path is not None:
         write_json(json_path, {"mean": results, "clips": clip_rows(experiment, found.run)})
     if save_predictions is not None:
-        model = experiment.architecture.load(found.run.weights()).to(experiment.device)
-        write_predictions(experiment.evaluation, model, found.test, save_predictions)
+        write_predictions(experiment.evaluation, found.network(), found.test, save_predictions)
         click.echo(f"predictions of {len(found.test.names)} clips under {save_predictions}")

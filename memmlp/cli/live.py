@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from memmlp.live.player.sources import ClipSource, PoseSource, TrackedClip
+    from memmlp.live.spaces import SpaceName
 
 PORT = click.IntRange(1, 65535)
 
@@ -43,7 +44,7 @@ def live(
     clip: str | None,
     udp: int | None,
     osc: int | None,
-    space: str,
+    space: SpaceName,
     hz: float,
     port: int,
     no_browser: bool,
@@ -80,7 +81,7 @@ class Feed(NamedTuple):
     clip: str | None
     udp: int | None
     osc: int | None
-    space: str
+    space: SpaceName
     hz: float
     outputs: Path
 

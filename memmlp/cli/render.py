@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
     from memmlp.render.take import Take
 
-SUFFIXES = (".png", ".gif", ".mp4")
+POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions_of_position_branch"}
 
 
 @click.command("render")
@@ -57,35 +57,21 @@ def render(
     A PNG has a row for each run and a column for each pose; a GIF or MP4 has them side by side at 30 pictures
     a second. One colour scale holds for all.
     """
-    from memmlp.common.errors import InputError
     from memmlp.config.open_run import open_run
-    from memmlp.render.figure import heatmap_png
-    from memmlp.render.film import film, pyav
+    from memmlp.render.picture import check_picture, write_picture
 
-    check(out, runs, labels)
-    kind = out.suffix.lower()
-    if kind == ".mp4":
-        pyav()
+    check_picture(out, "--out")
+    check_labels(runs, labels)
     take = taken([open_run(outputs, run) for run in runs], labels, clip, (begin, end), branch, mode)
-    try:
-        if kind == ".png":
-            heatmap_png(out, take, frames)
-        else:
-            film(out, take)
-    except OSError as error:
-        raise InputError(f"--out {out}: {error.strerror or error}") from None
+    write_picture(out, take, frames, "--out")
     errors = ", ".join(f"{label} {error.mean():.1f} cm" for label, error in take.errors.items())
     click.echo(f"{out}: {take.title}, {errors}")
 
 
-def check(out: Path, runs: tuple[str, ...], labels: tuple[str, ...]) -> None:
-    """Raise InputError for options that are known to be wrong before any run is read."""
+def check_labels(runs: tuple[str, ...], labels: tuple[str, ...]) -> None:
+    """Raise InputError where there is not one label for each run."""
     from memmlp.common.errors import InputError
 
-    if out.suffix.lower() not in SUFFIXES:
-        raise InputError(f"--out {out}: no such kind of picture; allowed are {', '.join(SUFFIXES)}")
-    if not out.parent.is_dir():
-        raise InputError(f"--out {out}: there is no folder {out.parent}")
     if labels and len(labels) != len(runs):
         raise InputError(f"--label: {len(labels)} for {len(runs)} runs; allowed is one for each, or none")
 
@@ -115,13 +101,13 @@ def taken(
 
     from memmlp.common.errors import InputError
     from memmlp.config.open_run import clip_of
-    from memmlp.render.take import Take
+    from memmlp.render.take import Take, span
 
     names = labels or tuple(run.run.id[:8] for run in runs)
     if len(set(names)) < len(names):
         raise InputError(f"{'--label' if labels else 'RUNS'}: one is there twice; allowed are different ones")
     title = clip or runs[0].test.names[0]
-    first, last = span(len(clip_of(runs[0].test, title)), title, *times)
+    first, last = span(len(clip_of(runs[0].test, title)), title, *times, ("--from", "--to"))
     truths, predictions = [], {}
     for label, run in zip(names, runs, strict=True):
         truth, motion = predicted(run, title, last, branch, mode)
@@ -137,33 +123,10 @@ def taken(
 def predicted(run: OpenedRun, clip: str, last: int, branch: str, mode: str) -> tuple[np.ndarray, np.ndarray]:
     """Return truth and prediction (last, 22, 3) of a test clip's first `last` frames, metres, world."""
     from memmlp.config.open_run import clip_of
-    from memmlp.evaluation import modes as evaluation
-    from memmlp.motion.body import SPARSE_DIM
+    from memmlp.evaluation.predictions import predict_clip
 
-    model = run.experiment.architecture.load(run.run.weights())
     frames = clip_of(run.test, clip)
     if mode == "stream":  # a stream sees no later frames; windows may
         frames = frames[:last]
-    motion = evaluation.MODES[mode](model, [frames])[0][:last]
-    frames = frames[:last]
-    positions = {
-        "rotation": lambda: model.normalizer.pose(motion, frames[:, :SPARSE_DIM]),
-        "position": lambda: evaluation.joint_positions(motion),
-    }[branch]()
-    return evaluation.joint_positions(frames[:, SPARSE_DIM:]).numpy(), positions.numpy()
-
-
-def span(length: int, title: str, begin: float, end: float | None) -> tuple[int, int]:
-    """Return a piece's first frame and the one after its last, for begin and end in seconds.
-
-    Raises:
-        InputError: where nothing lies between.
-    """
-    from memmlp.common.errors import InputError
-    from memmlp.motion.body import FPS
-
-    first, last = round(begin * FPS), length if end is None else min(round(end * FPS), length)
-    if first >= last:
-        given = f"--from {begin:g}" + ("" if end is None else f" --to {end:g}")
-        raise InputError(f"{given}: nothing between; {title} has {length / FPS:.1f} s")
-    return first, last
+    arrays = predict_clip(run.network(), frames, mode)
+    return arrays["true_positions"][:last], arrays[POSITIONS[branch]][:last]

@@ -37,6 +37,7 @@ from memmlp.networks.vqvae import VQVAE
 from memmlp.networks.window_model import WindowModel
 from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.identity import flatten
+from memmlp.runs.lookup import check_trained
 from memmlp.runs.run import Run
 from memmlp.runs.tracking import Tracking
 from memmlp.training.losses import Loss, MotionLoss
@@ -165,8 +166,7 @@ def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
         InputError: where the run is not finished, its config does not fit this version, or an override is
             wrong.
     """
-    if not run.done or run.manifest.get("kind") != "memmlp":
-        raise InputError(f"run {run.id}: not a finished Mem-MLP run")
+    check_trained(run)
     if foreign := sorted(name for name in _targets(run.config) if not name.startswith("memmlp.")):
         raise InputError(f"{run.config_path}: {', '.join(foreign)}: allowed are classes of memmlp")
     try:

@@ -13,6 +13,7 @@ from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment, config_of, device
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.source import Prepared
+from memmlp.networks.window_model import WindowModel
 from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.identity import trained_by
 from memmlp.runs.lookup import find_run
@@ -31,6 +32,10 @@ class OpenedRun(NamedTuple):
         """The test clips, on the experiment's device."""
         return self.data.open("test").to(self.experiment.device)
 
+    def network(self) -> WindowModel:
+        """The trained network, in evaluation mode, on the experiment's device."""
+        return self.experiment.architecture.load(self.run.weights()).to(self.experiment.device)
+
 
 def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequence[str] = ()) -> OpenedRun:
     """Open a finished run.
@@ -45,7 +50,11 @@ def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequ
         InputError: where there is no such run, an override would change its training, or its data is no
             longer what it was trained and tested on.
     """
-    run = find_run(outputs, name)
+    return open_found(find_run(outputs, name), device_name, overrides)
+
+
+def open_found(run: Run, device_name: str = "cpu", overrides: Sequence[str] = ()) -> OpenedRun:
+    """The same of a run that was found already."""
     experiment = replace(build_experiment(config_of(run, overrides)), device=device(device_name))
     if trained_by(run.config) != trained_by(experiment.config):
         words = ", ".join(overrides)
@@ -57,13 +66,16 @@ def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequ
     return OpenedRun(run, experiment, data)
 
 
-def clip_of(test: MotionDataset, name: str) -> Tensor:
-    """Return all frames (N, 252) of a test clip. Raises InputError where no clip has that name."""
-    return test.clip(clip_index(test, name))
+def clip_of(test: MotionDataset, name: str, key: str = "--clip") -> Tensor:
+    """All frames (N, 252) of a test clip. Raises InputError where there is none of that name."""
+    return test.clip(clip_index(test, name, key))
 
 
-def clip_index(test: MotionDataset, name: str) -> int:
-    """Return the index of a test clip. Raises InputError, which lists all clips, where none has that name."""
+def clip_index(test: MotionDataset, name: str, key: str = "--clip") -> int:
+    """The place of a test clip. Raises InputError, which lists them, where there is none of that name.
+
+    key: what the name was given as, for that line.
+    """
     if name not in test.names:
-        raise InputError(f"--clip {name}: no such test clip; allowed are {', '.join(test.names)}")
+        raise InputError(f"{key} {name}: no such test clip; allowed are {', '.join(test.names)}")
     return test.names.index(name)

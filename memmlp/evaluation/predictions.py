@@ -9,7 +9,7 @@ from torch import Tensor
 
 from memmlp.evaluation import modes
 from memmlp.evaluation.evaluation import Evaluation
-from memmlp.evaluation.ik import IK
+from memmlp.evaluation.ik import IK, NoIK
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.normalizer import Normalizer
@@ -27,6 +27,11 @@ def save_predictions(evaluation: Evaluation, model: WindowModel, test: MotionDat
             np.savez(
                 path, allow_pickle=False, **prediction_arrays(model.normalizer, clip, motion, evaluation.ik)
             )
+
+
+def predict_clip(model: WindowModel, clip: Tensor, mode: str) -> dict[str, np.ndarray]:
+    """What a network makes of a clip's frames (N, 252) in a mode, beside the truth (`prediction_arrays`)."""
+    return prediction_arrays(model.normalizer, clip, modes.MODES[mode](model, [clip])[0], NoIK())
 
 
 def prediction_arrays(normalizer: Normalizer, clip: Tensor, motion: Tensor, ik: IK) -> dict[str, np.ndarray]:

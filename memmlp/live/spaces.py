@@ -15,10 +15,13 @@ almost the head's. A local rotation (of a joint relative to its parent) has the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from memmlp.common.errors import InputError
+
+SpaceName = Literal["amass", "openxr", "unity"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from memmlp.common.errors import InputError
 from memmlp.live.exported import ExportedNetwork
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
-from memmlp.live.spaces import space_of
+from memmlp.live.spaces import SpaceName, space_of
 from memmlp.live.trackers import Features, Lost, Trackers, t_pose
 from memmlp.runs.run import Run
 
@@ -30,6 +30,7 @@ LATEST = 1e10  # seconds; at much later times floats can't tell frames of 1/60 s
 UNIT = 1e-2  # how far a quaternion's norm may be from 1, or a matrix from orthonormal
 
 Tracker = tuple[ArrayLike, ArrayLike] | None
+RotationFormat = Literal["matrix", "quaternion"]
 
 
 class Pose(NamedTuple):
@@ -99,8 +100,8 @@ class Stream:
         self,
         source: str | PathLike[str] | Run,
         *,
-        space: str = "amass",
-        rotations: str = "matrix",
+        space: SpaceName = "amass",
+        rotations: RotationFormat = "matrix",
         offsets: Offsets | None = None,
         ik: LBFGS | None = None,
     ):
@@ -317,7 +318,7 @@ def checked_offsets(offsets: Offsets) -> Offsets:
         positions, rotations = (np.asarray(part, np.float64) for part in offsets)
     except (TypeError, ValueError):
         raise InputError(
-            "offsets: allowed are memmlp.live.Offsets, positions (3, 3) and rotations (3, 3, 3)"
+            "offsets: allowed are memmlp.Offsets, positions (3, 3) and rotations (3, 3, 3)"
         ) from None
     if positions.shape != (3, 3) or rotations.shape != (3, 3, 3):
         shapes = f"{positions.shape} and {rotations.shape}"

@@ -92,6 +92,6 @@ def pyav() -> Any:
         import av
     except ImportError:
         raise InputError(
-            "--out: MP4 needs PyAV, pip install 'memmlp[video]'; allowed without it: .gif, .png"
+            "MP4: needs PyAV, pip install 'memmlp[video]'; allowed without it: .gif, .png"
         ) from None
     return av

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from memmlp.common.errors import InputError
 from memmlp.motion.body import FPS, ROOT
 from memmlp.render.mannequin import RADII, scale
 from memmlp.render.raster import Camera
@@ -16,6 +17,26 @@ MIDDLE = 0.88  # height of a picture's middle above the floor, metres
 SIDE = np.deg2rad(25)  # the camera's angle from the person's front, radians
 METRES = 2.15  # height that a picture covers, metres
 FOLLOW = 0.4  # seconds over which the camera's way is smoothed
+
+
+def span(
+    length: int, title: str, begin: float, end: float | None, keys: tuple[str, str] = ("begin", "end")
+) -> tuple[int, int]:
+    """The first frame of a piece of a clip, and the one after its last.
+
+    Args:
+        length: of the clip, frames. title: its name.
+        begin, end: of the piece, seconds; None for the clip's end.
+        keys: what the two were given as.
+
+    Raises:
+        InputError: where no frame lies between.
+    """
+    stop = length / FPS if end is None else min(end, length / FPS)
+    if not 0 <= begin < stop or round(begin * FPS) == round(stop * FPS):  # NaN is neither
+        given = f"{keys[0]} {begin:g}" + ("" if end is None else f" {keys[1]} {end:g}")
+        raise InputError(f"{given}: nothing between; {title} has {length / FPS:.1f} s")
+    return round(begin * FPS), round(stop * FPS)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ from memmlp.cli.options import outputs_option
 
 if TYPE_CHECKING:
     from memmlp.live.soak import TrackedMotion
-    from memmlp.live.stream import Stream
+    from memmlp.live.spaces import SpaceName
+    from memmlp.live.stream import RotationFormat, Stream
     from memmlp.motion.dataset import MotionDataset
 
 
@@ -31,8 +32,8 @@ def avatar(
     onnx: Path | None,
     frames: int,
     rounds: int,
-    space: str,
-    rotations: str,
+    space: SpaceName,
+    rotations: RotationFormat,
     outputs: Path,
     overrides: tuple[str, ...],
 ) -> None:

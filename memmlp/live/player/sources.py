@@ -14,7 +14,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.live.player.packets import Packet, Parse, Trackers
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
-from memmlp.live.spaces import Space
+from memmlp.live.spaces import Space, SpaceName
 from memmlp.live.trackers import Tracked, between
 from memmlp.motion.body import (
     FPS,
@@ -51,7 +51,7 @@ class PoseSource(Protocol):
     """
 
     name: str
-    space: str
+    space: SpaceName
     malformed: int
 
     def read(self) -> PoseSample | None:
@@ -120,7 +120,7 @@ class ClipSource:
         sleep: waits so many seconds; the machine's by default.
     """
 
-    space = "amass"
+    space: SpaceName = "amass"
     malformed = 0
 
     def __init__(
@@ -180,7 +180,7 @@ class PacketSource:
         InputError: where the port is taken.
     """
 
-    def __init__(self, name: str, port: int, parse: Parse, space: str):
+    def __init__(self, name: str, port: int, parse: Parse, space: SpaceName):
         self.parse, self.space, self.malformed = parse, space, 0
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.settimeout(WAIT)

@@ -1,0 +1,339 @@
+"""What a script or a notebook does with finished runs: open, compare, predict, draw, stream.
+
+Its names are those of the package (`memmlp.load_run`). Reading runs and results needs no torch, which is
+imported where a network is.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args, overload
+
+import numpy as np
+
+from memmlp.common.errors import InputError
+from memmlp.evaluation.units import UNITS
+from memmlp.live.stream import Offsets, Stream
+from memmlp.runs.lookup import check_trained, find_run, is_trained, list_runs
+from memmlp.runs.run import Run
+from memmlp.tables.measured import load
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from memmlp.config.open_run import OpenedRun
+    from memmlp.evaluation.ik import LBFGS
+    from memmlp.live.spaces import SpaceName
+    from memmlp.live.stream import RotationFormat
+    from memmlp.networks.window_model import WindowModel
+    from memmlp.render.take import Take
+
+StrPath = str | os.PathLike[str]
+Mode = Literal["stream", "window"]
+Branch = Literal["rotation", "position"]
+
+COLUMNS = ("run", "seed", "mode", "branch", "clip", "group", "frames", *UNITS)
+
+
+def load_run(name: StrPath, outputs: StrPath | None = None) -> TrainedRun:
+    """The finished run of a motion network.
+
+    Args:
+        name: an id, the beginning of one, or a run's folder.
+        outputs: the folder of runs; by default that of the command line, $MEMMLP_OUTPUTS or "outputs".
+
+    Raises:
+        InputError: where there is none, there are several, or it is not finished.
+    """
+    run = find_run(_outputs(outputs), os.fspath(name))
+    check_trained(run)
+    return TrainedRun(run)
+
+
+class Runs(Sequence["TrainedRun"]):
+    """The finished runs of motion networks below an outputs folder, the newest first.
+
+    They are those of the moment when this was made. A slice is the runs of a part.
+
+    Args:
+        outputs: the folder of runs; by default that of the command line, $MEMMLP_OUTPUTS or "outputs".
+
+    Raises:
+        InputError: where it has no runs' folder.
+    """
+
+    def __init__(self, outputs: StrPath | None = None):
+        folder = _outputs(outputs)
+        if not (folder / "runs").is_dir():
+            raise InputError(f"outputs {folder}: has no folder runs; allowed is what memmlp train wrote to")
+        self._runs = [TrainedRun(run) for run in list_runs(folder) if is_trained(run)]
+
+    @overload
+    def __getitem__(self, index: int) -> TrainedRun: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Runs: ...
+
+    def __getitem__(self, index: int | slice) -> TrainedRun | Runs:
+        """A run by its place, or the runs of a slice."""
+        if isinstance(index, slice):
+            part = object.__new__(Runs)
+            part._runs = self._runs[index]
+            return part
+        return self._runs[index]
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self._runs)
+
+    def __repr__(self) -> str:
+        return f"Runs({self._runs})"
+
+    def per_clip(self) -> pd.DataFrame:
+        """The rows of all runs in one frame (`TrainedRun.per_clip`)."""
+        return _frame(row for run in self._runs for row in run._rows())
+
+
+class TrainedRun(os.PathLike[str]):
+    """A finished run of a motion network: its config, its results, its network.
+
+    Made by `load_run` and `Runs`. Config and results need the run's folder alone. `clips`, `model` and
+    `predict` need its data too; a relative path in the config counts from the current folder, as it did in
+    training.
+
+    Attributes:
+        id: 16 hex digits.
+        folder: where it lies, absolute.
+    """
+
+    def __init__(self, run: Run):
+        self._run = Run(run.folder.resolve())
+        self.id: str = self._run.id
+        self.folder: Path = self._run.folder
+
+    def __fspath__(self) -> str:
+        """The folder, so that a run stands wherever a path of one does."""
+        return str(self.folder)
+
+    def __repr__(self) -> str:
+        return f"TrainedRun({self.id!r})"
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """The resolved config, a dict of dicts."""
+        return self._run.config
+
+    @property
+    def seed(self) -> int:
+        """The seed of its training."""
+        return int(self.config["seed"])
+
+    @property
+    def results(self) -> dict[str, dict[str, dict[str, float]]]:
+        """Mode -> branch -> metric, the mean over the test clips, in the units of `per_clip`.
+
+        Raises InputError where a file of results is damaged.
+        """
+        return {
+            mode: {branch: _numbers(errors) for branch, errors in branches.items()}
+            for mode, branches in sorted(load(self.folder).means.items())
+        }
+
+    def per_clip(self) -> pd.DataFrame:
+        """One row for each mode, branch and test clip.
+
+        Columns are run, seed, mode, branch, clip, group (the clips of one take or subject have one), frames
+        at 60 Hz, and the metrics, lower is better, whose units are in `.attrs["units"]`: MPJRE and geodesic
+        in degrees (NaN in the position branch), MPJPE and the other PE in cm, MPJVE in cm/s, Jitter in
+        10^2 m/s^3. A network without a position branch has the joints of its rotations there.
+
+        Raises:
+            InputError: where pandas is not installed, or a file of results is damaged.
+        """
+        return _frame(self._rows())
+
+    @property
+    def clips(self) -> list[str]:
+        """The names of its test clips. Raises InputError where its data is not there or has changed."""
+        return list(self._opened.test.names)
+
+    @cached_property
+    def model(self) -> WindowModel:
+        """The trained network, a torch module in evaluation mode on the processor."""
+        return self._opened.network()
+
+    def predict(self, clip: str, mode: Mode = "stream") -> Prediction:
+        """What the network makes of a test clip.
+
+        Args:
+            clip: one of `clips`.
+            mode: "stream", frame by frame with the network's own past, as live; or "window", in
+                non-overlapping windows.
+
+        Raises:
+            InputError: for another clip or mode, or where its data is not there or has changed.
+        """
+        from memmlp.config.open_run import clip_of
+        from memmlp.evaluation.predictions import predict_clip
+
+        _check("mode", mode, get_args(Mode))
+        arrays = predict_clip(self.model, clip_of(self._opened.test, clip, "clip"), mode)
+        learned = "position" in self.model.branches
+        return Prediction(
+            run=self.id,
+            clip=clip,
+            mode=mode,
+            true_positions=arrays["true_positions"],
+            true_rotations=arrays["true_rotations"],
+            positions=arrays["predicted_positions"],
+            rotations=arrays["predicted_rotations"],
+            joints=arrays["predicted_positions_of_position_branch"] if learned else None,
+        )
+
+    def stream(
+        self,
+        *,
+        space: SpaceName = "amass",
+        rotations: RotationFormat = "matrix",
+        offsets: Offsets | None = None,
+        ik: LBFGS | None = None,
+    ) -> Stream:
+        """The network to be fed live, from its ONNX file; the arguments are those of `Stream`.
+
+        Raises InputError as that does, and where the run has no ONNX file yet.
+        """
+        return Stream(self._run, space=space, rotations=rotations, offsets=offsets, ik=ik)
+
+    @cached_property
+    def _opened(self) -> OpenedRun:
+        """The run with its experiment and data."""
+        from memmlp.config.open_run import open_found
+
+        return open_found(self._run)
+
+    def _rows(self) -> Iterator[dict[str, Any]]:
+        """The rows of `per_clip`."""
+        measured = load(self.folder)
+        for mode, branches in sorted(measured.means.items()):
+            for branch in branches:
+                for clip, modes in measured.clips.items():
+                    facts = {"clip": clip, "group": measured.group(clip), "frames": modes[mode]["frames"]}
+                    about = {"run": self.id, "seed": self.seed, "mode": mode, "branch": branch}
+                    yield about | facts | _numbers(modes[mode][branch])
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """A test clip of N frames at 60 Hz as a network predicts it, beside the truth.
+
+    Positions are metres in AMASS' world (Z up); local rotations are matrices, the root's global.
+
+    Attributes:
+        run: the run's id. clip: the clip's name. mode: "stream" or "window".
+        true_positions, true_rotations: (N, 22, 3) and (N, 22, 3, 3).
+        positions: of the rotation branch (N, 22, 3): forward kinematics, the head on its tracker.
+        rotations: of the rotation branch (N, 22, 3, 3).
+        joints: of the position branch (N, 22, 3); None for a network without one.
+    """
+
+    run: str
+    clip: str
+    mode: Mode
+    true_positions: np.ndarray = field(repr=False)
+    true_rotations: np.ndarray = field(repr=False)
+    positions: np.ndarray = field(repr=False)
+    rotations: np.ndarray = field(repr=False)
+    joints: np.ndarray | None = field(repr=False)
+
+    def __len__(self) -> int:
+        """N."""
+        return len(self.true_positions)
+
+    def errors(self, branch: Branch = "rotation") -> np.ndarray:
+        """Each joint's distance from the truth (N, 22), cm; their mean is the clip's MPJPE.
+
+        Raises InputError for another branch, or one that the network has not.
+        """
+        return self._take(branch).errors[branch]
+
+    def draw(
+        self,
+        path: StrPath,
+        *,
+        branch: Branch = "rotation",
+        begin: float = 0.0,
+        end: float | None = None,
+        poses: int = 6,
+    ) -> Path:
+        """Draw the truth and the prediction, coloured by error.
+
+        Args:
+            path: FILE.png, so many poses in a row; FILE.gif or .mp4, a film at 30 pictures a second.
+            branch: whose joints are drawn.
+            begin, end: of the piece, seconds; by default the whole clip.
+            poses: of a PNG, evenly spaced, 1 to 20.
+
+        Returns:
+            The file's path.
+
+        Raises:
+            InputError: for another kind of file, a folder that is not there, another branch, a piece without
+                frames, a number of poses out of range, or where MP4 is asked for and PyAV is not installed.
+        """
+        from memmlp.render.picture import check_picture, write_picture
+        from memmlp.render.take import span
+
+        file = Path(path)
+        check_picture(file)
+        if poses not in range(1, 21):
+            raise InputError(f"poses {poses}: allowed are 1 to 20")
+        first, last = span(len(self), self.clip, begin, end)
+        write_picture(file, self._take(branch, first, last), poses)
+        return file
+
+    def _take(self, branch: Branch, first: int = 0, last: int | None = None) -> Take:
+        """The frames of a branch from one up to another, to be drawn."""
+        from memmlp.render.take import Take
+
+        _check("branch", branch, [name for name, joints in self._joints.items() if joints is not None])
+        joints = self._joints[branch]
+        assert joints is not None
+        return Take(self.clip, self.true_positions[first:last], {branch: joints[first:last]}, start=first)
+
+    @property
+    def _joints(self) -> dict[str, np.ndarray | None]:
+        return {"rotation": self.positions, "position": self.joints}
+
+
+def _outputs(given: StrPath | None) -> Path:
+    """The outputs folder of an argument, or the command line's."""
+    return Path(os.environ.get("MEMMLP_OUTPUTS", "outputs") if given is None else given)
+
+
+def _check(key: str, value: object, allowed: Iterable[object]) -> None:
+    """Raise InputError for a value that is none of the allowed ones."""
+    known = list(allowed)
+    if value not in known:
+        raise InputError(f"{key} {value}: allowed are {', '.join(map(str, known))}")
+
+
+def _numbers(errors: Mapping[str, Any]) -> dict[str, float]:
+    """Metrics as numbers; files hold NaN as a word."""
+    return {name: float(value) for name, value in errors.items()}
+
+
+def _frame(rows: Iterable[dict[str, Any]]) -> pd.DataFrame:
+    """Rows as a frame with the units of its metrics. Raises InputError where pandas is not installed."""
+    try:
+        import pandas as pd
+    except ImportError:
+        raise InputError(
+            "per_clip: needs pandas, pip install 'memmlp[notebook]'; allowed without: results"
+        ) from None
+    frame = pd.DataFrame(list(rows), columns=list(COLUMNS))
+    frame.attrs["units"] = dict(UNITS)
+    return frame

@@ -1,0 +1,388 @@
+"""What a script or a notebook does with finished runs, and what a type checker knows of it."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import shutil
+import subprocess
+import sys
+import venv
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from PIL import Image
+
+import memmlp
+from memmlp.common.files import read_json, write_json
+from memmlp.evaluation.units import UNITS
+from memmlp.runs.lookup import list_runs
+
+ROOT = Path(memmlp.__file__).parents[1]
+NAMES = ["InputError", "Offsets", "Pose", "Prediction", "Runs", "Stream", "TrainedRun", "load_run"]
+UPRIGHT = ((0.0, 1.6, 0.0), np.eye(3))
+
+
+@pytest.fixture(autouse=True)
+def _where_it_was_trained(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(home)
+
+
+@pytest.fixture(scope="module")
+def run(home: Path) -> memmlp.TrainedRun:
+    (only,) = memmlp.Runs(home / "outputs")
+    return only
+
+
+@pytest.fixture(scope="module")
+def prediction(home: Path, run: memmlp.TrainedRun) -> memmlp.Prediction:
+    with contextlib.chdir(home):
+        return run.predict(run.clips[0])
+
+
+@pytest.fixture
+def three(run: memmlp.TrainedRun, tmp_path: Path) -> memmlp.Runs:
+    """The run and two copies of it under other ids, started later and earlier, of seeds 1 and 2."""
+    shutil.copytree(run.folder, tmp_path / "runs" / run.id)
+    for seed, started in ((1, "9"), (2, "0")):
+        folder = shutil.copytree(run.folder, tmp_path / "runs" / (str(seed) * 16))
+        write_json(folder / "manifest.json", read_json(folder / "manifest.json") | {"started": started})
+        (folder / "config.yaml").write_text(yaml.safe_dump(run.config | {"seed": seed}))
+    return memmlp.Runs(tmp_path)
+
+
+def refused(*words: str) -> contextlib.AbstractContextManager[object]:
+    """An InputError of one line that begins with the first of these words and has the others after it."""
+    pattern = r"^(?![\s\S]*\n)" + ".*".join(map(re.escape, words))
+    return pytest.raises(memmlp.InputError, match=pattern)
+
+
+# Runs
+
+
+def test_a_run_is_found_by_its_id_its_beginning_and_its_folder(run: memmlp.TrainedRun):
+    for name in (run.id, run.id[:6], run.folder, f"outputs/runs/{run.id}", run):
+        found = memmlp.load_run(name, "outputs")
+        assert (found.id, found.folder) == (run.id, run.folder)
+
+
+def test_outputs_are_those_of_the_command_line(
+    run: memmlp.TrainedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    assert memmlp.load_run(run.id).id == memmlp.Runs()[0].id == run.id
+    monkeypatch.setenv("MEMMLP_OUTPUTS", str(tmp_path))
+    with refused(f"run '{run.id}'", str(tmp_path)):
+        memmlp.load_run(run.id)
+    with refused("outputs", str(tmp_path)):
+        memmlp.Runs()
+
+
+def test_what_is_no_trained_network_is_refused(run: memmlp.TrainedRun):
+    (codes,) = [found for found in list_runs("outputs") if found.id != run.id]
+    for name, word in (("nobody", "nobody"), ("", "''"), (codes.id, "not a finished Mem-MLP run")):
+        with refused("run", word):
+            memmlp.load_run(name)
+
+
+def test_an_unfinished_run_is_none_of_the_runs(run: memmlp.TrainedRun, three: memmlp.Runs, tmp_path: Path):
+    (tmp_path / "runs" / run.id / "DONE").unlink()
+    assert [found.seed for found in memmlp.Runs(tmp_path)] == [1, 2]
+    with refused(f"run {run.id}", "not a finished"):
+        memmlp.load_run(run.id, tmp_path)
+
+
+def test_runs_are_a_sequence_the_newest_first(three: memmlp.Runs):
+    assert [run.seed for run in three] == [1, 0, 2]
+    assert (len(three), three[-1].seed) == (3, 2)
+    rest = three[1:]
+    assert isinstance(rest, memmlp.Runs)
+    assert [run.seed for run in rest] == [0, 2]
+    assert repr(rest) == f"Runs([{three[1]!r}, TrainedRun('{'2' * 16}')])"
+
+
+def test_an_outputs_folder_without_runs_is_refused(tmp_path: Path):
+    with refused(f"outputs {tmp_path / 'no'}", "allowed"):
+        memmlp.Runs(tmp_path / "no")
+    (tmp_path / "runs").mkdir()
+    assert len(memmlp.Runs(tmp_path)) == 0
+
+
+# Results
+
+
+def test_config_and_results_are_those_of_the_folder(run: memmlp.TrainedRun):
+    config = yaml.safe_load((run.folder / "config.yaml").read_text())
+    assert (run.config, run.seed) == (config, 0)
+    assert list(run.results) == ["stream", "window"]
+    for mode, branches in run.results.items():
+        (file,) = run.folder.glob(f"evaluations/{mode}-*.json")
+        assert branches == read_json(file)["mean"]
+
+
+def test_per_clip_results_are_a_frame(run: memmlp.TrainedRun):
+    frame = run.per_clip()
+    facts = ["run", "seed", "mode", "branch", "clip", "group", "frames"]
+    assert list(frame.columns) == [*facts, *UNITS]
+    assert frame.attrs["units"]["MPJPE"] == "cm"
+    pairs = [(mode, branch) for mode in ("stream", "window") for branch in ("rotation", "position")]
+    assert list(frame[["mode", "branch"]].itertuples(index=False, name=None)) == pairs  # one test clip
+    for row, (mode, branch) in zip(frame.to_dict("records"), pairs, strict=True):
+        (file,) = run.folder.glob(f"evaluations/{mode}-*.json")
+        (clip,) = read_json(file)["clips"]
+        assert (row["clip"], row["group"], row["frames"]) == (clip["name"], clip["group"], clip["frames"])
+        assert {name: row[name] for name in clip[branch]} == clip[branch]
+        assert np.isnan(row["MPJRE"]) == (branch == "position")
+
+
+def test_the_rows_of_all_runs_are_one_frame(three: memmlp.Runs):
+    whole = three.per_clip()
+    pd.testing.assert_frame_equal(whole, pd.concat([run.per_clip() for run in three], ignore_index=True))
+    assert whole["seed"].unique().tolist() == [1, 0, 2]
+    assert whole.attrs["units"] == UNITS
+    assert list(three[:0].per_clip().columns) == list(whole.columns)
+
+
+def test_a_metric_that_is_no_number_is_nan(three: memmlp.Runs):
+    """As of a clip too short for it; JSON has a word for it."""
+    (file,) = three[0].folder.glob("evaluations/stream-*.json")
+    report = {key: value for key, value in read_json(file).items() if key != "digest"}
+    report["clips"][0]["rotation"]["Jitter"] = "nan"
+    write_json(file, report)
+    assert three.per_clip()["Jitter"].isna().sum() == 1
+
+
+def test_a_damaged_file_of_results_is_named(three: memmlp.Runs):
+    (file,) = three[0].folder.glob("evaluations/stream-*.json")
+    file.write_text(file.read_text().replace("squat", "sit"))
+    for read in (three.per_clip, lambda: three[0].results):
+        with refused(str(file)):
+            read()
+
+
+def test_without_pandas_one_line_says_so(run: memmlp.TrainedRun, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with refused("per_clip: needs pandas", "memmlp[notebook]"):
+        run.per_clip()
+
+
+# Predictions
+
+
+def test_a_prediction_is_what_was_measured(run: memmlp.TrainedRun, prediction: memmlp.Prediction):
+    assert (prediction.run, prediction.clip, prediction.mode) == (run.id, run.clips[0], "stream")
+    n = len(prediction)
+    frame = run.per_clip().set_index(["mode", "branch"])
+    for mode, found in (("stream", prediction), ("window", run.predict(run.clips[0], mode="window"))):
+        assert frame.loc[(mode, "rotation"), "frames"] == n
+        for branch in ("rotation", "position"):
+            errors = found.errors(branch)
+            assert errors.shape == (n, 22)
+            assert errors.mean() == pytest.approx(frame.loc[(mode, branch), "MPJPE"], rel=1e-4)
+
+
+def test_a_predictions_arrays(prediction: memmlp.Prediction):
+    n = len(prediction)
+    assert prediction.true_positions.shape == prediction.positions.shape == (n, 22, 3)
+    assert prediction.joints is not None
+    assert prediction.joints.shape == (n, 22, 3)
+    for rotations in (prediction.rotations, prediction.true_rotations):
+        product = rotations @ rotations.swapaxes(-1, -2)
+        np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), (n, 22, 3, 3)), atol=1e-4)
+    head = prediction.positions[:, 15] - prediction.true_positions[:, 15]
+    np.testing.assert_allclose(head, 0, atol=1e-5)  # on its tracker
+
+
+def test_a_network_without_a_position_branch_has_no_joints(
+    run: memmlp.TrainedRun, monkeypatch: pytest.MonkeyPatch
+):
+    alone = memmlp.load_run(run)
+    monkeypatch.setattr(alone.model, "branches", frozenset({"rotation"}))
+    found = alone.predict(alone.clips[0], "window")
+    assert found.joints is None
+    assert found.errors().shape == (len(found), 22)
+    with refused("branch position", "allowed are rotation"):
+        found.errors("position")
+
+
+def test_the_model_is_a_torch_module_that_is_ready(run: memmlp.TrainedRun):
+    assert not run.model.training
+    assert run.model.count_parameters() > 0
+    assert run.model is run.model
+
+
+def test_unknown_clips_and_modes_are_one_line(run: memmlp.TrainedRun):
+    with refused("clip nobody", run.clips[0]):
+        run.predict("nobody")
+    with refused("mode live", "stream, window"):
+        run.predict(run.clips[0], "live")  # type: ignore[arg-type]
+
+
+def test_a_picture_is_drawn(prediction: memmlp.Prediction, tmp_path: Path):
+    one, two = (prediction.draw(tmp_path / f"{n}.png", poses=n) for n in (1, 2))
+    assert one == tmp_path / "1.png"
+    with Image.open(one) as narrow, Image.open(two) as wide:
+        assert wide.size[0] > narrow.size[0]
+    assert prediction.draw(tmp_path / "3.png", poses=1, branch="position").read_bytes() != one.read_bytes()
+
+
+def test_a_film_is_of_the_piece(prediction: memmlp.Prediction, tmp_path: Path):
+    path = prediction.draw(str(tmp_path / "film.gif"), begin=0.5, end=0.6)
+    with Image.open(path) as film:
+        assert film.n_frames == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        ("a.avi", {}, ("path ", "a.avi", ".png, .gif, .mp4")),
+        ("no/a.png", {}, ("path ", "no folder", "no")),
+        ("a.png", {"branch": "combined"}, ("branch combined", "rotation, position")),
+        ("a.png", {"begin": 900}, ("begin 900", "nothing between")),
+        ("a.png", {"begin": -1}, ("begin -1", "nothing between")),
+        ("a.png", {"begin": float("nan")}, ("begin nan", "nothing between")),
+        ("a.png", {"begin": 1, "end": 1}, ("begin 1 end 1", "nothing between")),
+        ("a.png", {"begin": 0.501, "end": 0.505}, ("begin 0.501 end 0.505", "nothing between")),
+        ("a.png", {"poses": 0}, ("poses 0", "1 to 20")),
+    ],
+)
+def test_bad_input_to_a_picture_is_one_line(
+    prediction: memmlp.Prediction, tmp_path: Path, name: str, options: dict, words: tuple[str, ...]
+):
+    with refused(*words):
+        prediction.draw(tmp_path / name, **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+# Live
+
+
+def test_a_run_streams(run: memmlp.TrainedRun):
+    stream = run.stream(space="unity", rotations="quaternion")
+    assert isinstance(stream, memmlp.Stream)
+    pose = stream.step(UPRIGHT, None, None, time=0.0)
+    assert isinstance(pose, memmlp.Pose)
+    assert (pose.rotations.shape, stream.space.name) == ((22, 4), "unity")
+    assert memmlp.Stream(run).network.path == stream.network.path
+
+
+def test_streams_refuse_as_ever(run: memmlp.TrainedRun, three: memmlp.Runs):
+    with refused("space=blender"):
+        run.stream(space="blender")  # type: ignore[arg-type]
+    shutil.rmtree(three[0].folder / "deployments")
+    with refused(str(three[0].folder), "step.onnx"):
+        three[0].stream()
+
+
+# The package
+
+
+def test_dir_is_the_api():
+    assert dir(memmlp) == sorted(memmlp.__all__) == NAMES
+    for name in NAMES:
+        assert getattr(memmlp, name).__name__ == name
+    with pytest.raises(AttributeError, match="Strem"):
+        memmlp.Strem  # noqa: B018
+
+
+def test_importing_it_is_quick():
+    """The names come when they are asked for; runs and results do without torch."""
+    loaded = "print(sorted({'hydra', 'numpy', 'onnxruntime', 'pandas', 'torch'} & set(sys.modules)));"
+    later = "memmlp.load_run; print(sorted({'hydra', 'torch'} & set(sys.modules)))"
+    code = f"import sys, memmlp; {loaded} {later}"
+    ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert ran.stdout == "[]\n[]\n"
+
+
+RIGHT = """
+from typing import assert_type
+
+import numpy as np
+import pandas as pd
+
+import memmlp
+
+run = memmlp.load_run("0123", outputs="outputs")
+assert_type(memmlp.Runs("outputs")[0], memmlp.TrainedRun)
+assert_type(memmlp.Runs()[1:], memmlp.Runs)
+assert_type(memmlp.Runs().per_clip(), pd.DataFrame)
+assert_type(run.results["stream"]["rotation"]["MPJPE"], float)
+prediction = run.predict("clip", mode="window")
+assert_type(prediction, memmlp.Prediction)
+prediction.draw("clip.gif", begin=1, end=2.5)
+parameters: int = run.model.count_parameters()
+offsets = memmlp.Offsets(np.zeros((3, 3)), np.zeros((3, 3, 3)))
+pose = memmlp.Stream(run, space="unity", offsets=offsets).step(((0, 1, 0), np.eye(3)), None, None, time=0.5)
+assert_type(pose, memmlp.Pose)
+assert_type(run.stream(rotations="quaternion"), memmlp.Stream)
+"""
+
+WRONG = """
+import memmlp
+run = memmlp.load_run("0123", output="outputs")
+memmlp.Runs(folder="outputs")
+memmlp.Runs()[0].per_clips()
+run.predict("clip", mod="window")
+run.predict("clip", "windows")
+run.predict("clip").draw("a.png", frames=3)
+run.predict("clip").error()
+run.seed = "0"
+run.stream(spcae="unity")
+memmlp.Stream("run", space="untiy")
+memmlp.Stream("run").step(None, None, None).position
+memmlp.Strem("run")
+memmlp.load_run(3)
+"""
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The Python of an environment where the package and what it needs are installed."""
+    folder = tmp_path_factory.mktemp("user") / "venv"
+    venv.create(folder, symlinks=True)
+    (packages,) = folder.glob("lib/python*/site-packages")
+    places = dict.fromkeys(str(Path(module.__file__).parents[1]) for module in (memmlp, np, pd))
+    (packages / "installed.pth").write_text("\n".join(places))
+    return folder / "bin" / "python"
+
+
+def complaints(python: Path, folder: Path) -> Iterator[tuple[str, int, str]]:
+    """What mypy --strict has to say to a user's scripts: file, line, message.
+
+    It keeps what it learned of torch where the project's own mypy does, beside it.
+    """
+    mypy = [sys.executable, "-m", "mypy", "--strict", "--no-error-summary", "--hide-error-context"]
+    options = [f"--python-executable={python}", f"--cache-dir={ROOT / '.mypy_cache' / 'scripts'}"]
+    ran = subprocess.run(
+        [*mypy, *options, "right.py", "wrong.py"], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert ran.stderr == ""
+    for line in ran.stdout.splitlines():
+        file, number, kind, message = line.split(":", 3)
+        if kind.strip() == "error":
+            yield file, int(number), message
+
+
+def test_mypy_of_a_script_sees_the_types(python: Path, tmp_path: Path):
+    """A misspelt name, argument or value is an error, and nothing that is right is one."""
+    (tmp_path / "right.py").write_text(RIGHT)
+    (tmp_path / "wrong.py").write_text(WRONG)
+    found = list(complaints(python, tmp_path))
+    assert [complaint for complaint in found if complaint[0] != "wrong.py"] == []
+    lines = WRONG.splitlines()
+    assert {number for _, number, _ in found} == set(range(3, len(lines) + 1)), found
+
+
+# The guide
+
+
+def test_the_guides_code_runs(home: Path, capsys: pytest.CaptureFixture[str]):
+    guide = (ROOT / "docs" / "guides" / "notebook.md").read_text(encoding="utf-8")
+    names: dict[str, object] = {}
+    for block in re.findall(r"```python\n(.*?)```", guide, re.DOTALL):
+        exec(block, names)
+    assert (home / "clip.png").exists()
+    assert "(22, 3) (22, 4)" in capsys.readouterr().out
