@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import command_line
+import processes
 import pytest
 from filelock import FileLock
 
@@ -19,6 +20,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     here = Path(__file__).parent
     ranks = {here / f"{name}.py": rank for rank, name in enumerate(LONGEST)}
     items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
+    for item in items:
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT))
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish() -> None:
+    """What a test process left that died itself."""
+    processes.end_all()
 
 
 class Ran(NamedTuple):
@@ -29,6 +39,8 @@ class Ran(NamedTuple):
     err: str
 
 
+processes.mark()
+
 # Networks are tiny and test processes many: more threads only wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -38,6 +50,8 @@ LONGEST = (
     "cli/test_sweep", "live/test_full_graph", "pipeline/test_pipeline", "deploy/test_deployment",
     "live/test_stream", "kills/test_command", "kills/test_training",
 )  # fmt: skip
+
+SLOW_TIMEOUT = 3600  # seconds: ends what hangs, but not what is slow on a machine with much other work
 
 INT8 = "export.precision=int8"
 Memmlp = Callable[..., Ran]
@@ -59,6 +73,13 @@ def clean(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(autouse=True)
 def _own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     clean(monkeypatch)
+
+
+@pytest.fixture(autouse=True)
+def _no_process_is_left() -> Iterator[None]:
+    """What a test started ends with it, whether it passes, fails, or takes too long."""
+    yield
+    processes.end_all()
 
 
 @pytest.fixture(scope="session")

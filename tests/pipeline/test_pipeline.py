@@ -1,7 +1,6 @@
 """The whole way at profile=tiny, by the commands a person would type."""
 
 import json
-import os
 import re
 from pathlib import Path
 
@@ -170,9 +169,9 @@ def test_foreign_targets_in_a_runs_config_are_refused(home, tmp_path):
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in shipped("conf/experiment").glob("*.yaml")))
-def test_every_experiment_trains_and_streams(home, name):
+def test_every_experiment_trains_and_streams(home, name, monkeypatch: pytest.MonkeyPatch):
     """Two steps and one validation of each, on the prepared data, without export."""
-    os.chdir(home)
+    monkeypatch.chdir(home)
     cfg = composed([f"experiment={name}", *TINY, "optim.steps=2"])
     experiment = build_experiment(cfg)
     data = experiment.data.prepare()
