@@ -101,7 +101,7 @@ class Submitit:
 
 @contextlib.contextmanager
 def _interruptible() -> Iterator[None]:
-    """Processes started herein hear SIGINT, by which submitit cancels, even where this one ignores it (nohup)."""
+    """Processes started herein hear SIGINT, by which submitit cancels, where this one ignores it (nohup)."""
     before = signal.getsignal(signal.SIGINT)
     if before is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
