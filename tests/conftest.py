@@ -16,11 +16,13 @@ from filelock import FileLock
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest files first; the others as they were."""
+    """The longest files first, the others as they were; what needs a trained run is slow."""
     here = Path(__file__).parent
     ranks = {here / f"{name}.py": rank for rank, name in enumerate(LONGEST)}
     items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
     for item in items:
+        if "home" in item.fixturenames or "tiny_home" in item.fixturenames:
+            item.add_marker(pytest.mark.slow)
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT))
 
@@ -99,9 +101,9 @@ def tiny_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def home(tiny_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the folder with one finished run."""
+    """A copy of the folder with one finished run, for one test."""
     return Path(shutil.copytree(tiny_home, tmp_path_factory.mktemp("home") / "home"))
 
 

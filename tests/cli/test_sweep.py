@@ -33,7 +33,8 @@ def home(tmp_path_factory) -> Path:
     """A folder where a sweep of three arms, one of which diverges, was run."""
     folder = tmp_path_factory.mktemp("sweep")
     write(folder, ARMS)
-    (folder / "first.txt").write_text(run_apart(folder, "sweep", "trial.yaml", *TINY, code=1))
+    said = run_apart(folder, "sweep", "trial.yaml", *TINY, "--workers", "1", code=1)
+    (folder / "first.txt").write_text(said)
     return folder
 
 
@@ -109,6 +110,7 @@ def test_seeds_come_one_after_another_each_with_all_arms(home: Path, monkeypatch
     assert re.search(r"none +done .* cm +waiting", said)
 
 
+@pytest.mark.slow
 def test_the_first_failure_ends_the_sweep_where_that_is_wanted(tmp_path: Path):
     endless, failing = ["memory=none", "optim.steps=100000"], ["memory=none", "optim.lr=1e30"]
     write(tmp_path, {"endless": endless, "failing": failing, "late": ["memory=none"]})
@@ -151,6 +153,7 @@ def test_a_plan_is_kept_until_the_data_changes(home: Path, monkeypatch: pytest.M
     assert orphans(chosen, planned(chosen, outputs)) == []
 
 
+@pytest.mark.slow
 def test_an_interrupted_sweep_ends_its_workers_and_goes_on_later(tmp_path: Path):
     write(tmp_path, {"none": ["memory=none"]})
     line = [*MAIN, "sweep", "trial.yaml", *TINY, "optim.steps=100000"]

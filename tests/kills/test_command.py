@@ -21,6 +21,7 @@ MOMENTS = (
 )
 
 
+@pytest.mark.slow
 def test_kill_9_then_again_gives_the_same_model(tiny_home: Path, tmp_path: Path):
     """The whole command killed as soon as it comes to each moment, and then let finish."""
     line = [*MAIN, "train", *TINY]

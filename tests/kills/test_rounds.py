@@ -6,15 +6,18 @@ import json
 import subprocess
 from pathlib import Path
 
+import pytest
 import yaml
-from command_line import MAIN, TINY, run, run_apart
+from command_line import MAIN, TINY, run
 from processes import started, until
 
 from memmlp.runs.lookup import list_runs
 
-WORDS = ["sweep", "trial.yaml", *TINY, "data.synth.minutes=1", "data.split.test=0.5", "executor=debug"]
+SETTINGS = ["data.synth.minutes=1", "data.split.test=0.5", "evaluation.modes=[stream]", "executor=debug"]
+WORDS = ["sweep", "trial.yaml", *TINY, *SETTINGS]
 
 
+@pytest.mark.slow
 def test_rounds_go_on_after_a_kill(tmp_path: Path):
     """Of two arms that hardly differ, which three seeds show."""
     hardly = ["memory=none", "optim.weight_decay=1.001e-4"]
@@ -26,7 +29,7 @@ def test_rounds_go_on_after_a_kill(tmp_path: Path):
             lambda: any(one.done for one in list_runs(tmp_path / "outputs")), "the first run is done", killed
         )
     assert not list(tmp_path.glob("outputs/sweeps/*/rounds.json"))
-    said = run_apart(tmp_path, *WORDS, "--until-decided")
+    said = run(tmp_path, *WORDS, "--until-decided")
     assert "all verdicts are decided" in said
     runs = list_runs(tmp_path / "outputs")
     assert len(runs) == 6

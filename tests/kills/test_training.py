@@ -9,6 +9,7 @@ import textwrap
 from contextlib import AbstractContextManager
 from pathlib import Path
 
+import pytest
 import tiny
 import torch
 from processes import started, until
@@ -54,6 +55,7 @@ def passed(run: Run, step: int) -> bool:
     return run.checkpoint.exists() and checkpoint.read(run.checkpoint)[1]["step"] >= step
 
 
+@pytest.mark.slow
 def test_kill_9_at_any_moment_then_again_ends_in_the_same_weights(tmp_path: Path):
     """Real processes, killed at three unrelated moments (a write in progress among them by chance)."""
     broken = Run(tmp_path / "broken")
