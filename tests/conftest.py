@@ -53,7 +53,7 @@ LONGEST = (
     "live/test_stream", "kills/test_command", "kills/test_training",
 )  # fmt: skip
 
-SLOW_TIMEOUT = int(os.environ.get("ST", 3600))  # seconds: ends what hangs, but not what is slow on a machine with much other work
+SLOW_TIMEOUT = 3600  # seconds: ends what hangs, but not what is slow on a machine with much other work
 
 INT8 = "export.precision=int8"
 Memmlp = Callable[..., Ran]
