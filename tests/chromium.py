@@ -8,16 +8,15 @@ import json
 import os
 import shutil
 import subprocess
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
+from processes import until
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-SECONDS = 60  # until a wait fails
 
 
 class Browser:
@@ -83,11 +82,7 @@ class Browser:
 
     def wait(self, expression: str) -> Any:
         """The first value of an expression that is true."""
-        end = time.monotonic() + SECONDS
-        while not (value := self.value(expression)):
-            assert time.monotonic() < end, f"never: {expression}; {self.errors}"
-            time.sleep(0.05)
-        return value
+        return until(lambda: self.value(expression), f"{expression}; {self.errors}", self.process)
 
     def open(self, url: str) -> None:
         """Go to a page."""

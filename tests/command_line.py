@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import io
-import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from processes import finished
 
 from memmlp.cli.main import main
 
-MAIN = [sys.executable, "-c", "from memmlp.cli.main import main; main()"]  # for a process of its own
+# For a process of its own. Ctrl-C reaches it where the tests were started with SIGINT ignored (nohup, &).
+INTERRUPTIBLE = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+MAIN = [sys.executable, "-c", f"{INTERRUPTIBLE}; from memmlp.cli.main import main; main()"]
 TINY = [
     "profile=tiny",
     "data.synth.minutes=0.2",
@@ -49,7 +51,6 @@ def exit_code(arguments: Sequence[str]) -> int:
 
 def run_apart(folder: Path, *arguments: str, code: int = 0) -> str:
     """The same in a process of its own."""
-    line = [*MAIN, *arguments]
-    ran = subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False)
+    ran = finished([*MAIN, *arguments], cwd=folder)
     assert ran.returncode == code, ran.stdout + ran.stderr
     return ran.stdout + ran.stderr

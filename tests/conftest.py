@@ -5,20 +5,32 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import command_line
+import processes
 import pytest
 from filelock import FileLock
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest files first; the others as they were."""
+    """The longest files first, the others as they were; what needs a trained run is slow."""
     here = Path(__file__).parent
     ranks = {here / f"{name}.py": rank for rank, name in enumerate(LONGEST)}
     items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
+    for item in items:
+        if "home" in item.fixturenames or "tiny_home" in item.fixturenames:
+            item.add_marker(pytest.mark.slow)
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT))
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish() -> None:
+    """What a test process left that died itself."""
+    processes.end_all()
 
 
 class Ran(NamedTuple):
@@ -29,6 +41,8 @@ class Ran(NamedTuple):
     err: str
 
 
+processes.mark()
+
 # Networks are tiny and test processes many: more threads only wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -38,6 +52,8 @@ LONGEST = (
     "cli/test_sweep", "live/test_full_graph", "pipeline/test_pipeline", "deploy/test_deployment",
     "live/test_stream", "kills/test_command", "kills/test_training",
 )  # fmt: skip
+
+SLOW_TIMEOUT = 3600  # seconds: ends what hangs, but not what is slow on a machine with much other work
 
 INT8 = "export.precision=int8"
 Memmlp = Callable[..., Ran]
@@ -61,6 +77,13 @@ def _own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     clean(monkeypatch)
 
 
+@pytest.fixture(autouse=True)
+def _no_process_is_left() -> Iterator[None]:
+    """What a test started ends with it, whether it passes, fails, or takes too long."""
+    yield
+    processes.end_all()
+
+
 @pytest.fixture(scope="session")
 def tiny_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with one finished run, int8 included, and what it printed; made once for all processes.
@@ -78,9 +101,9 @@ def tiny_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def home(tiny_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the folder with one finished run."""
+    """A copy of the folder with one finished run, for one test."""
     return Path(shutil.copytree(tiny_home, tmp_path_factory.mktemp("home") / "home"))
 
 

@@ -6,8 +6,10 @@ settled among them (memmlp.sweep.worker).
 
 from __future__ import annotations
 
+import contextlib
 import logging
-from collections.abc import Callable, Mapping
+import signal
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -97,7 +99,21 @@ class Submitit:
 
     def submit(self, work: Callable[[], None]) -> Submitted:
         """Start a worker."""
-        return Submitted(self.executor.submit(Requeued(work)))
+        with _interruptible():
+            return Submitted(self.executor.submit(Requeued(work)))
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """Processes started herein hear SIGINT, by which submitit cancels, where this one ignores it (nohup)."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        if before is signal.SIG_IGN:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def sbatch(folder: Path, options: Mapping[str, Any] | None = None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import os
@@ -18,6 +19,7 @@ import pytest
 from command_line import MAIN
 from conftest import Memmlp, one_line
 from PIL import Image
+from processes import PATIENCE, started
 
 from memmlp.live.player.packets import Packet
 from memmlp.live.player.sources import PacketSource
@@ -129,20 +131,18 @@ def test_a_taken_port_is_one_line(memmlp: Memmlp, finished: Run, option: str):
 
 
 class Watched:
-    """`memmlp live` in a process of its own."""
+    """`memmlp live` in a process of its own, until the test ends."""
 
-    def __init__(self, folder: Path, *arguments: str):
+    def __init__(self, stack: contextlib.ExitStack, folder: Path, *arguments: str):
         line = [*MAIN, "live", "--no-browser", "--port", "0", *arguments]
-        self.process = subprocess.Popen(
-            line, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        assert self.process.stdout is not None
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        self.process = stack.enter_context(started(line, cwd=folder, text=True, **pipes))
         self.greeting = self.process.stdout.readline()
         self.port = int(re.findall(r"http://127.0.0.1:(\d+)/", self.greeting)[0])
 
     def frames(self) -> Iterator[dict]:
-        """Yield the frames that it sends."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        """The frames that it sends."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE)
         connection.request("GET", "/events")
         for line in connection.getresponse():
             if line.startswith(b'data: {"number"'):
@@ -151,18 +151,26 @@ class Watched:
     def interrupt(self) -> tuple[int, str, str]:
         """Interrupt it as Ctrl-C does, and return its exit code and the rest of its output."""
         self.process.send_signal(signal.SIGINT)
-        out, err = self.process.communicate(timeout=60)
+        out, err = self.process.communicate(timeout=PATIENCE)
         return self.process.returncode, out, err
 
 
+@pytest.fixture
+def stack() -> Iterator[contextlib.ExitStack]:
+    with contextlib.ExitStack() as stack:
+        yield stack
+
+
 @pytest.mark.parametrize("source", ["clip", "udp"])
-def test_ctrl_c_ends_it_and_leaves_nothing(home: Path, finished: Run, source: str):
+def test_ctrl_c_ends_it_and_leaves_nothing(
+    home: Path, finished: Run, stack: contextlib.ExitStack, source: str
+):
     arguments = ["--hz", "72"]
     if source == "udp":
         free = PacketSource("UDP", 0, lambda data: Packet((None, None, None)), "amass")
         free.close()
         arguments = ["--udp", str(free.port), "--space", "unity"]
-    watched = Watched(home, finished.id, *arguments)
+    watched = Watched(stack, home, finished.id, *arguments)
     if source == "clip":
         frames = watched.frames()
         assert {"joints", "truth", "held", "ms"} <= set(next(frames))
@@ -174,19 +182,16 @@ def test_ctrl_c_ends_it_and_leaves_nothing(home: Path, finished: Run, source: st
 
 
 @pytest.mark.parametrize("kind", ["--udp", "--osc"])
-def test_a_clip_that_is_sent_is_predicted(home: Path, finished: Run, kind: str):
-    """In a space that sender and receiver name alike, the body stands upright on the floor."""
+def test_a_clip_that_is_sent_is_predicted(home: Path, finished: Run, stack: contextlib.ExitStack, kind: str):
+    """In a space that both name: the body stands upright on the floor."""
     free = PacketSource("any", 0, lambda data: Packet((None, None, None)), "amass")
     free.close()
     at = [kind, str(free.port), "--space", "unity"]
-    watched = Watched(home, finished.id, *at)
-    sender = subprocess.Popen(
-        [*MAIN, "live", finished.id, "--send", *at], cwd=home, stdout=subprocess.DEVNULL
-    )
-    frames = watched.frames()
-    seen = [next(frames) for _ in range(30)]
-    sender.kill()
-    sender.wait()
+    watched = Watched(stack, home, finished.id, *at)
+    sends = [*MAIN, "live", finished.id, "--send", *at]
+    with started(sends, cwd=home, stdout=subprocess.DEVNULL):
+        frames = watched.frames()
+        seen = [next(frames) for _ in range(30)]
     assert [f["number"] for f in seen] == list(range(seen[0]["number"], seen[0]["number"] + 30))
     assert all(f["truth"] is None and f["held"] == [] and f["malformed"] == 0 for f in seen)
     head = [f["joints"][3 * 15 + 1] for f in seen]

@@ -9,13 +9,13 @@ import re
 import shutil
 import signal
 import subprocess
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
 from command_line import MAIN, TINY, run, run_apart
+from processes import PATIENCE, ignoring_interrupts, started, until
 
 from memmlp.cli.sweep import split_executor
 from memmlp.common.errors import InputError
@@ -34,7 +34,8 @@ def home(tmp_path_factory) -> Path:
     """Run a sweep of three arms, one of which diverges, in a folder of its own."""
     folder = tmp_path_factory.mktemp("sweep")
     write(folder, ARMS)
-    (folder / "first.txt").write_text(run_apart(folder, "sweep", "trial.yaml", *TINY, code=1))
+    said = run_apart(folder, "sweep", "trial.yaml", *TINY, "--workers", "1", code=1)
+    (folder / "first.txt").write_text(said)
     return folder
 
 
@@ -110,6 +111,7 @@ def test_seeds_come_one_after_another_each_with_all_arms(home: Path, monkeypatch
     assert re.search(r"none +done .* cm +waiting", said)
 
 
+@pytest.mark.slow
 def test_the_first_failure_ends_the_sweep_where_that_is_wanted(tmp_path: Path):
     endless, failing = ["memory=none", "optim.steps=100000"], ["memory=none", "optim.lr=1e30"]
     write(tmp_path, {"endless": endless, "failing": failing, "late": ["memory=none"]})
@@ -119,8 +121,8 @@ def test_the_first_failure_ends_the_sweep_where_that_is_wanted(tmp_path: Path):
     assert "failing seed 0: failed, loss is nan" in said
     assert re.search(r"^failed: run .*: loss is nan", said, re.M)
     runs = list_runs(tmp_path / "outputs")
-    assert len(runs) <= 2  # the last arm's run was not begun
-    wait_for(lambda: not any(run.status == "running" for run in runs))
+    assert len(runs) <= 2  # the last arm's was not begun
+    until(lambda: not any(run.status == "running" for run in runs), "the workers end")
     assert [run.status for run in runs].count("failed") == 1
     assert "0 of 3 runs done" in run_apart(tmp_path, *words, code=1)  # a run that failed before ends it again
     assert len(list_runs(tmp_path / "outputs")) == len(runs)
@@ -169,27 +171,21 @@ def test_a_plan_is_kept_until_the_data_changes(home: Path, monkeypatch: pytest.M
     assert orphans(chosen, planned(chosen, outputs)) == []
 
 
+@pytest.mark.slow
 def test_an_interrupted_sweep_ends_its_workers_and_goes_on_later(tmp_path: Path):
     write(tmp_path, {"none": ["memory=none"]})
     line = [*MAIN, "sweep", "trial.yaml", *TINY, "optim.steps=100000"]
-    with subprocess.Popen(
-        line, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as process:
-        wait_for(lambda: any(run.step for run in list_runs(tmp_path / "outputs")))
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    with ignoring_interrupts(), started(line, cwd=tmp_path, text=True, **pipes) as process:
+        begun = lambda: any(run.step for run in list_runs(tmp_path / "outputs"))  # noqa: E731
+        until(begun, "the run's first steps", process)
         run = list_runs(tmp_path / "outputs")[0]
         assert run.status == "running"
         process.send_signal(signal.SIGINT)
-        said, _ = process.communicate(timeout=60)
+        said, _ = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130, said
     assert "interrupted" in said
-    wait_for(lambda: run.status == "stopped" or run.status == "lost")
-
-
-def wait_for(condition, seconds: float = 90) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it never came to that"
-        time.sleep(0.1)
+    until(lambda: run.status in ("stopped", "lost"), "its worker ends")
 
 
 @pytest.mark.parametrize(

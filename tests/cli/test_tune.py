@@ -24,7 +24,7 @@ TINY = [*BASE, "optim.validate_every=3"]
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run a search of three trials in a folder of its own."""
     folder = tmp_path_factory.mktemp("tune")
-    (folder / "said.txt").write_text(run_apart(folder, "tune", *TINY, "search.n_trials=3", "--workers", "2"))
+    (folder / "said.txt").write_text(run_apart(folder, "tune", *TINY, "search.n_trials=3", "--workers", "1"))
     return folder
 
 
@@ -67,7 +67,7 @@ def test_a_trial_of_two_seeds_goes_on_from_a_search_of_one(home: Path, tmp_path:
     """The first trial's first run is that of a search with one seed; its other run has the next seed."""
     shutil.copytree(home / "outputs/runs", tmp_path / "outputs/runs")
     shutil.copytree(home / "outputs/data", tmp_path / "outputs/data", copy_function=shutil.copy2)
-    words = ["search.n_trials=1", "search.seeds=2", "--workers", "2"]
+    words = ["search.n_trials=1", "search.seeds=2", "--workers", "1"]
     said = run_apart(tmp_path, "tune", *TINY, *words)
     assert "1 of 1 trials: 1 complete" in said
     (before,) = list(csv.DictReader((folder_of(home) / "trials.csv").read_text().splitlines()))[:1]
@@ -123,6 +123,7 @@ def test_bad_searches_are_refused_before_anything_runs(tmp_path: Path, word: str
     assert not (tmp_path / "outputs").exists()
 
 
+@pytest.mark.slow
 def test_what_counts_gives_a_search_of_its_own(tmp_path: Path):
     def folder(*words: str) -> str:
         return prepared([*TINY, *words], None, tmp_path).folder.name
@@ -138,6 +139,7 @@ def test_what_counts_gives_a_search_of_its_own(tmp_path: Path):
     assert folder("search.seeds=1") == base
 
 
+@pytest.mark.slow
 def test_a_search_is_named_after_what_its_trials_follow_from(tmp_path: Path):
     """The interval of validations decides which trials are pruned, how a network is used what they show."""
     names = {

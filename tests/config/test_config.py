@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from conftest import Memmlp, one_line
 from omegaconf import DictConfig, OmegaConf
+from processes import finished
 
 from memmlp.common.errors import InputError
 from memmlp.config import schema
@@ -261,7 +260,7 @@ def test_a_bad_command_line_is_one_line(
 )
 def test_a_bad_command_line_in_a_process_of_its_own(tmp_path: Path, arguments: list[str]):
     command = [sys.executable, "-m", "memmlp.cli.main", "train", *arguments]
-    ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=dict(os.environ))
+    ran = finished(command, cwd=tmp_path)
     assert (ran.returncode, ran.stdout) == (2, "")
     assert ran.stderr.startswith("memmlp: ")
     assert ran.stderr.count("\n") == 1

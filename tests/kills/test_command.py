@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import signal
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
 from command_line import MAIN, TINY, run
+from processes import started, until
 
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
@@ -21,15 +21,15 @@ MOMENTS = (
 )
 
 
+@pytest.mark.slow
 def test_kill_9_then_again_gives_the_same_model(tiny_home: Path, tmp_path: Path):
     """The whole command killed as soon as it comes to each moment, and then let finish."""
     line = [*MAIN, "train", *TINY]
     for moment in MOMENTS:
-        process = subprocess.Popen(line, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        while process.poll() is None and not list((tmp_path / "outputs").glob(moment)):
-            time.sleep(0.003)
-        process.kill()
-        assert process.wait() == -signal.SIGKILL
+        with started(line, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+            until(lambda at=moment: list((tmp_path / "outputs").glob(at)), moment, process)
+            process.kill()
+            assert process.wait() == -signal.SIGKILL
     run(tmp_path, "train", *TINY)
     whole = next(made for made in list_runs(tiny_home / "outputs") if "window" in made.results)
     killed = Run.of(tmp_path / "outputs", whole.id)

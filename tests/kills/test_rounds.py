@@ -3,34 +3,31 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
-import time
 from pathlib import Path
 
+import pytest
 import yaml
 from command_line import MAIN, TINY, run, run_apart
+from processes import started, until
 
 from memmlp.runs.lookup import list_runs
 
-WORDS = ["sweep", "trial.yaml", *TINY, "data.synth.minutes=1", "data.split.test=0.5", "executor=debug"]
+SETTINGS = ["data.synth.minutes=1", "data.split.test=0.5", "evaluation.modes=[stream]", "executor=debug"]
+WORDS = ["sweep", "trial.yaml", *TINY, *SETTINGS]
 
 
+@pytest.mark.slow
 def test_rounds_go_on_after_a_kill(tmp_path: Path):
     """Of two arms that hardly differ, which three seeds show."""
     hardly = ["memory=none", "optim.weight_decay=1.001e-4"]
     content = {"metrics": ["MPJPE"], "arms": {"one": ["memory=none"], "other": hardly}}
     (tmp_path / "trial.yaml").write_text(yaml.safe_dump(content))
     line = [*MAIN, *WORDS, "--until-decided"]
-    killed = subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.DEVNULL, start_new_session=True)
-    deadline = time.monotonic() + 120
-    while not any(one.done for one in list_runs(tmp_path / "outputs")):
-        assert killed.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    os.killpg(killed.pid, signal.SIGKILL)
-    killed.wait()
+    with started(line, cwd=tmp_path, stderr=subprocess.DEVNULL) as killed:
+        until(
+            lambda: any(one.done for one in list_runs(tmp_path / "outputs")), "the first run is done", killed
+        )
     assert not list(tmp_path.glob("outputs/sweeps/*/rounds.json"))
     said = run_apart(tmp_path, *WORDS, "--until-decided")
     assert "all verdicts are decided" in said

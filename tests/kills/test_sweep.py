@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import pytest
 from command_line import run
 
 from memmlp.cli.bench.chaos import check, compare
@@ -12,6 +13,7 @@ from memmlp.common.files import write_json
 from memmlp.runs.run import Run
 
 
+@pytest.mark.slow
 def test_a_sweep_under_kills_ends_as_an_undisturbed_one(tmp_path: Path):
     words = ["--runs", "2", "--kills", "3", "--controllers", "2", "data.synth.minutes=0.2"]
     said = run(tmp_path, "bench", "chaos", *words)

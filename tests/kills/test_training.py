@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
 import textwrap
-import time
+from contextlib import AbstractContextManager
 from pathlib import Path
 
+import pytest
 import tiny
 import torch
+from processes import started, until
 
 from memmlp.networks import checkpoint
 from memmlp.runs.run import Run
@@ -41,25 +42,28 @@ def whole(folder: Path) -> Run:
     return run
 
 
-def child(folder: Path) -> subprocess.Popen:
+def child(folder: Path) -> AbstractContextManager[subprocess.Popen]:
+    """A process that brings the run to its end."""
     here = Path(__file__).parent
     code = textwrap.dedent(CHILD).format(tests=str(here.parent), here=str(here), folder=str(folder))
-    return subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    line = [sys.executable, "-c", code]
+    return started(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
+def passed(run: Run, step: int) -> bool:
+    """Whether the checkpoint is of that step or a later one."""
+    return run.checkpoint.exists() and checkpoint.read(run.checkpoint)[1]["step"] >= step
+
+
+@pytest.mark.slow
 def test_kill_9_at_any_moment_then_again_ends_in_the_same_weights(tmp_path: Path):
     """Real processes, killed at three unrelated moments (a write in progress among them by chance)."""
     broken = Run(tmp_path / "broken")
     for after in (7, 50, 100):  # kill as soon as the checkpoint has passed that step
-        process = child(broken.folder)
-        while process.poll() is None:
-            if broken.checkpoint.exists() and checkpoint.read(broken.checkpoint)[1]["step"] >= after:
-                os.kill(process.pid, signal.SIGKILL)
-                break
-            time.sleep(0.003)
-        assert process.wait() == -signal.SIGKILL
+        with child(broken.folder) as process:
+            until(lambda step=after: passed(broken, step), f"step {after}", process)
+            process.kill()
+            assert process.wait() == -signal.SIGKILL
     expected, got = (checkpoint.read(whole(tmp_path / name).checkpoint)[0] for name in ("whole", "broken"))
     assert expected.keys() == got.keys()
     assert all(torch.equal(expected[name], got[name]) for name in expected)

@@ -6,7 +6,6 @@ without the treatment that is tested.
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import tracemalloc
 from pathlib import Path
@@ -16,6 +15,7 @@ import pytest
 import tiny
 import torch
 import wearer
+from processes import finished
 from scipy.spatial.transform import Rotation
 
 import memmlp
@@ -345,8 +345,8 @@ def test_it_needs_no_torch(file):
         f"memmlp.Stream({str(file)!r}).step(one, one, one);"
         "print(sorted({'torch', 'onnx', 'scipy'} & set(sys.modules)))"
     )
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ran.stdout == "[]\n"
+    ran = finished([sys.executable, "-c", code])
+    assert ran.stdout == "[]\n", ran.stderr
 
 
 def test_a_run_or_its_folder_is_a_source(file, tmp_path):

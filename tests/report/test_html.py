@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from conftest import Memmlp, one_line
 from fake_runs import CLIPS, fake_sweep, nothing, runs_of, table_of
+from processes import finished
 
 from memmlp.common.errors import InputError
 from memmlp.report import figures
@@ -164,7 +165,7 @@ def browser(tmp_path: Path, *arguments: str) -> subprocess.CompletedProcess[str]
         "--host-resolver-rules=MAP * ~NOTFOUND", "--enable-logging=stderr", "--v=0",
         f"--user-data-dir={tmp_path / 'profile'}", *arguments,
     ]  # fmt: skip
-    ran = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    ran = finished(command)
     assert ran.returncode == 0, ran.stderr[-2000:]
     return ran
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import shutil
 import subprocess
 import sys
-import threading
-import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from processes import finished, started
 
 import memmlp.runs.recipes
 from memmlp.common.errors import InputError
@@ -420,31 +421,32 @@ with Run(sys.argv[1]).lock():
 """
 
 
+@contextlib.contextmanager
+def holding(run: Run) -> Iterator[subprocess.Popen]:
+    """A process that holds the run until its input ends."""
+    line = [sys.executable, "-c", HOLD, str(run.folder)]
+    with started(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout.readline() == b"held\n"
+        yield holder
+
+
 def test_another_process_waits_and_says_for_whom(tmp_path: Path):
     run = begun(tmp_path)
     said: list[str] = []
-    with subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(run.folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as holder:
-        assert holder.stdin is not None
-        assert holder.stdout is not None
-        holder.stdout.readline()
-        threading.Timer(0.3, holder.stdin.close).start()
-        start = time.monotonic()
-        with run.lock(said.append):
-            waited = time.monotonic() - start
-    assert waited > 0.2
-    assert len(said) == 1
+    with holding(run) as holder:
+
+        def waiting(line: str) -> None:
+            said.append(line)
+            holder.stdin.close()  # only now it lets go
+
+        with run.lock(waiting):
+            assert len(said) == 1
     assert f"process {holder.pid} since" in said[0]
 
 
 def test_a_killed_holder_frees_the_lock(tmp_path: Path):
     run = begun(tmp_path)
-    with subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(run.folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as holder:
-        assert holder.stdout is not None
-        holder.stdout.readline()
+    with holding(run) as holder:
         holder.kill()
         holder.wait()
         said: list[str] = []
@@ -528,4 +530,4 @@ def test_environment_says_what_ran_without_the_machines_name():
 
 def test_runs_need_neither_torch_nor_hydra():
     code = "import sys, memmlp.runs.run; print([m for m in ('torch', 'hydra', 'mlflow') if m in sys.modules])"
-    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
+    assert finished([sys.executable, "-c", code]).stdout == "[]\n"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -13,6 +11,7 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from processes import finished
 
 from memmlp.cli.track import track
 from memmlp.common.files import write_json
@@ -175,9 +174,7 @@ def test_cold_starts_at_once_do_not_ruin_the_store(tmp_path: Path):
         a_run(tmp_path, name)
     with ThreadPoolExecutor(2) as pool:
         jobs = pool.map(
-            lambda name: subprocess.run(
-                [sys.executable, "-c", COLD, str(tmp_path), name], capture_output=True, text=True, timeout=120
-            ),
+            lambda name: finished([sys.executable, "-c", COLD, str(tmp_path), name]),
             names,
         )
     assert [(job.returncode, job.stderr) for job in jobs] == [(0, "")] * 2
@@ -199,9 +196,7 @@ project_safely(MLflowTracking(None, Path(sys.argv[1])), run)
 
 def test_no_tracking_needs_no_mlflow(tmp_path: Path):
     a_run(tmp_path)
-    job = subprocess.run(
-        [sys.executable, "-c", BLOCKED, str(tmp_path)], capture_output=True, text=True, env=dict(os.environ)
-    )
+    job = finished([sys.executable, "-c", BLOCKED, str(tmp_path)])
     assert (job.returncode, job.stdout) == (0, "none works\n")
     assert job.stderr.count("\n") == 1
     assert "mlflow" in job.stderr

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import time
 from functools import partial
 from pathlib import Path
 
 import pytest
+from processes import ignoring_interrupts, until
 
 from memmlp.common.errors import InputError
 from memmlp.sweep import controller
@@ -21,28 +23,24 @@ def touch(path: str) -> None:
     Path(path).touch()
 
 
-def wait(handle, seconds: float = 60) -> None:
-    deadline = time.monotonic() + seconds
-    while handle.alive():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-
-
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # its logs stay open
 @pytest.mark.parametrize("cluster", ["local", "debug"])
 def test_submitit_runs_a_worker(tmp_path: Path, cluster: str):
     handle = Submitit(cluster, tmp_path / "%j").submit(partial(Path.touch, tmp_path / "done"))
-    wait(handle)
+    until(lambda: not handle.alive(), "the worker ends")
     if cluster == "debug":
         handle.job.results()  # debug jobs run when they are asked
     assert (tmp_path / "done").exists()
 
 
-def test_a_cancelled_local_worker_ends(tmp_path: Path):
-    handle = Submitit("local", tmp_path / "%j").submit(partial(time.sleep, 60))
+@pytest.mark.parametrize("around", [contextlib.nullcontext, ignoring_interrupts])
+def test_a_cancelled_local_worker_ends(tmp_path: Path, around):
+    """Also where interrupts are ignored, by which submitit cancels."""
+    with around():
+        handle = Submitit("local", tmp_path / "%j").submit(partial(time.sleep, 6000))
     assert handle.alive()
     handle.cancel()
-    wait(handle, 20)
+    until(lambda: not handle.alive(), "the worker ends")
 
 
 def test_slurm_options_reach_sbatch(tmp_path: Path):

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import signal
+import contextlib
 import subprocess
 import sys
 import threading
-import time
 from collections import Counter
 from pathlib import Path
 
 import pytest
+from processes import PATIENCE, started, until
 
 from memmlp.common.errors import InputError, TrainingDiverged
 from memmlp.config.work import check_wanted
@@ -143,16 +142,16 @@ def test_a_worker_stays_while_its_plan_is_open_and_wanted(tmp_path: Path, monkey
         done.append(task.id)
         finish(plan, task)
 
-    thread = threading.Thread(target=work, args=(path, perform))
+    looks: list[Path] = []
+    monkeypatch.setattr(Plan, "load", lambda path, load=Plan.load: (looks.append(path), load(path))[1])
+    thread = threading.Thread(target=work, args=(path, perform), daemon=True)
     thread.start()
-    time.sleep(0.05)
+    until(lambda: len(looks) > 2, "it looks again")
     assert thread.is_alive()
     saved(tmp_path, ALONE, open=True)
-    deadline = time.monotonic() + 10
-    while not done and time.monotonic() < deadline:
-        time.sleep(0.01)
+    until(lambda: done, "it takes up what was added")
     saved(tmp_path, ALONE)
-    thread.join(10)
+    thread.join(PATIENCE)
     assert not thread.is_alive()
     assert done == [ALONE.id]
     work(saved(tmp_path, ONE, open=True), perform, wanted=lambda: False)
@@ -165,15 +164,15 @@ def test_a_run_whose_process_died_is_lost_then_taken_over(tmp_path: Path):
         "import sys, time; from pathlib import Path; from memmlp.sweep.worker import work\n"
         "def perform(plan, task):\n"
         "    plan.run_of(task).begin('memmlp', {}, data='d', upstream=None)\n"
-        "    print('at it', flush=True); time.sleep(60)\n"
+        "    print('at it', flush=True); time.sleep(600)\n"
         "work(Path(sys.argv[1]), perform)"
     )
-    with subprocess.Popen([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE) as victim:
+    with started([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE) as victim:
         assert victim.stdout is not None
         victim.stdout.readline()
         assert Plan.load(path).states()[ALONE.id] == "running"
         assert not attempt(Plan.load(path), ALONE, finish)
-        victim.send_signal(signal.SIGKILL)
+        victim.kill()
         victim.wait()
     assert Plan.load(path).states()[ALONE.id] == "lost"
     work(path, finish)
@@ -215,8 +214,10 @@ def test_many_workers_perform_each_task_exactly_once(tmp_path: Path):
         "work(Path(sys.argv[1]), perform)"
     )
     log = tmp_path / "log"
-    workers = [subprocess.Popen([sys.executable, "-c", code, str(path), str(log)]) for _ in range(4)]
-    assert [process.wait(60) for process in workers] == [0] * 4
+    with contextlib.ExitStack() as stack:
+        line = [sys.executable, "-c", code, str(path), str(log)]
+        workers = [stack.enter_context(started(line)) for _ in range(4)]
+        assert [process.wait(PATIENCE) for process in workers] == [0] * 4
     assert Counter(log.read_text().split()) == Counter([CODES.id, *(task.id for task in tasks)])
     assert not list(tmp_path.glob("runs/*/.holder"))
 
@@ -225,13 +226,14 @@ def test_presence_ends_with_its_process(tmp_path: Path):
     path = tmp_path / "here.lock"
     code = (
         "import sys, time; from pathlib import Path; from memmlp.sweep.worker import Presence\n"
-        "here = Presence(Path(sys.argv[1])); print('here', flush=True); time.sleep(60)"
+        "here = Presence(Path(sys.argv[1])); print('here', flush=True); time.sleep(600)"
     )
-    with subprocess.Popen([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE) as process:
+    with started([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         process.stdout.readline()
         assert Presence.of(path)
-        os.kill(process.pid, signal.SIGKILL)
+        process.kill()
+        process.wait()
     assert not Presence.of(path)
 
 

@@ -6,7 +6,6 @@ import functools
 import io
 import json
 import re
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, runs_of, table_of
+from processes import finished
 from rich.console import Console
 
 from memmlp.common.errors import InputError
@@ -606,7 +606,8 @@ def test_collect_reads_each_run_once(sweep: Sweep, tmp_path: Path):
 def test_tables_need_no_torch():
     """Tables need no scipy.stats, matplotlib or Hydra either, for these take seconds to import."""
     code = "import sys, memmlp.cli.table, memmlp.tables.formats as r; print(*sys.modules)"
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    ran = finished([sys.executable, "-c", code])
+    assert ran.returncode == 0, ran.stderr
     assert not {"torch", "scipy.stats", "matplotlib", "hydra"} & set(ran.stdout.split())
 
 

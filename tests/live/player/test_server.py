@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import PATIENCE
 
 from memmlp.common.errors import InputError
 from memmlp.live.player import server as module
@@ -94,7 +95,7 @@ def server(clip: TrackedClip) -> Iterator[Server]:
 
 
 def get(server: Server, path: str) -> http.client.HTTPResponse:
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=PATIENCE)
     connection.request("GET", path)
     return connection.getresponse()
 
@@ -164,8 +165,8 @@ def test_only_this_machine_is_served(server: Server):
 
 
 def test_a_page_of_another_site_gets_nothing(server: Server):
-    """The other site's name was made to lead to this machine (DNS rebinding)."""
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+    """Whose name was made to mean this machine."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=PATIENCE)
     connection.request("GET", "/events", headers={"Host": f"elsewhere.example:{server.server_port}"})
     assert connection.getresponse().status == 403
 
