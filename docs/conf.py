@@ -23,7 +23,7 @@ version = release = memmlp.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode",
               "sphinx_copybutton", "sphinx_design"]  # fmt: skip
-exclude_patterns = ["results/data", "results/templates"]
+exclude_patterns = ["results/templates"]
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
 html_theme = "furo"
@@ -35,19 +35,37 @@ html_theme_options = {"source_repository": "https://github.com/memmlp/memmlp/", 
 pygments_dark_style = "monokai"
 copybutton_exclude = ".linenos, .gp, .go, .c1"
 
+smartquotes = False  # two dashes are those of an option
 default_role = "code"  # docstrings write `name` as Markdown does
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
+autodoc_type_aliases = {name: name for name in ("ArrayLike", "Tracker", "State", "Terms")}
 napoleon_use_ivar = True
 napoleon_custom_sections = ["Source"]
-suppress_warnings = ["config.cache"]
+suppress_warnings = [
+    "myst.header",  # pages of results begin with the heading that they have as a part of another
+    "ref.python",  # attributes' names are no references
+]
+
+
+COLON = "\N{TWO DOT PUNCTUATION}"  # a colon that napoleon does not see
 
 
 def plain_markup(_app: Sphinx, what: str, *rest: object) -> None:
     """Docstrings are plain words with `names`: what reStructuredText would read into them is taken literally."""
     lines: list[str] = rest[-1]  # type: ignore[assignment]
     lines[:] = literal_blocks(lines) if what == "module" else [escaped(line) for line in lines]
+    for index, line in enumerate(lines):  # "a, b: words" under Args is one field of two names
+        lines[index] = re.sub(r"^ {4}(\w+(?:, \w+)+):", lambda found: found[0].replace(", ", ","), line)
+    if what in ("attribute", "data") and lines:  # a colon in its words would end a type
+        lines[0] = lines[0].replace(":", COLON)
+
+
+def colons(_app: Sphinx, what: str, *rest: object) -> None:
+    """Undo what hid colons."""
+    lines: list[str] = rest[-1]  # type: ignore[assignment]
+    lines[:] = [line.replace(COLON, ":") for line in lines]
 
 
 def escaped(line: str) -> str:
@@ -76,8 +94,15 @@ def folders_as_text(_app: Sphinx, docname: str, source: list[str]) -> None:
     source[0] = re.sub(r"\[([^\]]+)\]\((?!\w+:)[^)\s]*/\)", r"\1", source[0])
 
 
+def named_fields(_app: Sphinx, what: str, name: str, thing: object, skip: bool, _options: object) -> bool | None:
+    """Leave out the fields of named tuples, which their class describes."""
+    return True if type(thing).__name__ == "_tuplegetter" else None
+
+
 def setup(app: Sphinx) -> None:
     """Make the reference, then let pages and docstrings pass the functions above."""
     reference.write(HERE / "reference")
     app.connect("source-read", folders_as_text)
-    app.connect("autodoc-process-docstring", plain_markup)
+    app.connect("autodoc-skip-member", named_fields)
+    app.connect("autodoc-process-docstring", plain_markup, priority=400)  # napoleon's is 500
+    app.connect("autodoc-process-docstring", colons, priority=600)

@@ -6,6 +6,7 @@ Commands come from click, keys from conf/ (values and comments) and memmlp.confi
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import inspect
 import pkgutil
 import typing
@@ -28,22 +29,13 @@ MARK = "<!-- made from the code by docs/reference.py -->\n\n"
 
 def write(folder: Path) -> None:
     """Write all reference pages into a folder; pages that are as they should be are left alone."""
-    pages = {"index.md": index(), "commands.md": command_page(), "config.md": config_page(), "api.md": api()}
-    pages |= {f"{room}.md": room_page(room) for room in rooms()}
-    folder.mkdir(exist_ok=True)
+    pages = {"commands.md": command_page(), "keys.md": config_page(), "api.md": api()}
+    pages |= {f"rooms/{room}.md": room_page(room) for room in rooms()}
+    (folder / "rooms").mkdir(parents=True, exist_ok=True)
     for name, text in pages.items():
         path = folder / name
         if not path.exists() or path.read_text(encoding="utf-8") != MARK + text:
             path.write_text(MARK + text, encoding="utf-8")
-
-
-def index() -> str:
-    """The page above the others."""
-    toctree = "\n".join(["commands", "config", "api"])
-    return (
-        "# Reference\n\nMade from the code each time the site is built.\n\n"
-        f"```{{toctree}}\n:maxdepth: 2\n\n{toctree}\n```\n"
-    )
 
 
 # Commands
@@ -72,7 +64,7 @@ def described(command: click.Command, context: click.Context, line: str = "", de
     yield inspect.cleandoc(command.help or line).replace("\b\n", "")
     if context.command_path == "memmlp train":
         yield (
-            "A [Hydra](https://hydra.cc) application: arguments are overrides of [config keys](config.md), "
+            "A [Hydra](https://hydra.cc) application: arguments are overrides of [config keys](keys.md), "
             "`GROUP=OPTION` or `GROUP.KEY=VALUE`. `--help` lists the groups, `--cfg job` prints every key, "
             "`-m` runs several (`-m seed=0,1,2`)."
         )
@@ -84,7 +76,7 @@ def described(command: click.Command, context: click.Context, line: str = "", de
     else:
         yield f"```text\n{' '.join([context.command_path, *command.collect_usage_pieces(context)])}\n```"
         if rows := [record for one in command.params if (record := one.get_help_record(context))]:
-            cells = [f"| `{flags}` | {cell(words)} |" for flags, words in rows]
+            cells = [f"| `{flags}` | {cell(words)} |" for flags, words in rows if words]
             yield "\n".join(["| option | |", "|---|---|", *cells])
 
 
@@ -251,7 +243,7 @@ def api() -> str:
     """What `import memmlp` gives, and the rooms below it."""
     names = getattr(memmlp, "__all__", ["Stream"])
     public = [f"```{{eval-rst}}\n{directive(f'memmlp.{name}')}\n```" for name in names]
-    below = "\n".join(rooms())
+    below = "\n".join(f"rooms/{room}" for room in rooms())
     return "\n\n".join(
         [
             "# Python",
@@ -268,11 +260,10 @@ def api() -> str:
 def directive(name: str) -> str:
     """The autodoc directive of a public name."""
     module, _, own = name.rpartition(".")
-    thing = getattr(__import__(module, fromlist=[own]), own)
-    kind = "class" if inspect.isclass(thing) else "function" if callable(thing) else "data"
-    full = f"{thing.__module__}.{thing.__qualname__}" if kind != "data" else name
-    members = "\n   :members:" if kind == "class" else ""
-    return f".. auto{kind}:: {full}\n   :no-index:{members}"
+    thing = getattr(importlib.import_module(module), own)
+    if inspect.isclass(thing):
+        return f".. autoclass:: {name}\n   :no-index:\n   :members:"
+    return f".. auto{'function' if callable(thing) else 'data'}:: {name}\n   :no-index:"
 
 
 def room_page(room: str) -> str:
@@ -286,6 +277,6 @@ def room_page(room: str) -> str:
 
 def modules(room: str) -> list[str]:
     """The modules of a room, itself first."""
-    package = __import__(f"memmlp.{room}", fromlist=["_"])
+    package = importlib.import_module(f"memmlp.{room}")
     below = pkgutil.walk_packages(package.__path__, f"memmlp.{room}.")
     return [f"memmlp.{room}", *(one.name for one in below)]
