@@ -13,12 +13,13 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
 os.environ.pop("COMP_LINE", None)  # of a shell that completes; Hydra would answer it
 
-import memmlp  # noqa: E402
 import reference  # noqa: E402
+
+import memmlp  # noqa: E402
 
 project = "memmlp"
 author = "The memmlp developers"
-copyright = f"2026, {author}"  # noqa: A001
+copyright = f"2026, {author}"
 version = release = memmlp.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode",
@@ -35,7 +36,6 @@ html_theme_options = {"source_repository": "https://github.com/memmlp/memmlp/", 
 pygments_dark_style = "monokai"
 copybutton_exclude = ".linenos, .gp, .go, .c1"
 
-smartquotes = False  # two dashes are those of an option
 default_role = "code"  # docstrings write `name` as Markdown does
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
@@ -53,7 +53,7 @@ COLON = "\N{TWO DOT PUNCTUATION}"  # a colon that napoleon does not see
 
 
 def plain_markup(_app: Sphinx, what: str, *rest: object) -> None:
-    """Docstrings are plain words with `names`: what reStructuredText would read into them is taken literally."""
+    """Docstrings are plain words with `names`; what reStructuredText would read into them is taken as it is."""
     lines: list[str] = rest[-1]  # type: ignore[assignment]
     lines[:] = literal_blocks(lines) if what == "module" else [escaped(line) for line in lines]
     for index, line in enumerate(lines):  # "a, b: words" under Args is one field of two names
@@ -69,12 +69,12 @@ def colons(_app: Sphinx, what: str, *rest: object) -> None:
 
 
 def escaped(line: str) -> str:
-    """A line whose stars, bars and trailing underscores outside backticks mean themselves."""
+    """A line whose stars, bars, trailing underscores and options outside backticks mean themselves."""
     parts = re.split(r"(`[^`]*`)", line)
-    return "".join(
-        part if index % 2 else re.sub(r"[*|]|(?<=\w)_(?!\w)", r"\\\g<0>", part)
-        for index, part in enumerate(parts)
-    )
+    for index in range(0, len(parts), 2):
+        marked = re.sub(r"[*|]|(?<=\w)_(?!\w)", r"\\\g<0>", parts[index])
+        parts[index] = re.sub(r"(?<![\w-])--[a-z][\w-]*", r"`\g<0>`", marked)  # an option, and no dash
+    return "".join(parts)
 
 
 def literal_blocks(lines: list[str]) -> list[str]:
@@ -94,7 +94,9 @@ def folders_as_text(_app: Sphinx, docname: str, source: list[str]) -> None:
     source[0] = re.sub(r"\[([^\]]+)\]\((?!\w+:)[^)\s]*/\)", r"\1", source[0])
 
 
-def named_fields(_app: Sphinx, what: str, name: str, thing: object, skip: bool, _options: object) -> bool | None:
+def named_fields(
+    _app: Sphinx, what: str, name: str, thing: object, skip: bool, _options: object
+) -> bool | None:
     """Leave out the fields of named tuples, which their class describes."""
     return True if type(thing).__name__ == "_tuplegetter" else None
 

@@ -48,17 +48,21 @@ def command_page() -> str:
         "# Commands",
         inspect.cleandoc(commands.help or ""),
         "Bad input ends in one line that names the key or file and what is allowed, with exit code 2, before "
-        "anything runs. A failed run exits with 1, an interrupted one with 130. `MEMMLP_TRACEBACK=1` shows where "
-        "an error came from.",
+        "anything runs. A failed run exits with 1, an interrupted one with 130. `MEMMLP_TRACEBACK=1` shows "
+        "where an error came from.",
     ]
     for name in COMMANDS:
         command = commands.get_command(context, name)
         assert command is not None
-        parts += described(command, click.Context(command, parent=context, info_name=name), COMMANDS[name].help)
+        parts += described(
+            command, click.Context(command, parent=context, info_name=name), COMMANDS[name].help
+        )
     return "\n\n".join(parts) + "\n"
 
 
-def described(command: click.Command, context: click.Context, line: str = "", depth: int = 2) -> Iterator[str]:
+def described(
+    command: click.Command, context: click.Context, line: str = "", depth: int = 2
+) -> Iterator[str]:
     """A command's section, then those of its sub-commands."""
     yield f"{'#' * depth} {context.command_path}"
     yield inspect.cleandoc(command.help or line).replace("\b\n", "")
@@ -75,8 +79,9 @@ def described(command: click.Command, context: click.Context, line: str = "", de
             yield from described(sub, click.Context(sub, parent=context, info_name=name), depth=depth + 1)
     else:
         yield f"```text\n{' '.join([context.command_path, *command.collect_usage_pieces(context)])}\n```"
-        if rows := [record for one in command.params if (record := one.get_help_record(context))]:
-            cells = [f"| `{flags}` | {cell(words)} |" for flags, words in rows if words]
+        records = [one.get_help_record(context) for one in command.params]
+        cells = [f"| `{record[0]}` | {cell(record[1])} |" for record in records if record and record[1]]
+        if cells:
             yield "\n".join(["| option | |", "|---|---|", *cells])
 
 
@@ -101,14 +106,17 @@ def config_page() -> str:
         "## Top level",
         keys_table(file_keys(conf / "train.yaml", skip=("defaults", "hydra")), SCHEMAS["config"]),
         "## profile",
-        "The sizes that a scale of work needs; the groups read them, and any can be set in its group instead.",
+        inspect.getdoc(SCHEMAS["profile"]) or "",
         profiles(conf / "profile"),
     ]
     defaults = default_options(conf / "train.yaml")
     for group in sorted(path.name for path in conf.iterdir() if path.is_dir()):
         if group not in ("profile", "search"):
             parts += group_section(conf / group, defaults.get(group))
-    parts += ["## search", "Of `memmlp tune`, as `search.KEY=VALUE`; [searches](../guides/searches.md) explains them."]
+    parts += [
+        "## search",
+        "Of `memmlp tune`, as `search.KEY=VALUE`; [searches](../guides/searches.md) explains them.",
+    ]
     parts += [keys_table(file_keys(path), None) for path in sorted((conf / "search").glob("*.yaml"))]
     return "\n\n".join(parts) + "\n"
 
@@ -221,7 +229,11 @@ def allowed(spec: dataclasses.Field[Any]) -> str:
     rule = spec.metadata.get("rule")
     kind = str(spec.type)
     optional = kind.startswith("Optional[")
-    words = str(rule) if rule else {"bool": "true or false", "str": "text"}.get(kind.removeprefix("Optional[").rstrip("]"), "")
+    words = (
+        str(rule)
+        if rule
+        else {"bool": "true or false", "str": "text"}.get(kind.removeprefix("Optional[").rstrip("]"), "")
+    )
     whole = "whole number, " if rule and "int" in kind and "list" not in kind and "Union" not in kind else ""
     return f"{whole}{cell(words)}{' or null' if optional else ''}"
 
@@ -271,7 +283,10 @@ def room_page(room: str) -> str:
     parts = [f"# memmlp.{room}"]
     for module in modules(room):
         title = [f"## {module}"] if module != f"memmlp.{room}" else []
-        parts += [*title, f"```{{eval-rst}}\n.. automodule:: {module}\n   :members:\n   :show-inheritance:\n```"]
+        parts += [
+            *title,
+            f"```{{eval-rst}}\n.. automodule:: {module}\n   :members:\n   :show-inheritance:\n```",
+        ]
     return "\n\n".join(parts) + "\n"
 
 
