@@ -53,7 +53,7 @@ COLON = "\N{TWO DOT PUNCTUATION}"  # a colon that napoleon does not see
 
 
 def plain_markup(_app: Sphinx, what: str, *rest: object) -> None:
-    """Docstrings are plain words with `names`; what reStructuredText would read into them is taken as it is."""
+    """Take docstrings as plain words with `names`, whatever reStructuredText would read into them."""
     lines: list[str] = rest[-1]  # type: ignore[assignment]
     lines[:] = literal_blocks(lines) if what == "module" else [escaped(line) for line in lines]
     for index, line in enumerate(lines):  # "a, b: words" under Args is one field of two names
