@@ -33,6 +33,7 @@ html_static_path = ["site"]
 html_css_files = ["site.css"]
 html_theme_options = {"source_repository": "https://github.com/memmlp/memmlp/", "source_branch": "main",
                       "source_directory": "docs/"}  # fmt: skip
+highlight_language = "text"  # where a block names none
 pygments_dark_style = "monokai"
 copybutton_exclude = ".linenos, .gp, .go, .c1"
 

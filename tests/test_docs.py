@@ -108,7 +108,7 @@ def anchors(path: Path) -> set[str]:
 def test_extras_are_those_of_the_package():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     for page in PAGES:
-        for extra in re.findall(r"memmlp\[(\w+)\]", page.read_text(encoding="utf-8")):
+        for extra in re.findall(r"(?:memmlp|'\.)\[(\w+)\]", page.read_text(encoding="utf-8")):
             assert extra in extras, f"{page}: {extra}"
 
 
