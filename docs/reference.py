@@ -117,7 +117,9 @@ def config_page() -> str:
         "## search",
         "Of `memmlp tune`, as `search.KEY=VALUE`; [searches](../guides/searches.md) explains them.",
     ]
-    parts += [keys_table(file_keys(path), None) for path in sorted((conf / "search").glob("*.yaml"))]
+    parts += [
+        keys_table(file_keys(path), None, "search") for path in sorted((conf / "search").glob("*.yaml"))
+    ]
     return "\n\n".join(parts) + "\n"
 
 
@@ -225,17 +227,12 @@ def field_of(schema: type, path: list[str]) -> dataclasses.Field[Any] | None:
 
 
 def allowed(spec: dataclasses.Field[Any]) -> str:
-    """A key's type, where no rule says more, and its limits."""
-    rule = spec.metadata.get("rule")
-    kind = str(spec.type)
-    optional = kind.startswith("Optional[")
-    words = (
-        str(rule)
-        if rule
-        else {"bool": "true or false", "str": "text"}.get(kind.removeprefix("Optional[").rstrip("]"), "")
-    )
-    whole = "whole number, " if rule and "int" in kind and "list" not in kind and "Union" not in kind else ""
-    return f"{whole}{cell(words)}{' or null' if optional else ''}"
+    """A key's limits; its type where no rule says more."""
+    rule, kind = spec.metadata.get("rule"), str(spec.type)
+    own = kind.removeprefix("Optional[").removesuffix("]") if kind.startswith("Optional[") else kind
+    words = cell(str(rule)) if rule else {"bool": "true or false", "str": "text"}.get(own, "")
+    whole = "whole number, " if rule and own == "int" else ""
+    return " or ".join(filter(None, [whole + words, "null" if own != kind else ""]))
 
 
 def cell(words: str) -> str:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import shlex
 import sys
 import tomllib
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import yaml
 from command_lines import ROOT, Line, blocks, inline_lines, shell_lines, takes
+from omegaconf import OmegaConf
 
+from memmlp.cli.main import COMMANDS
 from memmlp.config.build import build_loss
 from memmlp.config.compose import composed
 from memmlp.motion.skeleton import SkeletonMap
+from memmlp.runs.identity import flatten
 from memmlp.sweep.spec import load_sweep
 
 DOCS = ROOT / "docs"
@@ -130,6 +135,31 @@ def test_numbers_of_readme_stand_in_the_results_that_they_name():
             found += 1
             assert re.search(rf"(?<![\d.]){re.escape(number)}(?![\d.])", kept), f"{number}: {part}"
     assert found >= 2
+
+
+@pytest.fixture
+def reference(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The generator of the reference pages."""
+    monkeypatch.syspath_prepend(DOCS)
+    return importlib.import_module("reference")
+
+
+def test_the_reference_has_every_key(reference: ModuleType):
+    page = reference.config_page()
+    groups = [f"+{path.parent.name}={path.stem}" for path in sorted((ROOT / "conf/memory").glob("*.yaml"))]
+    for words in ([], *([word.lstrip("+")] for word in groups), ["model=agrol_diffusion"], ["tracking=none"]):
+        config = OmegaConf.to_container(composed(words), resolve=False)
+        for key in flatten(config):
+            last = key.rsplit(".", 1)[-1]
+            assert last in ("name", "_target_", "_partial_") or f"| `{key}` |" in page, key
+
+
+def test_the_reference_has_every_option(reference: ModuleType):
+    page = reference.command_page()
+    for name in COMMANDS:
+        assert f"## memmlp {name}\n" in page
+    for option in ("--until-decided", "--max-growth FLOAT", "--udp PORT", "--save-predictions PATH"):
+        assert f"| `{option}` |" in page, option
 
 
 def examples(name: str, language: str) -> list[str]:
