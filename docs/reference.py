@@ -117,9 +117,9 @@ def config_page() -> str:
         "## search",
         "Of `memmlp tune`, as `search.KEY=VALUE`; [searches](../guides/searches.md) explains them.",
     ]
-    parts += [
-        keys_table(file_keys(path), None, "search") for path in sorted((conf / "search").glob("*.yaml"))
-    ]
+    for path in sorted((conf / "search").glob("*.yaml")):
+        keys = [key._replace(name=f"search.{key.name}") for key in file_keys(path)]
+        parts.append(keys_table(keys, None))
     return "\n\n".join(parts) + "\n"
 
 
@@ -134,31 +134,39 @@ def group_section(folder: Path, default: str | None) -> Iterator[str]:
     yield f"## {folder.name}"
     paths = sorted(folder.glob("*.yaml"), key=lambda path: (path.stem != default, path.stem))
     for path in paths:
-        text = path.read_text(encoding="utf-8")
         if len(paths) > 1:
             yield f"### {folder.name}={path.stem}"
-        if said := head_comment(text):
-            yield said
-        schema = SCHEMAS.get(schema_name(text))
-        keys = [key for key in file_keys(path) if not key.name.split(".")[-1].startswith("_")]
-        if keys and "@package" not in text:
-            yield keys_table(keys, schema, folder.name)
-        elif keys:
-            yield "\n".join(f"- `{key.name}={key.value}` {key.comment}".rstrip() for key in keys)
-        if overridden := [
-            f"`{name.removeprefix('override /')}={option}`"
-            for one in yaml.safe_load(text).get("defaults", [])
-            if isinstance(one, dict)
-            for name, option in one.items()
-            if name.startswith("override ")
-        ]:
-            yield f"Takes {', '.join(overridden)}."
+        yield from option_section(path)
+
+
+def option_section(path: Path) -> Iterator[str]:
+    """An option's words, its keys, and what else it sets."""
+    text, group = path.read_text(encoding="utf-8"), path.parent.name
+    if said := head_comment(text):
+        yield said
+    keys = [key for key in file_keys(path) if not key.name.split(".")[-1].startswith("_")]
+    if "@package _global_" not in text:
+        keys = [key._replace(name=f"{group}.{key.name}") for key in keys]
+    if own := [key for key in keys if key.name.startswith(f"{group}.")]:
+        yield keys_table(own, SCHEMAS.get(schema_name(text)), group)
+    taken = [f"`{name}={option or 'null'}`" for name, option in overridden(text)]
+    others = [f"`{key.name}={key.value}`" for key in keys if key not in own]
+    if taken or others:
+        yield f"Sets {', '.join([*taken, *others])}."
+
+
+def overridden(text: str) -> Iterator[tuple[str, str | None]]:
+    """The other groups' options that a config file takes."""
+    for one in yaml.safe_load(text).get("defaults", []):
+        for name, option in one.items() if isinstance(one, dict) else ():
+            if name.startswith("override "):
+                yield name.removeprefix("override /"), option
 
 
 def schema_name(text: str) -> str:
     """The schema that a config file starts from."""
     first = (yaml.safe_load(text).get("defaults") or [""])[0]
-    return str(first).removeprefix("/schema/").removesuffix("@_here_")
+    return str(first).removeprefix("/schema/").partition("@")[0]
 
 
 def head_comment(text: str) -> str:
@@ -206,13 +214,13 @@ def leaves(node: yaml.MappingNode, lines: list[str], prefix: str) -> Iterator[Ke
 
 
 def keys_table(keys: list[Key], schema: type | None, group: str = "") -> str:
-    """The keys with values, limits and comments."""
+    """The keys, dotted, with values, limits and comments; the schema is that of the group."""
     rows = ["| key | default | allowed | |", "|---|---|---|---|"]
     for key in keys:
-        spec = field_of(schema, key.name.split(".")) if schema else None
-        name = f"{group}.{key.name}" if group else key.name
+        below = key.name.removeprefix(f"{group}.").split(".")
+        spec = field_of(schema, below) if schema else None
         value = "(give one)" if key.value == MISSING else f"`{key.value}`"
-        rows.append(f"| `{name}` | {value} | {allowed(spec) if spec else ''} | {cell(key.comment)} |")
+        rows.append(f"| `{key.name}` | {value} | {allowed(spec) if spec else ''} | {cell(key.comment)} |")
     return "\n".join(rows)
 
 
