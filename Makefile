@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: setup demo test test-fast coverage golden check clean
+.PHONY: setup demo test test-fast coverage golden check docs dist pre-commit clean
 
 setup: $(STAMP)
 
@@ -36,6 +36,22 @@ check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: .venv/.docs
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs site
+	@echo "open site/index.html"
+
+dist: .venv/.publish
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist
+	MEMMLP_DIST=dist $(BIN)/python -m pytest -m slow tests/test_dist.py
+
+pre-commit: .venv/.publish
+	$(BIN)/pre-commit install
+
+.venv/.docs .venv/.publish: .venv/.%: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$*]'
+	@touch $@
 
 clean:
 	rm -rf .venv

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from memmlp.common.errors import InputError
     from memmlp.live.stream import Offsets, Pose, Stream
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = ["InputError", "Offsets", "Pose", "Prediction", "Runs", "Stream", "TrainedRun", "load_run"]
 

@@ -196,7 +196,7 @@ def test_a_run_is_done_when_its_marker_is_whole(tmp_path: Path):
         assert not run.done
 
 
-def finished(outputs: Path, config: dict = CONFIG) -> Run:
+def complete(outputs: Path, config: dict = CONFIG) -> Run:
     """A run with weights, an evaluation and a deployment in int8."""
     run = begun(outputs, config)
     run.model.write_bytes(b"weights")
@@ -213,7 +213,7 @@ def finished(outputs: Path, config: dict = CONFIG) -> Run:
 
 def test_a_folder_under_anothers_id_is_no_run(tmp_path: Path):
     """Its numbers would stand for a training that never was. A copy of another name is one."""
-    run = finished(tmp_path)
+    run = complete(tmp_path)
     other = Run.of(tmp_path, "0123456789abcdef")
     shutil.copytree(run.folder, other.folder)
     copy = Run(shutil.copytree(run.folder, tmp_path / "best"))
@@ -223,8 +223,8 @@ def test_a_folder_under_anothers_id_is_no_run(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["stream-0", "stream-1"])
 def test_an_evaluation_of_another_run_or_name_is_refused(tmp_path: Path, name: str):
-    run = finished(tmp_path)
-    other = run if name == "stream-1" else finished(tmp_path, CONFIG | {"seed": 1})
+    run = complete(tmp_path)
+    other = run if name == "stream-1" else complete(tmp_path, CONFIG | {"seed": 1})
     shutil.copy(run.evaluation("stream-0"), other.evaluation(name))
     load(run.folder, ["stream-0"])
     with pytest.raises(InputError, match=rf"evaluations/{name}\.json: cannot be read"):
@@ -234,7 +234,7 @@ def test_an_evaluation_of_another_run_or_name_is_refused(tmp_path: Path, name: s
 
 def test_a_deployment_that_lost_a_file_is_made_again(tmp_path: Path):
     """And is not, in silence, the float32 one."""
-    run = finished(tmp_path)
+    run = complete(tmp_path)
     assert run.deployed == run.deployment("int8-0").int8
     run.deployment("int8-0").int8.unlink()
     assert not run.has("int8-0")
@@ -242,7 +242,7 @@ def test_a_deployment_that_lost_a_file_is_made_again(tmp_path: Path):
 
 
 def test_weights_that_changed_since_are_refused(tmp_path: Path):
-    run = finished(tmp_path)
+    run = complete(tmp_path)
     assert run.weights() == run.model
     run.model.write_bytes(b"other")
     with pytest.raises(InputError, match="not the weights that were trained"):
