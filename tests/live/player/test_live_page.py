@@ -16,6 +16,8 @@ from memmlp.live.player.server import Hub, Server
 from memmlp.live.player.sources import ClipSource, TrackedClip
 from memmlp.live.stream import Stream
 
+pytestmark = pytest.mark.slow
+
 SHOWN = "Number(document.documentElement.dataset.shown)"
 NEWEST = "Number(document.querySelector('#scrub').max)"
 
