@@ -54,7 +54,7 @@ def live(
     """Show a finished run (id, its beginning, or folder) or an ONNX file live, on a page of this machine.
 
     It is fed a clip in real time, over and over, or tracker poses that arrive as packets.
-    The README has their format. Ctrl-C ends it.
+    Their format is in docs/guides/live.md. Ctrl-C ends it.
     """
     from memmlp.common.errors import InputError
     from memmlp.live.player.packets import needs_osc
