@@ -20,11 +20,18 @@ from PIL import Image
 import memmlp
 from memmlp.common.files import read_json, write_json
 from memmlp.evaluation.units import UNITS
+from memmlp.runs.evaluated import write_report
 from memmlp.runs.lookup import list_runs
 
 ROOT = Path(memmlp.__file__).parents[1]
 NAMES = ["InputError", "Offsets", "Pose", "Prediction", "Runs", "Stream", "TrainedRun", "load_run"]
 UPRIGHT = ((0.0, 1.6, 0.0), np.eye(3))
+
+
+@pytest.fixture(scope="module")
+def home(tiny_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the folder with one finished run, for all tests here: none of them changes it."""
+    return Path(shutil.copytree(tiny_home, tmp_path_factory.mktemp("home") / "home"))
 
 
 @pytest.fixture(autouse=True)
@@ -49,7 +56,13 @@ def three(run: memmlp.TrainedRun, tmp_path: Path) -> memmlp.Runs:
     """The run and two copies of it under other ids, started later and earlier, of seeds 1 and 2."""
     shutil.copytree(run.folder, tmp_path / "runs" / run.id)
     for seed, started in ((1, "9"), (2, "0")):
-        folder = shutil.copytree(run.folder, tmp_path / "runs" / (str(seed) * 16))
+        folder = Path(shutil.copytree(run.folder, tmp_path / "runs" / (str(seed) * 16)))
+        own = {"run": folder.name}  # what lies in a run's folder names its run
+        write_json(folder / "DONE", read_json(folder / "DONE") | {"id": folder.name})
+        for report in folder.glob("evaluations/*.json"):
+            content = read_json(report)
+            del content["digest"]
+            write_report(report, {**content, **own})
         write_json(folder / "manifest.json", read_json(folder / "manifest.json") | {"started": started})
         (folder / "config.yaml").write_text(yaml.safe_dump(run.config | {"seed": seed}))
     return memmlp.Runs(tmp_path)

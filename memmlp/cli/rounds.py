@@ -266,7 +266,8 @@ def closing(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs]) -> list[str]
     """Say why the rounds ended, what more seeds could do, and how many runs were spent."""
     latest = [finding for finding, _ in rounds.latest().values()]
     still = [finding for finding in latest if finding.verdict == "open"]
-    unseen = Counter(key.label for key in rounds.unseen(sweep))
+    evaluated = {mode for found in runs.values() for run in found.values() for mode in run.means}
+    unseen = Counter(key.label for key in rounds.unseen(sweep) if key.mode in evaluated)
     lines = [] if still or unseen or rounds.next_looks(sweep) else ["all verdicts are decided"]
     lines += [
         f"of '{label}' {number} comparisons have no verdict: the runs have nothing to compare"
