@@ -38,7 +38,7 @@ class Evaluation:
         """Compute the metrics in a mode.
 
         Returns:
-            `{"mean": {branch: {metric: value}}, "clips": [...]}`, where the list has a row for each clip.
+            "mean", the metrics by branch, and "clips", a row for each clip with its metrics by branch.
         """
         torch.manual_seed(self.seed)  # a mode's result does not depend on which modes came before it
         found = modes.evaluate(model, test, [mode], self.batch, self.ik)
