@@ -69,7 +69,7 @@ def read_clip(path: Path, name: str) -> Clip:
     """
     try:
         # The file is opened here, since np.load does not close one that is no zip.
-        with open(path, "rb") as open_run, np.load(open_run, allow_pickle=False) as file:
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
             missing = {"poses", "trans"} - set(file.files)
             rate_key = next((key for key in FRAME_RATE_KEYS if key in file.files), None)
             if missing or rate_key is None:

@@ -41,7 +41,7 @@ def search(**changes: Any) -> Search:
     return parse_search({**content, **changes})
 
 
-def open_run(folder: Path, **changes: Any) -> Study:
+def open_study(folder: Path, **changes: Any) -> Study:
     return Study.own(search(**changes), "mine", folder)
 
 
@@ -82,7 +82,7 @@ def to_the_end(study: Study, folder: Path, capacity: int = 2) -> None:
 
 
 def test_a_search_has_the_trials_it_wants_and_the_papers_first(tmp_path: Path):
-    study = open_run(tmp_path)
+    study = open_study(tmp_path)
     to_the_end(study, tmp_path)
     assert [trial.state for trial in study.trials] == [TrialState.COMPLETE] * 6
     assert study.trials[0].params == {"loss.rotation": 1.0, "loss.hand": 0.1}
@@ -93,16 +93,16 @@ def test_a_search_has_the_trials_it_wants_and_the_papers_first(tmp_path: Path):
 
 
 def test_the_number_of_trials_is_a_total(tmp_path: Path):
-    to_the_end(open_run(tmp_path), tmp_path)
-    again = open_run(tmp_path)
+    to_the_end(open_study(tmp_path), tmp_path)
+    again = open_study(tmp_path)
     assert director(again, tmp_path).look(2).tasks == ()
-    more = open_run(tmp_path, n_trials=8)
+    more = open_study(tmp_path, n_trials=8)
     to_the_end(more, tmp_path)
     assert len(more.trials) == 8
 
 
 def test_capacity_is_kept_and_each_plan_holds_what_is_under_way(tmp_path: Path):
-    one = director(open_run(tmp_path), tmp_path)
+    one = director(open_study(tmp_path), tmp_path)
     assert len(one.look(3).tasks) == 3
     assert one.look(3) == one.look(3)
     finish(one.look(3))
@@ -116,7 +116,7 @@ def test_a_director_killed_while_it_asks_loses_and_repeats_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int
 ):
     """It dies before a new trial's first value, between its values, after them, or once its run is known."""
-    study = open_run(tmp_path)
+    study = open_study(tmp_path)
     one = director(study, tmp_path)
     finish(one.look(1))
     before = [trial.number for trial in study.trials]
@@ -144,7 +144,7 @@ def test_a_director_killed_while_it_asks_loses_and_repeats_nothing(
                 one.look(1)
         else:
             one.look(1)
-    study = open_run(tmp_path)
+    study = open_study(tmp_path)
     assert [trial.number for trial in study.trials] == [*before, 1]
     to_the_end(study, tmp_path)
     assert [trial.number for trial in study.trials] == list(range(6))
@@ -154,13 +154,13 @@ def test_a_director_killed_while_it_asks_loses_and_repeats_nothing(
 
 
 def test_a_resumed_search_proposes_what_the_undisturbed_one_does(tmp_path: Path):
-    calm = open_run(tmp_path / "calm" if (tmp_path / "calm").mkdir() is None else tmp_path)
+    calm = open_study(tmp_path / "calm" if (tmp_path / "calm").mkdir() is None else tmp_path)
     to_the_end(calm, tmp_path / "calm", capacity=1)
     (tmp_path / "stopped").mkdir()
     for _ in range(6):
-        one = director(open_run(tmp_path / "stopped"), tmp_path / "stopped")
+        one = director(open_study(tmp_path / "stopped"), tmp_path / "stopped")
         finish(one.look(1))
-    last = open_run(tmp_path / "stopped")
+    last = open_study(tmp_path / "stopped")
     to_the_end(last, tmp_path / "stopped", capacity=1)
     assert [trial.params for trial in last.trials] == [trial.params for trial in calm.trials]
 
@@ -169,7 +169,7 @@ def test_the_seed_changes_what_is_proposed_and_the_sampler_too(tmp_path: Path):
     proposed = []
     for name, changes in {"a": {}, "b": {"seed": 1}, "c": {"sampler": "random"}}.items():
         (tmp_path / name).mkdir()
-        study = open_run(tmp_path / name, **changes)
+        study = open_study(tmp_path / name, **changes)
         to_the_end(study, tmp_path / name, capacity=1)
         proposed.append([tuple(trial.params.values()) for trial in study.trials])
     assert proposed[0] != proposed[1]
@@ -182,21 +182,22 @@ def test_a_torn_line_and_a_dead_owners_lock_are_mended(tmp_path: Path, monkeypat
     def sleep(seconds: float) -> None:
         raise AssertionError("it waits for the lock")
 
-    study = open_run(tmp_path)
+    study = open_study(tmp_path)
     one = director(study, tmp_path)
     finish(one.look(2))
     one.look(2)
     with open(journal(tmp_path), "ab") as file:
         file.write(b'{"op_code":4,"worker_id":"x"')
     Path(f"{journal(tmp_path)}.lock").symlink_to(journal(tmp_path))
+    monkeypatch.setattr("memmlp.runs.run.changes", str)  # git, in a changed checkout, is waited for in sleeps
     monkeypatch.setattr(time, "sleep", sleep)
-    to_the_end(open_run(tmp_path), tmp_path)
-    again = open_run(tmp_path)
+    to_the_end(open_study(tmp_path), tmp_path)
+    again = open_study(tmp_path)
     assert [trial.number for trial in again.trials] == list(range(6))
 
 
 def test_mending_leaves_a_whole_journal_alone(tmp_path: Path):
-    open_run(tmp_path)
+    open_study(tmp_path)
     content = journal(tmp_path).read_bytes()
     mend(journal(tmp_path))
     assert journal(tmp_path).read_bytes() == content
@@ -213,7 +214,7 @@ def begun(plan: Plan) -> Run:
 
 
 def test_a_trial_worse_than_the_median_is_pruned_and_its_run_cancelled(tmp_path: Path):
-    study = open_run(tmp_path, pruner="median", prune_after=2)
+    study = open_study(tmp_path, pruner="median", prune_after=2)
     one = director(study, tmp_path)
     for level in (5.0, 6.0):
         run = begun(one.look(1))
@@ -236,14 +237,14 @@ def test_a_trial_worse_than_the_median_is_pruned_and_its_run_cancelled(tmp_path:
         TrialState.PRUNED,
     ]
     assert study.trials[0].intermediate_values == {10: 5.0, 20: 5.0, 30: 5.0}
-    resumed = director(open_run(tmp_path, pruner="median", prune_after=2), tmp_path)
+    resumed = director(open_study(tmp_path, pruner="median", prune_after=2), tmp_path)
     assert set(resumed.look(1).cancelled) == {run.id, failed}
 
 
 def test_no_trial_is_pruned_at_its_last_step_or_without_a_pruner(tmp_path: Path):
     for name, pruner, step in (("last", "median", STEPS), ("none", "none", 10)):
         (tmp_path / name).mkdir()
-        study = open_run(tmp_path / name, pruner=pruner, prune_after=1)
+        study = open_study(tmp_path / name, pruner=pruner, prune_after=1)
         one = director(study, tmp_path / name)
         for level in (5.0, 6.0):
             run = begun(one.look(1))
@@ -256,7 +257,7 @@ def test_no_trial_is_pruned_at_its_last_step_or_without_a_pruner(tmp_path: Path)
 
 
 def test_a_failed_run_fails_its_trial_and_the_search_goes_on(tmp_path: Path):
-    study = open_run(tmp_path)
+    study = open_study(tmp_path)
     one = director(study, tmp_path)
     begun(one.look(1)).fail("the loss is nan")
     to_the_end(study, tmp_path)
@@ -269,14 +270,14 @@ def test_values_that_make_no_sense_fail_their_trial_and_hopeless_searches_end(tm
     def refused(values: Mapping[str, Value]) -> list[list[RunTask]]:
         raise InputError("hand=position needs positions")
 
-    study = open_run(tmp_path, n_trials=20)
+    study = open_study(tmp_path, n_trials=20)
     one = director(study, tmp_path, refused)
     with pytest.raises(InputError, match="all 5 trials failed, the last one so: hand=position needs"):
         one.look(2)
 
 
 def test_a_value_that_is_no_number_is_a_failure(tmp_path: Path):
-    study = open_run(tmp_path)
+    study = open_study(tmp_path)
     one = director(study, tmp_path)
     run = begun(one.look(1))
     log(run, STEPS, float("nan"))
@@ -287,7 +288,7 @@ def test_a_value_that_is_no_number_is_a_failure(tmp_path: Path):
 
 def test_a_pruned_trials_run_is_wanted_again_by_one_with_its_values(tmp_path: Path):
     space = {"hand": {"choices": ["off", "fk"]}}
-    study = open_run(tmp_path, space=space, pruner="median", prune_after=1, n_trials=12)
+    study = open_study(tmp_path, space=space, pruner="median", prune_after=1, n_trials=12)
     one = director(study, tmp_path)
     seen = set()
     for _ in range(12):
@@ -313,7 +314,7 @@ def seeded(study: Study, folder: Path) -> Director:
 
 
 def test_a_trials_value_is_the_mean_of_its_seeds(tmp_path: Path):
-    study = open_run(tmp_path, seeds=3, n_trials=2)
+    study = open_study(tmp_path, seeds=3, n_trials=2)
     one = seeded(study, tmp_path)
     while (plan := one.look(1)).tasks:
         finish(plan)
@@ -328,7 +329,7 @@ def test_a_trials_value_is_the_mean_of_its_seeds(tmp_path: Path):
 
 
 def test_the_other_seeds_wait_for_the_first_ones_end_and_count_for_capacity(tmp_path: Path):
-    one = seeded(open_run(tmp_path, seeds=3), tmp_path)
+    one = seeded(open_study(tmp_path, seeds=3), tmp_path)
     plan = one.look(2)
     assert [(entry.label, entry.seed) for entry in plan.entries] == [("trial 0", 0), ("trial 1", 0)]
     run = begun(replace(plan, tasks=plan.tasks[:1]))
@@ -343,7 +344,7 @@ def test_the_other_seeds_wait_for_the_first_ones_end_and_count_for_capacity(tmp_
 
 
 def test_pruning_is_by_the_first_seed_alone(tmp_path: Path):
-    study = open_run(tmp_path, seeds=2, pruner="median", prune_after=1)
+    study = open_study(tmp_path, seeds=2, pruner="median", prune_after=1)
     one = seeded(study, tmp_path)
     for level in (5.0, 6.0):
         for _ in range(2):
@@ -368,7 +369,7 @@ def test_pruning_is_by_the_first_seed_alone(tmp_path: Path):
 
 
 def test_one_failed_seed_fails_the_trial_and_cancels_the_others(tmp_path: Path):
-    study = open_run(tmp_path, seeds=3)
+    study = open_study(tmp_path, seeds=3)
     one = seeded(study, tmp_path)
     finish(one.look(1))
     plan = one.look(1)
@@ -383,16 +384,16 @@ def test_one_failed_seed_fails_the_trial_and_cancels_the_others(tmp_path: Path):
 
 def test_a_director_killed_between_seeds_repeats_and_loses_none(tmp_path: Path):
     (tmp_path / "calm").mkdir()
-    calm = open_run(tmp_path / "calm", seeds=3, n_trials=3)
+    calm = open_study(tmp_path / "calm", seeds=3, n_trials=3)
     one = seeded(calm, tmp_path / "calm")
     while (plan := one.look(1)).tasks:
         finish(plan)
-    stopped = open_run(tmp_path, seeds=3, n_trials=3)
+    stopped = open_study(tmp_path, seeds=3, n_trials=3)
     made: list[str] = []
     while tasks := (plan := seeded(stopped, tmp_path).look(1)).left():  # a director of its own for each run
         made.append(tasks[0].id)
         finish(replace(plan, tasks=tasks[:1]))
-        stopped = open_run(tmp_path, seeds=3, n_trials=3)
+        stopped = open_study(tmp_path, seeds=3, n_trials=3)
     assert len(made) == len(set(made)) == 9
     assert [trial.values for trial in stopped.trials] == [trial.values for trial in calm.trials]
     assert [trial.user_attrs["runs"] for trial in stopped.trials] == [
@@ -401,7 +402,7 @@ def test_a_director_killed_between_seeds_repeats_and_loses_none(tmp_path: Path):
 
 
 def test_trials_of_several_seeds_as_csv(tmp_path: Path):
-    study = open_run(tmp_path, seeds=2, n_trials=2, objectives=["MPJPE", "Jitter"])
+    study = open_study(tmp_path, seeds=2, n_trials=2, objectives=["MPJPE", "Jitter"])
     one = seeded(study, tmp_path)
     finish(one.look(1))
     finish(one.look(1))
@@ -422,7 +423,7 @@ def test_trials_of_several_seeds_as_csv(tmp_path: Path):
 
 
 def test_two_objectives_give_a_front(tmp_path: Path):
-    study = open_run(tmp_path, objectives=["MPJPE", "Jitter"])
+    study = open_study(tmp_path, objectives=["MPJPE", "Jitter"])
     to_the_end(study, tmp_path)
     front = study.best()
     assert len(front) == 6  # Jitter is 20 less MPJPE here, so that none is better in both
@@ -434,7 +435,7 @@ def test_two_objectives_give_a_front(tmp_path: Path):
 
 
 def test_what_a_search_leaves(tmp_path: Path):
-    study = open_run(tmp_path)
+    study = open_study(tmp_path)
     to_the_end(study, tmp_path)
     results.write_trials(study, tmp_path / "trials.csv")
     with open(tmp_path / "trials.csv", newline="") as file:
@@ -464,7 +465,7 @@ def test_what_a_search_leaves(tmp_path: Path):
 
 
 def test_table_5_takes_only_loss_weights(tmp_path: Path):
-    study = open_run(tmp_path, space={"optim": {"lr": {"low": 0.1, "high": 1.0}}}, n_trials=1)
+    study = open_study(tmp_path, space={"optim": {"lr": {"low": 0.1, "high": 1.0}}}, n_trials=1)
     one = director(study, tmp_path)
     run = begun(one.look(1))
     log(run, STEPS, 1.0)
@@ -475,7 +476,7 @@ def test_table_5_takes_only_loss_weights(tmp_path: Path):
 
 def test_a_study_is_looked_at_while_its_owner_works(tmp_path: Path):
     assert Study.view(search(), "mine", tmp_path) is None
-    study = open_run(tmp_path)
+    study = open_study(tmp_path)
     director(study, tmp_path).look(2)
     seen = Study.view(search(), "mine", tmp_path)
     assert seen is not None
@@ -484,18 +485,18 @@ def test_a_study_is_looked_at_while_its_owner_works(tmp_path: Path):
 
 
 def test_a_team_storage_and_a_bad_one(tmp_path: Path):
-    study = open_run(tmp_path, storage=f"sqlite:///{tmp_path}/team.db")
+    study = open_study(tmp_path, storage=f"sqlite:///{tmp_path}/team.db")
     to_the_end(study, tmp_path)
     assert len(study.trials) == 6
     assert not journal(tmp_path).exists()
     with pytest.raises(InputError, match=r"search\.storage=nonsense:"):
-        open_run(tmp_path, storage="nonsense://x")
+        open_study(tmp_path, storage="nonsense://x")
 
 
 def test_a_best_trial_of_groups_lists_and_plain_keys_is_a_config(tmp_path: Path):
     space = {"hand": {"choices": ["off", "fk"]}, "memory": {"layers": {"choices": [[2], [2, 4]]}}}
     space |= {"seed": {"low": 3, "high": 9}}
-    study = open_run(tmp_path, space=space, n_trials=1, base=[])
+    study = open_study(tmp_path, space=space, n_trials=1, base=[])
     one = director(study, tmp_path)
     run = begun(one.look(1))
     log(run, STEPS, 1.0)
@@ -513,7 +514,7 @@ def test_a_best_trial_of_groups_lists_and_plain_keys_is_a_config(tmp_path: Path)
 )
 def test_what_is_no_journal_is_left_alone_and_named(tmp_path: Path, content: bytes):
     journal(tmp_path).write_bytes(content)
-    for look in (open_run, lambda folder: Study.view(search(), "mine", folder)):
+    for look in (open_study, lambda folder: Study.view(search(), "mine", folder)):
         with pytest.raises(InputError, match=r"study.journal: not a journal of Optuna's"):
             look(tmp_path)
     assert journal(tmp_path).read_bytes() == content

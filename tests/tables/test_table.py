@@ -593,14 +593,14 @@ def test_json_has_the_values_of_each_seed(table: Table):
 def test_collect_reads_each_run_once(sweep: Sweep, tmp_path: Path):
     """The work is linear in the runs: each is read once, though it is in many comparisons."""
     many = parse_sweep("many", {"axes": {"optim.lr": list(range(1, 41))}, "seeds": [0, 1]})
-    find, open_run = fake_sweep(tmp_path, many), []
+    find, opened = fake_sweep(tmp_path, many), []
 
     def counted(folder: Path):
-        open_run.append(folder)
+        opened.append(folder)
         return load(folder)
 
     runs_of(many, find, functools.cache(counted))
-    assert len(open_run) == len(set(open_run)) == 80
+    assert len(opened) == len(set(opened)) == 80
 
 
 def test_tables_need_no_torch():
