@@ -27,6 +27,8 @@ from memmlp.networks.window_model import WindowModel
 from memmlp.runs.deployed import Deployed
 from memmlp.runs.lookup import list_runs
 
+pytestmark = pytest.mark.slow
+
 CLIPS = [tiny.clip(60, seed=seed) for seed in range(3)]
 
 

@@ -17,6 +17,8 @@ from memmlp.motion.coordinates import Heading
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.predictor import RotationOnly
 
+pytestmark = pytest.mark.slow
+
 CLIP = tiny.clip(50)
 CASES = {
     "vq": {},

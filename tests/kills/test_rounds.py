@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from command_line import MAIN, TINY, run
+from command_line import MAIN, TINY, run, run_apart
 from processes import started, until
 
 from memmlp.runs.lookup import list_runs
@@ -29,7 +29,7 @@ def test_rounds_go_on_after_a_kill(tmp_path: Path):
             lambda: any(one.done for one in list_runs(tmp_path / "outputs")), "the first run is done", killed
         )
     assert not list(tmp_path.glob("outputs/sweeps/*/rounds.json"))
-    said = run(tmp_path, *WORDS, "--until-decided")
+    said = run_apart(tmp_path, *WORDS, "--until-decided")
     assert "all verdicts are decided" in said
     runs = list_runs(tmp_path / "outputs")
     assert len(runs) == 6

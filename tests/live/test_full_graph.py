@@ -24,6 +24,8 @@ from memmlp.motion.coordinates import Heading
 from memmlp.motion.features import sparse_features
 from memmlp.networks.streaming import streaming
 
+pytestmark = pytest.mark.slow
+
 RUN = "0123456789abcdef"
 PERSON = wearer.person(np.arange(61) / 60)
 

@@ -104,6 +104,7 @@ NETWORKS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("network", NETWORKS)
 def test_its_file_is_the_network_in_onnx_runtime(tmp_path: Path, network):
     model = NETWORKS[network]()

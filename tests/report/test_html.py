@@ -175,6 +175,7 @@ def console(ran: subprocess.CompletedProcess[str]) -> list[str]:
     return [line for line in ran.stderr.splitlines() if "CONSOLE" in line]
 
 
+@pytest.mark.slow
 def test_browser_shows_the_page(tmp_path: Path, text: str, chapters: list[Chapter]):
     probe = """<script>
       const wide = [...document.querySelectorAll('main *')].filter(e => !e.closest('.scroll'))
@@ -193,6 +194,7 @@ def test_browser_shows_the_page(tmp_path: Path, text: str, chapters: list[Chapte
         assert all(f'id="{chapter.sweep.name}"' in ran.stdout for chapter in chapters)
 
 
+@pytest.mark.slow
 def test_browser_tells_of_errors(tmp_path: Path):
     """The test above sees what a page's script throws, and what it cannot load."""
     path = tmp_path / "bad.html"
@@ -200,6 +202,7 @@ def test_browser_tells_of_errors(tmp_path: Path):
     assert any("loud" in line for line in console(browser(tmp_path, "--dump-dom", path.as_uri())))
 
 
+@pytest.mark.slow
 def test_browser_prints_and_takes_a_picture(tmp_path: Path, text: str):
     path = tmp_path / "report.html"
     path.write_text(text, encoding="utf-8")

@@ -168,6 +168,7 @@ COLD = "import sys; from pathlib import Path; from memmlp.runs.run import Run; "
     "MLflowTracking(None, Path(sys.argv[1])).project(Run.of(sys.argv[1], sys.argv[2]))"  # fmt: skip
 
 
+@pytest.mark.slow
 def test_cold_starts_at_once_do_not_ruin_the_store(tmp_path: Path):
     names = [f"{i:016x}" for i in range(2)]
     for name in names:

@@ -255,5 +255,6 @@ def test_false_claims_keep_to_the_level_over_all_rounds(truth: float, noise: flo
     assert false_claims(truth, noise, lambda rounds: rounds) <= 0.08
 
 
+@pytest.mark.slow
 def test_the_whole_level_at_every_look_would_not_keep_it():
     assert false_claims(0.0, 5.0, wasteful) > 0.11

@@ -9,11 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chromium import Browser
+from processes import PATIENCE
 
 from memmlp.live.player.play import greeting, play
 from memmlp.live.player.server import Hub, Server
 from memmlp.live.player.sources import ClipSource, TrackedClip
 from memmlp.live.stream import Stream
+
+pytestmark = pytest.mark.slow
 
 SHOWN = "Number(document.documentElement.dataset.shown)"
 NEWEST = "Number(document.querySelector('#scrub').max)"
@@ -24,11 +27,12 @@ def url(network: Path, clip: TrackedClip) -> Iterator[str]:
     """A clip that plays."""
     stopped, source = threading.Event(), ClipSource(clip, 60)
     with Server(Hub(greeting(source, "tiny")), 0) as server:
-        loop = threading.Thread(target=play, args=(Stream(network), source, server.hub.publish, stopped))
+        parts = (Stream(network), source, server.hub.publish, stopped)
+        loop = threading.Thread(target=play, args=parts, daemon=True)
         loop.start()
         yield server.url
         stopped.set()
-        loop.join()
+        loop.join(PATIENCE)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import threading
 
 import numpy as np
 import pytest
+from processes import PATIENCE
 
 from memmlp.common.errors import InputError
 from memmlp.live.player.packets import from_json, from_osc, to_json, to_osc
@@ -91,10 +92,10 @@ def test_a_clip_arrives_as_packets(clip: TrackedClip, kind: str, space: str):
     arrives = PacketSource(kind, 0, parse, space)
     there, clock = SPACES[space], Clock()
     played = source(clip, 60, clock)
-    sender = threading.Thread(target=send, args=(played, arrives.port, pack, there))
+    sender = threading.Thread(target=send, args=(played, arrives.port, pack, there), daemon=True)
     sender.start()
     samples = [arrives.read() for _ in range(120)]
-    sender.join()
+    sender.join(PATIENCE)
     arrives.close()
     assert [sample.time for sample in samples] == pytest.approx([i / 60 for i in range(120)])
     assert all(sample.dropped == 0 for sample in samples)
