@@ -19,6 +19,8 @@ from memmlp.runs.run import Run
 from memmlp.runs.tracking import MLflowTracking, NoTracking, project_safely
 from memmlp.sweep.plan import Entry, Plan
 
+pytestmark = pytest.mark.slow
+
 CONFIG = {"seed": 0, "memory": {"layers": [2, 4], "shift": None}, "long": "x" * 7000}
 
 
@@ -168,7 +170,6 @@ COLD = "import sys; from pathlib import Path; from memmlp.runs.run import Run; "
     "MLflowTracking(None, Path(sys.argv[1])).project(Run.of(sys.argv[1], sys.argv[2]))"  # fmt: skip
 
 
-@pytest.mark.slow
 def test_cold_starts_at_once_do_not_ruin_the_store(tmp_path: Path):
     names = [f"{i:016x}" for i in range(2)]
     for name in names:
