@@ -8,6 +8,7 @@ import pytest
 from memmlp.runs.recipes import RECIPES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", golden.CASES)
 def test_a_component_computes_what_its_recipe_number_stands_for(case: str):
     """Where this fails, numbers of finished runs and of new ones would be mixed under one identity."""

@@ -125,6 +125,7 @@ def test_train_gives_the_job_its_config(memmlp: Memmlp, jobs: list[DictConfig], 
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments", [["-m", "seed=0,1"], ["seed=0,1", "-m"], ["hydra.mode=MULTIRUN", "seed=0,1"]]
 )
@@ -136,6 +137,7 @@ def test_a_multirun(memmlp: Memmlp, jobs: list[DictConfig], tmp_path: Path, argu
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_failed_job_does_not_stop_the_others(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
     seeds = []
 

@@ -105,6 +105,7 @@ def test_identity_and_half_turns_give_no_nan(angle):
         assert (distance(solved) < distance(motion)).all()
 
 
+@pytest.mark.slow
 def test_a_frame_is_solved_alike_alone_in_a_batch_and_in_chunks():
     motion = torch.cat([perturbed(0.3, seed)[:5] for seed in range(3)] + [perturbed(2.0, 9)[:5]])
     sparse = SPARSE[:5].repeat(4, 1)

@@ -22,6 +22,8 @@ from memmlp.motion.synthetic import synthesize_clip
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.streaming import streaming
 
+pytestmark = pytest.mark.slow
+
 SECONDS = 4
 
 

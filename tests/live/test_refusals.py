@@ -18,6 +18,8 @@ from memmlp.networks.memory import NoMemory
 from memmlp.networks.predictor import RotationOnly
 from memmlp.networks.streaming import streaming
 
+pytestmark = pytest.mark.slow
+
 ONE = ([0, 0, 1.6], np.eye(3))
 
 

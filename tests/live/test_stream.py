@@ -35,6 +35,8 @@ from memmlp.networks.predictor import RotationOnly
 from memmlp.networks.streaming import streaming
 from memmlp.runs.run import Run
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 240
 TIMES = np.arange(FRAMES) / 60
 PERSON = wearer.person(TIMES)

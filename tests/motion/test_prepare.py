@@ -118,6 +118,7 @@ def _digest(args: tuple[Path, Path]) -> str:
     return prepare(source(args[0]), args[1]).digest
 
 
+@pytest.mark.slow
 def test_two_processes_at_once(root, tmp_path):
     with multiprocessing.get_context("spawn").Pool(2) as pool:
         digests = pool.map(_digest, [(root, tmp_path / "cache")] * 2)

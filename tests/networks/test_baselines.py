@@ -393,6 +393,7 @@ def identity(*overrides: str) -> str:
     return build_experiment(composed(list(overrides))).identity("d").id
 
 
+@pytest.mark.slow
 def test_networks_have_identities_of_their_own_that_stay_what_they_are():
     """Moving code, renaming classes and new keys that stand at their default change none of them."""
     assert len({identity(), *(identity(f"model={name}") for name in NAMES)}) == 4

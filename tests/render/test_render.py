@@ -137,6 +137,7 @@ def test_png(tmp_path: Path, take: Take):
     assert colour(rows[2])[0] > 2 * colour(rows[1])[0]
 
 
+@pytest.mark.slow
 def test_gif(tmp_path: Path, short: Take):
     film.film(tmp_path / "a.gif", short)
     with Image.open(tmp_path / "a.gif") as image:
@@ -150,6 +151,7 @@ def test_gif(tmp_path: Path, short: Take):
         assert np.asarray(image.convert("RGB"))[5, 5].tolist() == [255, 255, 255]
 
 
+@pytest.mark.slow
 def test_mp4(tmp_path: Path, short: Take):
     av = pytest.importorskip("av")
     film.film(tmp_path / "a.mp4", short)

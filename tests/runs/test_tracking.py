@@ -19,6 +19,8 @@ from memmlp.runs.run import Run
 from memmlp.runs.tracking import MLflowTracking, NoTracking, project_safely
 from memmlp.sweep.plan import Entry, Plan
 
+pytestmark = pytest.mark.slow
+
 CONFIG = {"seed": 0, "memory": {"layers": [2, 4], "shift": None}, "long": "x" * 7000}
 
 

@@ -434,6 +434,7 @@ def test_two_objectives_give_a_front(tmp_path: Path):
     assert names == {"pareto_front.png", "parallel_coordinate.png", "slice.png", "study.html"}
 
 
+@pytest.mark.slow
 def test_what_a_search_leaves(tmp_path: Path):
     study = open_study(tmp_path)
     to_the_end(study, tmp_path)

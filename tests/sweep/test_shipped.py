@@ -142,6 +142,7 @@ def test_tables_of_amass_name_the_body():
 DECOMPOSITION = load_sweep(FOLDER / "decomposition.yaml")
 
 
+@pytest.mark.slow
 def test_the_decomposition_changes_one_ingredient_a_step():
     """Each arm's config differs from its control's in what its label names, or only its branch does."""
     arms = {arm.label: arm for arm in DECOMPOSITION.arms}

@@ -251,6 +251,7 @@ def wasteful(rounds: Rounds) -> Rounds:
     return replace(rounds, levels=(0.05,) * len(rounds.looks))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("truth", "noise"), [(0.0, 5.0), (1.0, 0.5)])
 def test_false_claims_keep_to_the_level_over_all_rounds(truth: float, noise: float):
     assert false_claims(truth, noise, lambda rounds: rounds) <= 0.08
