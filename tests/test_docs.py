@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from memmlp.cli.main import COMMANDS
 from memmlp.config.build import build_loss
 from memmlp.config.compose import composed
-from memmlp.motion.skeleton import SkeletonMap
+from memmlp.motion.importing.skeleton import SkeletonMap
 from memmlp.runs.identity import flatten
 from memmlp.sweep.spec import load_sweep
 

@@ -137,8 +137,9 @@ def npz_frames(path: Path) -> np.ndarray:
 
     from memmlp.common.errors import InputError
     from memmlp.motion.body import builtin_rest_joints
-    from memmlp.motion.clip import read_clip, resample
+    from memmlp.motion.clip import resample
     from memmlp.motion.features import motion_frames
+    from memmlp.motion.formats.npz import read_clip
 
     clip, _ = resample(read_clip(path, path.stem))
     if len(clip) < 3:

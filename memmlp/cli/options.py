@@ -8,6 +8,8 @@ from typing import Any
 
 import click
 
+PATH = click.Path(path_type=Path)
+
 
 class Finite(click.FloatRange):
     """A number in a range, NaN and infinity excluded."""
@@ -22,7 +24,7 @@ class Finite(click.FloatRange):
 
 outputs_option = click.option(
     "--outputs",
-    type=click.Path(path_type=Path),
+    type=PATH,
     default=Path("outputs"),
     envvar="MEMMLP_OUTPUTS",
     show_default=True,

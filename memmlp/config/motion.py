@@ -7,8 +7,8 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from memmlp.config.components import built
-from memmlp.motion.prepare import ClipFolder
-from memmlp.motion.source import MotionSource
+from memmlp.motion.preparing.prepare import ClipFolder
+from memmlp.motion.preparing.source import MotionSource
 
 
 def build_motion(cfg: DictConfig) -> MotionSource:

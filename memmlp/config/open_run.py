@@ -12,7 +12,7 @@ from torch import Tensor
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment, config_of, device
 from memmlp.motion.dataset import MotionDataset
-from memmlp.motion.source import Prepared
+from memmlp.motion.preparing.source import Prepared
 from memmlp.networks.window_model import WindowModel
 from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.identity import trained_by

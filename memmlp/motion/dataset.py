@@ -11,8 +11,8 @@ from torch import Tensor
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import FRAME_DIM
-from memmlp.motion.prepare import Manifest
-from memmlp.motion.splits import PARTS
+from memmlp.motion.preparing.prepare import Manifest
+from memmlp.motion.preparing.splits import PARTS
 
 WEIGHTINGS = ("frames", "clips")
 

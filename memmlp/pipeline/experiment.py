@@ -10,7 +10,7 @@ import torch
 
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
-from memmlp.motion.source import MotionSource
+from memmlp.motion.preparing.source import MotionSource
 from memmlp.networks.architecture import VQVAE_SETTINGS, Architecture
 from memmlp.runs.identity import Identity, deployment_id, evaluation_id
 from memmlp.runs.tracking import Tracking

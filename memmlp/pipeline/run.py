@@ -16,7 +16,7 @@ import torch
 from memmlp.common.files import read_json, write_json
 from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
-from memmlp.motion.source import Prepared
+from memmlp.motion.preparing.source import Prepared
 from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.evaluated import write_report
 from memmlp.runs.identity import Identity, deployment_settings, evaluation_recipes, evaluation_settings

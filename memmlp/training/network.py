@@ -12,7 +12,7 @@ from torch import nn
 from memmlp.evaluation import modes
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset, WindowSampler
-from memmlp.motion.source import Prepared
+from memmlp.motion.preparing.source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architecture import Architecture
 from memmlp.networks.window_model import WindowModel

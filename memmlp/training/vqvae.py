@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.normalizer import Normalizer
-from memmlp.motion.source import Prepared
+from memmlp.motion.preparing.source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architecture import Architecture
 from memmlp.networks.vqvae import VQVAE, rotation_error

@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import PARENTS, builtin_rest_joints
-from memmlp.motion.bvh import END, Bvh, EndSite, read_bvh
 from memmlp.motion.clip import Clip
-from memmlp.motion.retarget import fit
-from memmlp.motion.skeleton import Z_UP, load_skeleton
+from memmlp.motion.formats.bvh import END, Bvh, EndSite, read_bvh
+from memmlp.motion.importing.retarget import fit
+from memmlp.motion.importing.skeleton import Z_UP, load_skeleton
 
 # Joint, parent, offset; a * before an end site's joint, which comes with the offset only.
 DAZ = """

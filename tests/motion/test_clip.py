@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
-from memmlp.motion.clip import Clip, read_clip, resample, write_clip
+from memmlp.motion.clip import Clip, resample
+from memmlp.motion.formats.npz import read_clip, write_clip
 
 
 def arrays(frames: int = 20, width: int = 156) -> dict[str, np.ndarray]:

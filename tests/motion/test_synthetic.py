@@ -10,7 +10,8 @@ import torch
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS, builtin_rest_joints
-from memmlp.motion.clip import Clip, read_clip
+from memmlp.motion.clip import Clip
+from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics, geodesic_angle
 from memmlp.motion.synthetic import ACTIVITIES, synthesize, synthesize_clip
 

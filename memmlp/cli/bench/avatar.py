@@ -156,8 +156,8 @@ def _synthetic() -> MotionDataset:
     import tempfile
 
     from memmlp.motion.dataset import MotionDataset
-    from memmlp.motion.prepare import ClipFolder, prepare
-    from memmlp.motion.splits import SeededSplit
+    from memmlp.motion.preparing.prepare import ClipFolder, prepare
+    from memmlp.motion.preparing.splits import SeededSplit
     from memmlp.motion.synthetic import synthesize
 
     with tempfile.TemporaryDirectory() as folder:

@@ -17,9 +17,9 @@ def prepare(minutes: float) -> None:
     import time
     from pathlib import Path
 
-    from memmlp.motion.prepare import ClipFolder
-    from memmlp.motion.prepare import prepare as run
-    from memmlp.motion.splits import SeededSplit
+    from memmlp.motion.preparing.prepare import ClipFolder
+    from memmlp.motion.preparing.prepare import prepare as run
+    from memmlp.motion.preparing.splits import SeededSplit
     from memmlp.motion.synthetic import synthesize
 
     with tempfile.TemporaryDirectory() as folder:

@@ -26,7 +26,7 @@ from memmlp.config.schema.rules import (
 @dataclass
 class SeededSplitConfig:
     name: str = called("seeded")
-    _target_: str = target("memmlp.motion.splits.SeededSplit")
+    _target_: str = target("memmlp.motion.preparing.splits.SeededSplit")
     test: float = fraction()
     val: float = fraction()
     seed: int = at_least(0)
@@ -36,7 +36,7 @@ class SeededSplitConfig:
 @dataclass
 class ListSplitConfig:
     name: str = called("lists")
-    _target_: str = target("memmlp.motion.splits.ListSplit")
+    _target_: str = target("memmlp.motion.preparing.splits.ListSplit")
     folder: str = key(Existing("folder"))
     val: float = fraction()
     seed: int = at_least(0)
@@ -46,7 +46,7 @@ class ListSplitConfig:
 @dataclass
 class SubsetSplitConfig:
     name: str = called("subsets")
-    _target_: str = target("memmlp.motion.splits.SubsetSplit")
+    _target_: str = target("memmlp.motion.preparing.splits.SubsetSplit")
     train: list[str] = key(EachOf())
     test: list[str] = key(EachOf())
     val: float = fraction()

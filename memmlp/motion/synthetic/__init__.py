@@ -10,7 +10,8 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.progress import track
-from memmlp.motion.clip import FRAME_RATE_RANGE, Clip, write_clip
+from memmlp.motion.clip import FRAME_RATE_RANGE, Clip
+from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.synthetic import actions, gait
 from memmlp.motion.synthetic.puppet import Puppet, solve
 

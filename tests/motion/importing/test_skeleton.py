@@ -12,10 +12,10 @@ from bvh_samples import TREES, person, read, refuse, write
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import builtin_rest_joints
-from memmlp.motion.bvh import read_bvh
-from memmlp.motion.importing import import_folder
-from memmlp.motion.retarget import fit, retarget
-from memmlp.motion.skeleton import SKELETONS, find_skeleton, load_skeleton, shipped_skeletons
+from memmlp.motion.formats.bvh import read_bvh
+from memmlp.motion.importing.folder import import_folder
+from memmlp.motion.importing.retarget import fit, retarget
+from memmlp.motion.importing.skeleton import SKELETONS, find_skeleton, load_skeleton, shipped_skeletons
 
 REST = builtin_rest_joints()
 
@@ -48,7 +48,7 @@ def test_unknown_skeleton_lists_joints_and_maps(tmp_path: Path) -> None:
 def test_a_file_of_two_skeletons_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("one", "two"):
         (tmp_path / f"{name}.yaml").write_text((SKELETONS / "cmu_daz.yaml").read_text())
-    monkeypatch.setattr("memmlp.motion.skeleton.SKELETONS", tmp_path)
+    monkeypatch.setattr("memmlp.motion.importing.skeleton.SKELETONS", tmp_path)
     with refuse(tmp_path, "more than one"):
         find_skeleton(read(tmp_path, "cmu_daz"))
 

@@ -3,7 +3,7 @@
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.motion.splits import S2_TEST, S2_TRAIN, ListSplit, SeededSplit, SubsetSplit
+from memmlp.motion.preparing.splits import S2_TEST, S2_TRAIN, ListSplit, SeededSplit, SubsetSplit
 
 NAMES = [f"salsa/{n:02}" for n in range(1, 31)] + [f"martial/{n:02}" for n in range(1, 11)]
 TWINS = [rf"salsa/(?:{n:02}|{n + 15:02})$" for n in range(1, 16)]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from filelock import FileLock
 
-from memmlp.motion.prepare import ClipFolder, Manifest, finished, prepare
+from memmlp.motion.preparing.prepare import ClipFolder, Manifest, finished, prepare
 
 if TYPE_CHECKING:
     from memmlp.motion.dataset import MotionDataset

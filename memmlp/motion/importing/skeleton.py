@@ -11,8 +11,8 @@ import yaml
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS
-from memmlp.motion.bvh import Bvh
 from memmlp.motion.clip import FRAME_RATE_RANGE
+from memmlp.motion.formats.bvh import Bvh
 
 SKELETONS = Path(__file__).parent / "skeletons"
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # Y-up axes to the world's: y becomes z

@@ -12,11 +12,11 @@ import torch
 
 from memmlp.common.progress import track
 from memmlp.motion.body import JOINTS, load_rest_joints
-from memmlp.motion.bvh import find_bvh, read_bvh
-from memmlp.motion.clip import read_clip, write_clip
+from memmlp.motion.formats.bvh import find_bvh, read_bvh
+from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
-from memmlp.motion.retarget import fit, limb_angles, retarget
-from memmlp.motion.skeleton import LIMBS, Z_UP, find_skeleton, load_skeleton
+from memmlp.motion.importing.retarget import fit, limb_angles, retarget
+from memmlp.motion.importing.skeleton import LIMBS, Z_UP, find_skeleton, load_skeleton
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS, PARENTS
-from memmlp.motion.bvh import Bvh
 from memmlp.motion.clip import Clip
-from memmlp.motion.skeleton import HIPS, LEGS, LIMBS, Z_UP, SkeletonMap
+from memmlp.motion.formats.bvh import Bvh
+from memmlp.motion.importing.skeleton import HIPS, LEGS, LIMBS, Z_UP, SkeletonMap
 
 FOLLOWERS = (7, 8, 10, 11, 20, 21)  # they keep the correction of the bone before them
 ZERO_POSE_LIMIT = 100.0  # degrees between a limb in the source's zero pose and in the T-pose

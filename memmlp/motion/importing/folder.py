@@ -16,10 +16,11 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.common.progress import track
 from memmlp.motion.body import load_rest_joints
-from memmlp.motion.bvh import Bvh, find_bvh, read_bvh
-from memmlp.motion.clip import FRAME_RATE_RANGE, Skipped, write_clip
-from memmlp.motion.retarget import retarget
-from memmlp.motion.skeleton import SkeletonMap, find_skeleton, is_number, load_skeleton
+from memmlp.motion.clip import FRAME_RATE_RANGE, Skipped
+from memmlp.motion.formats.bvh import Bvh, find_bvh, read_bvh
+from memmlp.motion.formats.npz import write_clip
+from memmlp.motion.importing.retarget import retarget
+from memmlp.motion.importing.skeleton import SkeletonMap, find_skeleton, is_number, load_skeleton
 
 RECORD = "import.json"
 HEADER = "the header's"

@@ -26,8 +26,9 @@ from filelock import FileLock
 from memmlp.common.errors import InputError
 from memmlp.common.progress import track
 from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
-from memmlp.motion.clip import Clip, Skipped, read_clip, resample
-from memmlp.motion.splits import PARTS, Split, group_names
+from memmlp.motion.clip import Clip, Skipped, resample
+from memmlp.motion.formats.npz import read_clip
+from memmlp.motion.preparing.splits import PARTS, Split, group_names
 from memmlp.runs.recipes import RECIPES
 
 FORMAT = 2  # number of the cache's format; a new one makes every cache again

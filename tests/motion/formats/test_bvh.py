@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from memmlp.common.errors import InputError
-from memmlp.motion.bvh import MAX_JOINTS, Bvh, read_bvh
+from memmlp.motion.formats.bvh import MAX_JOINTS, Bvh, read_bvh
 
 NUMBER = st.floats(-300, 300).map(lambda x: round(x, 4))
 QUICK = settings(
@@ -274,7 +274,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
 
 
 def test_files_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("memmlp.motion.bvh.MAX_BYTES", len(SMALL) - 1)
+    monkeypatch.setattr("memmlp.motion.formats.bvh.MAX_BYTES", len(SMALL) - 1)
     assert "too large" in refusal(write(tmp_path, SMALL))
 
 

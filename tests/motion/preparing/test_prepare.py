@@ -12,13 +12,14 @@ import pytest
 import torch
 
 from memmlp.common.errors import InputError
-from memmlp.motion import prepare as module
 from memmlp.motion.body import builtin_rest_joints
-from memmlp.motion.clip import Clip, write_clip
+from memmlp.motion.clip import Clip
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.features import motion_frames
-from memmlp.motion.prepare import ClipFolder, Manifest, prepare
-from memmlp.motion.splits import SeededSplit
+from memmlp.motion.formats.npz import write_clip
+from memmlp.motion.preparing import prepare as module
+from memmlp.motion.preparing.prepare import ClipFolder, Manifest, prepare
+from memmlp.motion.preparing.splits import SeededSplit
 from memmlp.runs.recipes import RECIPES
 
 

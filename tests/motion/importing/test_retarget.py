@@ -12,16 +12,17 @@ from bvh_samples import FOLDED, TREES, performed, person, read, refuse, write
 from scipy.spatial.transform import Rotation
 
 from memmlp.motion.body import JOINTS, builtin_rest_joints
-from memmlp.motion.bvh import END, read_bvh
-from memmlp.motion.clip import Clip, read_clip
-from memmlp.motion.fidelity import verify
+from memmlp.motion.clip import Clip
+from memmlp.motion.formats.bvh import END, read_bvh
+from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
-from memmlp.motion.retarget import FOLLOWERS, fit, retarget
-from memmlp.motion.skeleton import LIMBS, find_skeleton, load_skeleton
+from memmlp.motion.importing.retarget import FOLLOWERS, fit, retarget
+from memmlp.motion.importing.skeleton import LIMBS, find_skeleton, load_skeleton
+from memmlp.motion.importing.verify import verify
 from memmlp.motion.synthetic import synthesize_clip
 
 REST = builtin_rest_joints()
-CMU = sorted((Path(__file__).parents[2] / ".." / "shared" / "data" / "cmu").glob("salsa/[12][05].bvh"))
+CMU = sorted((Path(__file__).parents[3] / ".." / "shared" / "data" / "cmu").glob("salsa/[12][05].bvh"))
 """Some of the database's own files, for those who have them."""
 JOINT = {name: index for index, name in enumerate(JOINTS)}
 
@@ -92,7 +93,7 @@ def test_verify_notices_a_wrong_import(tmp_path: Path, monkeypatch: pytest.Monke
         return clip
 
     path = write(tmp_path, person("cmu_daz", 10, 5).text())
-    monkeypatch.setattr("memmlp.motion.fidelity.retarget", bent)
+    monkeypatch.setattr("memmlp.motion.importing.verify.retarget", bent)
     assert verify(path).worst_mm > 1
     assert verify(path).worst_joint == "left_wrist"
     assert verify(path).worst_degrees > 1
@@ -103,7 +104,7 @@ def test_verify_reads_the_npz(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         clip = read_clip(path, name)
         return replace(clip, trans=clip.trans + 0.01)
 
-    monkeypatch.setattr("memmlp.motion.fidelity.read_clip", shifted)
+    monkeypatch.setattr("memmlp.motion.importing.verify.read_clip", shifted)
     assert verify(write(tmp_path, person("cmu_daz", 10, 5).text())).worst_mm > 10
 
 

@@ -12,12 +12,12 @@ from bvh_samples import mutate, person, refuse, write
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import builtin_rest_joints
-from memmlp.motion.bvh import read_bvh
-from memmlp.motion.clip import read_clip
-from memmlp.motion.fidelity import verify_folder
-from memmlp.motion.importing import import_folder
-from memmlp.motion.retarget import retarget
-from memmlp.motion.skeleton import find_skeleton
+from memmlp.motion.formats.bvh import read_bvh
+from memmlp.motion.formats.npz import read_clip
+from memmlp.motion.importing.folder import import_folder
+from memmlp.motion.importing.retarget import retarget
+from memmlp.motion.importing.skeleton import find_skeleton
+from memmlp.motion.importing.verify import verify_folder
 
 REST = builtin_rest_joints()
 

@@ -1,0 +1,20 @@
+"""`memmlp data`: make, import, verify, prepare and inspect motion."""
+
+from __future__ import annotations
+
+import click
+
+from memmlp.cli.data.import_ import import_
+from memmlp.cli.data.inspect import inspect
+from memmlp.cli.data.prepare import prepare
+from memmlp.cli.data.synth import synth
+from memmlp.cli.data.verify import verify
+
+
+@click.group("data")
+def data() -> None:
+    """Make, import, prepare and inspect motion data."""
+
+
+for command in (synth, import_, verify, prepare, inspect):
+    data.add_command(command)

@@ -1,0 +1,29 @@
+"""`memmlp data inspect`: what a cache or a folder of clips holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from memmlp.cli.data.show import show_manifest, show_rates, show_skipped
+from memmlp.cli.options import PATH
+
+
+@click.command("inspect")
+@click.argument("path", type=PATH)
+def inspect(path: Path) -> None:
+    """Show clips, hours, rates and bad files.
+
+    PATH is a cache, whose splits are shown too, or a folder of npz files.
+    """
+    from memmlp.motion.preparing.prepare import MANIFEST, Manifest, survey
+
+    if (path / MANIFEST).is_file():
+        show_manifest(Manifest.load(path))
+        return
+    found = survey(path)
+    show_skipped([f"{file.file}: {file.reason}" for file in found.skipped])
+    show_rates(found.clips)
+    frames = sum(clip.length for clip in found.clips)
+    click.echo(f"{len(found.clips)} clips, {frames / 216000:.2f} h, {len(found.skipped)} bad files")

@@ -1,0 +1,1 @@
+"""Files of motion: what reads and writes each format."""
