@@ -11,7 +11,7 @@ from torch import Tensor
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import FRAME_DIM
-from memmlp.motion.preparing.prepare import Manifest
+from memmlp.motion.preparing.manifest import Manifest
 from memmlp.motion.preparing.splits import PARTS
 
 WEIGHTINGS = ("frames", "clips")

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from memmlp.motion.coordinates import World
 from memmlp.motion.normalizer import Normalizer
-from memmlp.motion.preparing.prepare import Manifest
+from memmlp.motion.preparing.manifest import Manifest
 from memmlp.networks import checkpoint
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import Memory

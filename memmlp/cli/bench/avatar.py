@@ -156,7 +156,7 @@ def _synthetic() -> MotionDataset:
     import tempfile
 
     from memmlp.motion.dataset import MotionDataset
-    from memmlp.motion.preparing.prepare import ClipFolder, prepare
+    from memmlp.motion.preparing.cache import ClipFolder, prepare
     from memmlp.motion.preparing.splits import SeededSplit
     from memmlp.motion.synthetic import synthesize
 

@@ -17,8 +17,8 @@ def prepare(minutes: float) -> None:
     import time
     from pathlib import Path
 
-    from memmlp.motion.preparing.prepare import ClipFolder
-    from memmlp.motion.preparing.prepare import prepare as run
+    from memmlp.motion.preparing.cache import ClipFolder
+    from memmlp.motion.preparing.cache import prepare as run
     from memmlp.motion.preparing.splits import SeededSplit
     from memmlp.motion.synthetic import synthesize
 

@@ -46,8 +46,8 @@ def prepare(
 
     The cache is memory-mappable, and has a manifest of what became of each file.
     """
-    from memmlp.motion.preparing.prepare import ClipFolder
-    from memmlp.motion.preparing.prepare import prepare as run
+    from memmlp.motion.preparing.cache import ClipFolder
+    from memmlp.motion.preparing.cache import prepare as run
 
     chosen = _split(split, val, test, seed, group)
     show_manifest(run(ClipFolder(root, chosen, body, min_frames, strict), out))

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from memmlp.motion.preparing.prepare import ClipRecord, Manifest
+    from memmlp.motion.preparing.manifest import ClipRecord, Manifest
 
 SHOWN = 8  # skipped files that are named on the screen; the manifest lists all
 

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from filelock import FileLock
 
-from memmlp.motion.preparing.prepare import ClipFolder, Manifest, finished, prepare
+from memmlp.motion.preparing.cache import ClipFolder, finished, prepare
+from memmlp.motion.preparing.manifest import Manifest
 
 if TYPE_CHECKING:
     from memmlp.motion.dataset import MotionDataset

@@ -11,12 +11,10 @@ import hashlib
 import json
 import os
 import shutil
-import zipfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -26,15 +24,14 @@ from filelock import FileLock
 from memmlp.common.errors import InputError
 from memmlp.common.progress import track
 from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
-from memmlp.motion.clip import Clip, Skipped, resample
-from memmlp.motion.formats.npz import read_clip
+from memmlp.motion.clip import Clip
+from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest, write_manifest
 from memmlp.motion.preparing.splits import PARTS, Split, group_names
+from memmlp.motion.preparing.survey import Survey, clip_name, load, sources, survey
 from memmlp.runs.recipes import RECIPES
 
-FORMAT = 2  # number of the cache's format; a new one makes every cache again
 FRAMES = 1  # number of a frame's content; a new one changes every digest, and so makes every run again
 CHUNK = 4096  # frames turned into features at a time
-MANIFEST = "manifest.json"
 ITEM_BYTES = FRAME_DIM * 4
 
 
@@ -55,118 +52,6 @@ class ClipFolder:
     body: str = "builtin"
     min_frames: int = 42
     strict: bool = False
-
-
-@dataclass(frozen=True)
-class ClipRecord:
-    """A clip in the cache.
-
-    Attributes:
-        name: path below the data root without suffix.
-        split: "train", "val" or "test".
-        group: name of the clip's group (`splits.group_names`); its own name where it belongs to none.
-        start: its first frame in that split's array.
-        length: its number of frames there.
-        sha256: digest of the source file.
-        fps: frame rate of the source, Hz.
-        resampling: how it was brought to 60 Hz.
-    """
-
-    name: str
-    split: str
-    group: str
-    start: int
-    length: int
-    sha256: str
-    fps: float
-    resampling: str
-
-
-@dataclass(frozen=True)
-class Survey:
-    """What a folder of npz files holds.
-
-    Attributes:
-        clips: sound clips, without split and group yet.
-        skipped: bad files.
-        ignored: number of npz files without motion.
-    """
-
-    clips: tuple[ClipRecord, ...]
-    skipped: tuple[Skipped, ...]
-    ignored: int
-
-
-@dataclass(frozen=True)
-class Manifest:
-    """What a cache holds; the content of `manifest.json`.
-
-    Attributes:
-        digest: sha256 over everything that determines the frames and their split. Groups are not in it, since
-            training does not know them.
-        request: sha256 over the settings and each source's path, size and time, by which a finished cache is
-            recognised.
-        body: "builtin", or the model file's name and a digest of its rest pose: "model.npz 0a1b2c3d".
-        rest_joints: rest positions (22, 3), metres.
-        split: the split's settings.
-        min_frames: fewest frames at 60 Hz of a clip that is taken.
-        clips: the clips, sorted by name.
-        skipped: bad files.
-        ignored: number of npz files without poses (shape.npz and the like).
-        left_out: number of sound clips without a part in the split, by top-level folder.
-        missing: entries of the split for which there is no file.
-        totals: part -> clips, frames, hours.
-        format: format number of the cache.
-    """
-
-    digest: str
-    request: str
-    body: str
-    rest_joints: tuple[tuple[float, ...], ...]
-    split: dict[str, Any]
-    min_frames: int
-    clips: tuple[ClipRecord, ...]
-    skipped: tuple[Skipped, ...]
-    ignored: int
-    left_out: dict[str, int]
-    missing: tuple[str, ...]
-    totals: dict[str, dict[str, float]]
-    format: int = FORMAT
-
-    @classmethod
-    def load(cls, out: Path) -> Manifest:
-        """Load the manifest of a cache.
-
-        Raises:
-            InputError: if there is no finished cache of this format.
-        """
-        path = out / MANIFEST
-        try:
-            data = json.loads(path.read_text())
-            if data["format"] != FORMAT:
-                raise InputError(f"{path}: format {data['format']}, not {FORMAT}; prepare the data again")
-            data["clips"] = tuple(ClipRecord(**clip) for clip in data["clips"])
-            data["skipped"] = tuple(Skipped(**file) for file in data["skipped"])
-            data["rest_joints"] = tuple(map(tuple, data["rest_joints"]))
-            return cls(**{**data, "missing": tuple(data["missing"])})
-        except FileNotFoundError as error:
-            raise InputError(f"{out}: no finished cache; run memmlp data prepare") from error
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
-            raise InputError(f"{path}: not a cache's manifest ({error}); prepare the data again") from error
-
-    @cached_property
-    def rest(self) -> np.ndarray:
-        """Rest positions (22, 3), metres, float64."""
-        return np.array(self.rest_joints)
-
-    @cached_property
-    def groups(self) -> dict[str, str]:
-        """clip name -> its group; statistics count a group once."""
-        return {clip.name: clip.group for clip in self.clips}
-
-    def part(self, split: str) -> list[ClipRecord]:
-        """Return the clips of a split, in the order of its array."""
-        return [clip for clip in self.clips if clip.split == split]
 
 
 def prepare(source: ClipFolder, out: Path) -> Manifest:
@@ -202,27 +87,6 @@ def finished(source: ClipFolder, out: Path) -> Manifest | None:
         return None
 
 
-def survey(root: Path, min_frames: int = 2, strict: bool = False) -> Survey:
-    """Read every npz below a folder.
-
-    Raises:
-        InputError: if there are none, or at the first bad one if `strict`.
-    """
-    clips, skipped, ignored = [], [], 0
-    for file in track(_sources(root), "reading"):
-        path = root / file
-        if _has_no_poses(path):
-            ignored += 1
-            continue
-        try:
-            clips.append(_inspect(path, file, min_frames))
-        except InputError as error:
-            if strict:
-                raise
-            skipped.append(Skipped(file, str(error).removeprefix(f"{path}: ")))
-    return Survey(tuple(clips), tuple(skipped), ignored)
-
-
 def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Manifest:
     """Read the sources, split them, and write the cache."""
     found = survey(source.root, source.min_frames, source.strict)
@@ -233,7 +97,7 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
     clips = _place(found.clips, assignment.parts, group_names(names, source.split.groups))
     if not any(clip.split == "train" for clip in clips):
         raise InputError(f"{source.root}: no clip for training (data.root, data.split); give it other data")
-    bad = {_name(file.file) for file in found.skipped}
+    bad = {clip_name(file.file) for file in found.skipped}
     manifest = Manifest(
         digest=_digest(clips, rest, source.min_frames),
         request=request,
@@ -263,7 +127,7 @@ def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) 
             header = {"descr": "<f4", "fortran_order": False, "shape": (frames[part], FRAME_DIM)}
             np.lib.format.write_array_header_1_0(file, header)
         for record in track(manifest.clips, "writing"):
-            clip, _, _ = _load(source.root / f"{record.name}.npz", record.name)
+            clip, _, _ = load(source.root / f"{record.name}.npz", record.name)
             for block in _frames(clip, rest):
                 files[record.split].write(block.tobytes())
         for file in files.values():
@@ -272,15 +136,7 @@ def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) 
         raise InputError(f"{source.root}: data.root changed while it was being prepared; run it again")
     for part in PARTS:
         os.replace(out / f"{part}.npy.tmp", out / f"{part}.npy")
-    _write_manifest(manifest, out / MANIFEST)
-
-
-def _write_manifest(manifest: Manifest, path: Path) -> None:
-    temporary = path.with_name(path.name + ".tmp")
-    with open(temporary, "wb") as file:
-        file.write(json.dumps(asdict(manifest), indent=1).encode())
-        _sync(file)
-    os.replace(temporary, path)
+    write_manifest(manifest, out)
 
 
 def _sync(file: BinaryIO) -> None:
@@ -298,49 +154,6 @@ def _frames(clip: Clip, rest: np.ndarray) -> Iterator[np.ndarray]:
     for start in range(0, len(clip) - 1, CHUNK):
         block = slice(start, start + CHUNK + 1)  # one frame more than comes out, as the first has no velocity
         yield motion_frames(poses[block], trans[block], joints).numpy().astype("<f4")
-
-
-def _sources(root: Path) -> list[str]:
-    """Return the npz files below a folder, also through links: sorted paths relative to it."""
-    if not root.is_dir():
-        raise InputError(f"data.root: {root} is no folder; give it the folder with your npz clips")
-    walk = os.walk(root, followlinks=True)
-    files = (Path(folder, file) for folder, _, names in walk for file in names if file.endswith(".npz"))
-    found = sorted(path.relative_to(root).as_posix() for path in files)
-    if not found:
-        raise InputError(f"data.root: no npz below {root}; make some with memmlp data synth or data import")
-    return found
-
-
-def _has_no_poses(path: Path) -> bool:
-    """Return whether a file is a sound npz of something else than motion; only its directory is read."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return "poses.npy" not in archive.namelist()
-    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
-        return False
-
-
-def _inspect(path: Path, file: str, min_frames: int) -> ClipRecord:
-    """Return the record of a sound clip, without split and start; raise InputError for any other file."""
-    name = _name(file)
-    clip, fps, how = _load(path, name)
-    if len(clip) < min_frames:
-        raise InputError(f"{path}: {len(clip)} frames at {FPS} Hz, fewer than {min_frames} (data.min_frames)")
-    with open(path, "rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    return ClipRecord(name, "", "", 0, len(clip) - 1, digest, fps, how)
-
-
-def _load(path: Path, name: str) -> tuple[Clip, float, str]:
-    """Read a clip, and return it at 60 Hz with its original frame rate and how it was resampled."""
-    clip = read_clip(path, name)
-    resampled, how = resample(clip)
-    return resampled, clip.fps, how
-
-
-def _name(file: str) -> str:
-    return file.removesuffix(".npz")
 
 
 def _body(body: str, rest: np.ndarray) -> str:
@@ -379,7 +192,7 @@ def _digest(clips: Sequence[ClipRecord], rest: np.ndarray, min_frames: int) -> s
 
 def _request(source: ClipFolder, rest: np.ndarray) -> str:
     """Return a digest of the settings and of each source's path, size and time, without opening any."""
-    files = [(file, *_stamp(source.root / file)) for file in _sources(source.root)]
+    files = [(file, *_stamp(source.root / file)) for file in sources(source.root)]
     code = [FORMAT, FRAMES, RECIPES["features"]]
     return _hash([*code, source.min_frames, rest.tolist(), source.split.describe(), files])
 

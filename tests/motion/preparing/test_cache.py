@@ -1,4 +1,4 @@
-"""Caches: content, manifest, bad files, digests, interruption, concurrency; frames, segments, sampling."""
+"""Caches: content, manifest, bad files, digests, interruption, concurrency."""
 
 import json
 import multiprocessing
@@ -14,11 +14,13 @@ import torch
 from memmlp.common.errors import InputError
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.clip import Clip
-from memmlp.motion.dataset import MotionDataset, WindowSampler
+from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.features import motion_frames
 from memmlp.motion.formats.npz import write_clip
-from memmlp.motion.preparing import prepare as module
-from memmlp.motion.preparing.prepare import ClipFolder, Manifest, prepare
+from memmlp.motion.preparing import cache as module
+from memmlp.motion.preparing import survey
+from memmlp.motion.preparing.cache import ClipFolder, prepare
+from memmlp.motion.preparing.manifest import Manifest
 from memmlp.motion.preparing.splits import SeededSplit
 from memmlp.runs.recipes import RECIPES
 
@@ -83,7 +85,7 @@ def test_unchanged_sources_are_not_read_again(root, tmp_path, monkeypatch):
         raise AssertionError("read a clip")
 
     with monkeypatch.context() as patch:
-        patch.setattr(module, "read_clip", no_reading)
+        patch.setattr(survey, "read_clip", no_reading)
         assert prepare(source(root), tmp_path / "cache") == first
     write_clip(root / "a" / "3.npz", motion(90, 77))
     assert prepare(source(root), tmp_path / "cache").digest != first.digest
@@ -107,7 +109,7 @@ def test_the_digest_knows_every_ingredient(root, tmp_path):
 
 def test_an_interrupted_prepare_is_redone(root, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(module, "_write_manifest", lambda *args: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(module, "write_manifest", lambda *args: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             prepare(source(root), tmp_path / "cache")
     with pytest.raises(InputError):
@@ -190,35 +192,6 @@ def test_nothing_to_prepare_is_one_line(tmp_path):
     for where in ("none", "empty"):
         with pytest.raises(InputError, match=r"data\.root"):
             prepare(source(tmp_path / where), tmp_path / "cache")
-
-
-@pytest.fixture
-def frames() -> MotionDataset:
-    lengths = torch.tensor([5, 12, 30])
-    numbers = torch.arange(47.0)[:, None].expand(-1, 252)
-    return MotionDataset(numbers, torch.tensor([0, 5, 17]), lengths, ["a", "b", "c"])
-
-
-def test_segments_end_where_asked_and_repeat_the_first_frame(frames):
-    segments = frames.segments(torch.tensor([0, 1, 2]), torch.tensor([2, 11, 29]), 4)[..., 0]
-    assert segments.tolist() == [[0, 0, 1, 2], [13, 14, 15, 16], [43, 44, 45, 46]]
-
-
-def test_the_sampler_draws_every_window_alike_and_the_step_is_its_position(frames):
-    sampler = WindowSampler(frames, batch=200, window=6, seed=0)
-    seen: dict[tuple[int, int], int] = {}
-    for step in range(60):
-        for pair in zip(*(x.tolist() for x in sampler.draw(step)), strict=True):
-            seen[pair] = seen.get(pair, 0) + 1
-    possible = {(0, 4)} | {(1, end) for end in range(5, 12)} | {(2, end) for end in range(5, 30)}
-    assert set(seen) == possible  # the last windows (2, 29) and (1, 11) among them
-    expected = 60 * 200 / len(possible)
-    assert all(0.7 * expected < count < 1.3 * expected for count in seen.values())
-    again = WindowSampler(frames, batch=200, window=6, seed=0)
-    assert all(torch.equal(a, b) for a, b in zip(sampler.draw(7), again.draw(7), strict=True))
-    assert not torch.equal(sampler.draw(7)[1], WindowSampler(frames, 200, 6, seed=1).draw(7)[1])
-    clips = WindowSampler(frames, batch=3000, window=6, seed=0, weighting="clips").draw(0)[0]
-    assert torch.bincount(clips).min() > 800
 
 
 def test_frames_of_an_older_recipe_are_made_again(root, tmp_path, monkeypatch):

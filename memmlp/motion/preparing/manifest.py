@@ -1,0 +1,120 @@
+"""What a cache holds: its clips, what became of every file, and how they were split."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from memmlp.common.errors import InputError
+from memmlp.common.files import atomic_write
+from memmlp.motion.clip import Skipped
+
+FORMAT = 2  # number of the cache's format; a new one makes every cache again
+MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True)
+class ClipRecord:
+    """A clip in the cache.
+
+    Attributes:
+        name: path below the data root without suffix.
+        split: "train", "val" or "test".
+        group: name of the clip's group (`splits.group_names`); its own name where it belongs to none.
+        start: its first frame in that split's array.
+        length: its number of frames there.
+        sha256: digest of the source file.
+        fps: frame rate of the source, Hz.
+        resampling: how it was brought to 60 Hz.
+    """
+
+    name: str
+    split: str
+    group: str
+    start: int
+    length: int
+    sha256: str
+    fps: float
+    resampling: str
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a cache holds; the content of `manifest.json`.
+
+    Attributes:
+        digest: sha256 over everything that determines the frames and their split. Groups are not in it, since
+            training does not know them.
+        request: sha256 over the settings and each source's path, size and time, by which a finished cache is
+            recognised.
+        body: "builtin", or the model file's name and a digest of its rest pose: "model.npz 0a1b2c3d".
+        rest_joints: rest positions (22, 3), metres.
+        split: the split's settings.
+        min_frames: fewest frames at 60 Hz of a clip that is taken.
+        clips: the clips, sorted by name.
+        skipped: bad files.
+        ignored: number of npz files without poses (shape.npz and the like).
+        left_out: number of sound clips without a part in the split, by top-level folder.
+        missing: entries of the split for which there is no file.
+        totals: part -> clips, frames, hours.
+        format: format number of the cache.
+    """
+
+    digest: str
+    request: str
+    body: str
+    rest_joints: tuple[tuple[float, ...], ...]
+    split: dict[str, Any]
+    min_frames: int
+    clips: tuple[ClipRecord, ...]
+    skipped: tuple[Skipped, ...]
+    ignored: int
+    left_out: dict[str, int]
+    missing: tuple[str, ...]
+    totals: dict[str, dict[str, float]]
+    format: int = FORMAT
+
+    @classmethod
+    def load(cls, out: Path) -> Manifest:
+        """Load the manifest of a cache.
+
+        Raises:
+            InputError: if there is no finished cache of this format.
+        """
+        path = out / MANIFEST
+        try:
+            data = json.loads(path.read_text())
+            if data["format"] != FORMAT:
+                raise InputError(f"{path}: format {data['format']}, not {FORMAT}; prepare the data again")
+            data["clips"] = tuple(ClipRecord(**clip) for clip in data["clips"])
+            data["skipped"] = tuple(Skipped(**file) for file in data["skipped"])
+            data["rest_joints"] = tuple(map(tuple, data["rest_joints"]))
+            return cls(**{**data, "missing": tuple(data["missing"])})
+        except FileNotFoundError as error:
+            raise InputError(f"{out}: no finished cache; run memmlp data prepare") from error
+        except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
+            raise InputError(f"{path}: not a cache's manifest ({error}); prepare the data again") from error
+
+    @cached_property
+    def rest(self) -> np.ndarray:
+        """Rest positions (22, 3), metres, float64."""
+        return np.array(self.rest_joints)
+
+    @cached_property
+    def groups(self) -> dict[str, str]:
+        """clip name -> its group; statistics count a group once."""
+        return {clip.name: clip.group for clip in self.clips}
+
+    def part(self, split: str) -> list[ClipRecord]:
+        """Return the clips of a split, in the order of its array."""
+        return [clip for clip in self.clips if clip.split == split]
+
+
+def write_manifest(manifest: Manifest, out: Path) -> None:
+    """Write the manifest of a cache, which with it is finished."""
+    atomic_write(out / MANIFEST, json.dumps(asdict(manifest), indent=1))

@@ -1,0 +1,95 @@
+"""Finds the npz clips of a folder and reads each of them once, so that what is bad is known and said."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from memmlp.common.errors import InputError
+from memmlp.common.progress import track
+from memmlp.motion.body import FPS
+from memmlp.motion.clip import Clip, Skipped, resample
+from memmlp.motion.formats.npz import read_clip
+from memmlp.motion.preparing.manifest import ClipRecord
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a folder of npz files holds.
+
+    Attributes:
+        clips: sound clips, without split and group yet.
+        skipped: bad files.
+        ignored: number of npz files without motion.
+    """
+
+    clips: tuple[ClipRecord, ...]
+    skipped: tuple[Skipped, ...]
+    ignored: int
+
+
+def survey(root: Path, min_frames: int = 2, strict: bool = False) -> Survey:
+    """Read every npz below a folder.
+
+    Raises:
+        InputError: if there are none, or at the first bad one if `strict`.
+    """
+    clips, skipped, ignored = [], [], 0
+    for file in track(sources(root), "reading"):
+        path = root / file
+        if _has_no_poses(path):
+            ignored += 1
+            continue
+        try:
+            clips.append(_inspect(path, file, min_frames))
+        except InputError as error:
+            if strict:
+                raise
+            skipped.append(Skipped(file, str(error).removeprefix(f"{path}: ")))
+    return Survey(tuple(clips), tuple(skipped), ignored)
+
+
+def sources(root: Path) -> list[str]:
+    """Return the npz files below a folder, also through links: sorted paths relative to it."""
+    if not root.is_dir():
+        raise InputError(f"data.root: {root} is no folder; give it the folder with your npz clips")
+    walk = os.walk(root, followlinks=True)
+    files = (Path(folder, file) for folder, _, names in walk for file in names if file.endswith(".npz"))
+    found = sorted(path.relative_to(root).as_posix() for path in files)
+    if not found:
+        raise InputError(f"data.root: no npz below {root}; make some with memmlp data synth or data import")
+    return found
+
+
+def _has_no_poses(path: Path) -> bool:
+    """Return whether a file is a sound npz of something else than motion; only its directory is read."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return "poses.npy" not in archive.namelist()
+    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
+        return False
+
+
+def _inspect(path: Path, file: str, min_frames: int) -> ClipRecord:
+    """Return the record of a sound clip, without split and start; raise InputError for any other file."""
+    name = clip_name(file)
+    clip, fps, how = load(path, name)
+    if len(clip) < min_frames:
+        raise InputError(f"{path}: {len(clip)} frames at {FPS} Hz, fewer than {min_frames} (data.min_frames)")
+    with open(path, "rb") as stream:
+        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    return ClipRecord(name, "", "", 0, len(clip) - 1, digest, fps, how)
+
+
+def load(path: Path, name: str) -> tuple[Clip, float, str]:
+    """Read a clip, and return it at 60 Hz with its original frame rate and how it was resampled."""
+    clip = read_clip(path, name)
+    resampled, how = resample(clip)
+    return resampled, clip.fps, how
+
+
+def clip_name(file: str) -> str:
+    return file.removesuffix(".npz")
