@@ -26,7 +26,7 @@ from memmlp.common.progress import track
 from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest, write_manifest
-from memmlp.motion.preparing.splits import PARTS, Split, group_names
+from memmlp.motion.preparing.splits import PARTS, Split
 from memmlp.motion.preparing.survey import Survey, clip_name, load, sources, survey
 from memmlp.runs.recipes import RECIPES
 
@@ -92,12 +92,12 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
     found = survey(source.root, source.min_frames, source.strict)
     if not found.clips:
         raise InputError(_no_clips(source.root, found))
-    names = [clip.name for clip in found.clips]
+    names, bad = [clip.name for clip in found.clips], [clip_name(file.file) for file in found.skipped]
     assignment = source.split.assign(names)
-    clips = _place(found.clips, assignment.parts, group_names(names, source.split.groups))
+    source.split.grouping.check([name for name, part in assignment.parts.items() if part], [*names, *bad])
+    clips = _place(found.clips, assignment.parts, assignment.groups)
     if not any(clip.split == "train" for clip in clips):
         raise InputError(f"{source.root}: no clip for training (data.root, data.split); give it other data")
-    bad = {clip_name(file.file) for file in found.skipped}
     manifest = Manifest(
         digest=_digest(clips, rest, source.min_frames),
         request=request,
@@ -109,7 +109,7 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
         skipped=found.skipped,
         ignored=found.ignored,
         left_out=_left_out(assignment.parts),
-        missing=tuple(name for name in assignment.missing if name not in bad),
+        missing=source.split.missing([*names, *bad]),
         totals={part: _total(clips, part) for part in PARTS},
     )
     _write(source, rest, manifest, out)

@@ -25,7 +25,7 @@ class ClipRecord:
     Attributes:
         name: path below the data root without suffix.
         split: "train", "val" or "test".
-        group: name of the clip's group (`splits.group_names`); its own name where it belongs to none.
+        group: name of the clip's group (`Grouping.names`); its own name where nothing ties it to another.
         start: its first frame in that split's array.
         length: its number of frames there.
         sha256: digest of the source file.

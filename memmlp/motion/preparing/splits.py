@@ -1,23 +1,26 @@
 """Splits, which assign clip names to train, val, test or nothing.
 
-A clip's name is its path below the data root without suffix, `/`-separated. Clips that `groups` (a list of
-regular expressions) tie together are never divided: two clips that match the same pattern anywhere
-(`re.search`), with the same captured groups, get the same part. Fractions count groups, and a clip that no
-pattern matches is a group of its own. Nothing depends on the order of the names: groups are ranked by a hash
-of seed and name, so a clip that is added later moves few others.
+A clip's name is its path below the data root without suffix, `/`-separated. Clips that belong together
+(`Grouping`) are never divided. Fractions count groups, and a clip that nothing ties to another is a group of
+its own. Nothing depends on the order of the names: groups are ranked by a hash of seed and name, so a clip
+that is added later moves few others. Entries of lists and names of subsets fit AMASS' clips whatever release
+these are from (`memmlp.motion.preparing.amass`).
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
 from memmlp.common.errors import InputError
+from memmlp.motion.preparing.amass import clip_key, subset, unpacked
+from memmlp.motion.preparing.groups import Grouping
 
 PARTS = ("train", "val", "test")
 PHASES = ("train", "test")  # the parts for which there are published lists
@@ -27,15 +30,6 @@ S2_TRAIN = (
     "EKUT", "ACCAD", "MPI_mosh", "SFU", "MPI_HDM05",
 )  # fmt: skip
 S2_TEST = ("HumanEva", "Transitions_mocap")
-# Later AMASS downloads renamed some subsets: new name -> the name that the protocols use, in lower case.
-RENAMED = {
-    "bmlrub": "biomotionlab_ntroje",
-    "eyesjapandataset": "eyes_japan_dataset",
-    "hdm05": "mpi_hdm05",
-    "mosh": "mpi_mosh",
-    "poseprior": "mpi_limits",
-    "transitions": "transitions_mocap",
-}
 
 
 @dataclass(frozen=True)
@@ -44,10 +38,12 @@ class Assignment:
 
     Attributes:
         parts: clip name -> "train", "val", "test", or None for a clip that is left out.
+        groups: clip name -> the name of its group; its own where nothing ties it to another.
         missing: entries of the split (list entries, subsets) that no clip's name fits.
     """
 
     parts: Mapping[str, str | None]
+    groups: Mapping[str, str]
     missing: tuple[str, ...] = ()
 
 
@@ -55,7 +51,11 @@ class Split(Protocol):
     """The split slot's interface."""
 
     def assign(self, names: Sequence[str]) -> Assignment:
-        """Return the part of every name; raises InputError if the split is impossible."""
+        """Return the part and the group of every name; raises InputError if the split is impossible."""
+        ...
+
+    def missing(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Return the entries of the split (list entries, subsets) that none of the names fits."""
         ...
 
     def describe(self) -> dict[str, Any]:
@@ -63,55 +63,88 @@ class Split(Protocol):
         ...
 
     @property
-    def groups(self) -> Sequence[str]:
-        """Patterns of clips that belong together."""
+    def listed(self) -> Mapping[str, int]:
+        """The number of the split's entries by subset; empty where it divides whatever there is."""
+        ...
+
+    @property
+    def grouping(self) -> Grouping:
+        """What ties clips together."""
         ...
 
 
+class _Grouped:
+    """What all splits do alike with their keys `groups` and `groups_file`."""
+
+    groups: Sequence[str]
+    groups_file: Path | str | None
+
+    @cached_property
+    def grouping(self) -> Grouping:
+        """What ties clips together."""
+        return Grouping.of(self.groups, self.groups_file)
+
+
 @dataclass(frozen=True)
-class SeededSplit:
+class SeededSplit(_Grouped):
     """A random split with a seed.
 
     Args:
-        test: fraction of the groups (of the clips, without `groups`) for test; 0 leaves it empty.
+        test: fraction of the groups (of the clips, where nothing ties them) for test; 0 leaves it empty.
         val: fraction of the groups for validation; 0 leaves it empty.
         seed: seed of the order in which groups are taken.
         groups: patterns of clips that stay together.
+        groups_file: column file that says which clips stay together; None for none.
     """
 
     test: float = 0.1
     val: float = 0.1
     seed: int = 0
     groups: Sequence[str] = ()
+    groups_file: Path | str | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         _check_fractions(test=self.test, val=self.val)
 
     def assign(self, names: Sequence[str]) -> Assignment:
-        return Assignment(_divide(names, {"test": self.test, "val": self.val}, self.seed, self.groups))
+        seen = {name: name for name in names}
+        fractions = {"test": self.test, "val": self.val}
+        parts = _divide(seen, fractions, self.seed, self.grouping)
+        return Assignment(parts, self.grouping.names(seen))
+
+    def missing(self, names: Iterable[str]) -> tuple[str, ...]:
+        return ()
+
+    @property
+    def listed(self) -> Mapping[str, int]:
+        return {}
 
     def describe(self) -> dict[str, Any]:
         return {"kind": "seeded", "test": self.test, **_carving(self)}
 
 
 @dataclass(frozen=True)
-class ListSplit:
+class ListSplit(_Grouped):
     """Published lists (AvatarPoser, AGRoL): FOLDER/SUBSET/train_split.txt and test_split.txt.
 
     A line is the relative path of an npz; blank lines, CRLF, a leading `./` and whatever stands before the
-    subset's own folder are accepted. Clips in no list are left out.
+    subset's own folder are accepted. An entry is the clip of that name, or else the one that has that name in
+    another release of AMASS. Clips in no list are left out. Patterns of groups see an entry's name, so that a
+    list divides every release alike.
 
     Args:
         folder: where the user keeps the lists.
         val: fraction of train's groups that becomes the validation part.
         seed: seed of the validation part.
         groups: patterns of clips that stay together in the validation part.
+        groups_file: column file that says which clips stay together; None for none.
     """
 
     folder: Path
     val: float = 0.05
     seed: int = 0
     groups: Sequence[str] = ()
+    groups_file: Path | str | None = field(default=None, repr=False)
     entries: Mapping[str, str] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -119,9 +152,18 @@ class ListSplit:
         object.__setattr__(self, "entries", _read_lists(Path(self.folder)))
 
     def assign(self, names: Sequence[str]) -> Assignment:
-        listed = {name: self.entries.get(name) for name in names}
-        missing = tuple(sorted(set(self.entries) - set(names)))
-        return Assignment(_carve_val(listed, self.val, self.seed, self.groups), missing)
+        fits = _fits(self.entries, names)
+        seen = {name: fits.get(name, name) for name in names}
+        parts = {name: self.entries.get(seen[name]) for name in names}
+        missing = tuple(sorted(set(self.entries) - set(fits.values())))
+        return _carved(parts, seen, self, missing)
+
+    def missing(self, names: Iterable[str]) -> tuple[str, ...]:
+        return tuple(sorted(set(self.entries) - set(_fits(self.entries, names).values())))
+
+    @property
+    def listed(self) -> Mapping[str, int]:
+        return dict(Counter(entry.split("/")[0] for entry in sorted(self.entries)))
 
     def describe(self) -> dict[str, Any]:
         lists = hashlib.sha256(json.dumps(sorted(self.entries.items())).encode()).hexdigest()
@@ -129,8 +171,8 @@ class ListSplit:
 
 
 @dataclass(frozen=True)
-class SubsetSplit:
-    """A split by top-level folder, in any letter case and under AMASS' old or new name.
+class SubsetSplit(_Grouped):
+    """A split by top-level folder, in any letter case and under any name that AMASS gave the subset.
 
     Clips in other folders are left out.
 
@@ -140,6 +182,7 @@ class SubsetSplit:
         val: fraction of train's groups that becomes the validation part.
         seed: seed of the validation part.
         groups: patterns of clips that stay together in the validation part.
+        groups_file: column file that says which clips stay together; None for none.
     """
 
     train: Sequence[str]
@@ -147,38 +190,41 @@ class SubsetSplit:
     val: float = 0.05
     seed: int = 0
     groups: Sequence[str] = ()
+    groups_file: Path | str | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         _check_fractions(val=self.val)
-        both = {_subset(name) for name in self.train} & {_subset(name) for name in self.test}
+        both = set(map(subset, self.train)) & set(map(subset, self.test))
         if both:
             raise InputError(f"data.split: subsets {', '.join(sorted(both))} are both in train and in test")
 
     def assign(self, names: Sequence[str]) -> Assignment:
-        phase = {_subset(name): part for part in PHASES for name in getattr(self, part)}
-        parts = {name: phase.get(_subset(name)) for name in names}
-        present = {_subset(name) for name in names}
-        missing = tuple(name for name in (*self.train, *self.test) if _subset(name) not in present)
-        return Assignment(_carve_val(parts, self.val, self.seed, self.groups), missing)
+        phase = {subset(name): part for part in PHASES for name in getattr(self, part)}
+        parts = {name: phase.get(subset(name)) for name in names}
+        _check_once(name for name, part in parts.items() if part)
+        return _carved(parts, {name: unpacked(name) for name in names}, self, self.missing(names))
+
+    def missing(self, names: Iterable[str]) -> tuple[str, ...]:
+        present = set(map(subset, names))
+        return tuple(name for name in (*self.train, *self.test) if subset(name) not in present)
+
+    @property
+    def listed(self) -> Mapping[str, int]:
+        return dict.fromkeys((*self.train, *self.test), 1)
 
     def describe(self) -> dict[str, Any]:
         return {"kind": "subsets", "train": list(self.train), "test": list(self.test), **_carving(self)}
 
 
-def group_names(names: Iterable[str], patterns: Sequence[str]) -> dict[str, str]:
-    """Map each clip's name to its group's: the first name in the group, its own for a clip alone.
-
-    Clips of one group are not replications of each other: two dancers of one recording, for example.
-
-    Raises:
-        InputError: if a pattern is no regular expression.
-    """
-    return {name: group[0] for group in _grouped(names, patterns) for name in group}
-
-
 def _carving(split: SeededSplit | ListSplit | SubsetSplit) -> dict[str, Any]:
     """Return the settings that every split has."""
-    return {"val": split.val, "seed": split.seed, "groups": list(split.groups)}
+    rows = split.grouping.rows
+    file = (
+        {}
+        if rows is None
+        else {"groups_file_sha256": hashlib.sha256(json.dumps(sorted(rows.items())).encode()).hexdigest()}
+    )
+    return {"val": split.val, "seed": split.seed, "groups": list(split.groups), **file}
 
 
 def _check_fractions(**fractions: float) -> None:
@@ -189,22 +235,29 @@ def _check_fractions(**fractions: float) -> None:
         raise InputError(f"data.{', data.'.join(fractions)}: they add up to 1 or more; leave some to train")
 
 
-def _carve_val(
-    parts: Mapping[str, str | None], val: float, seed: int, groups: Sequence[str]
-) -> dict[str, str | None]:
-    """Return the parts with some of train's groups moved to "val"."""
-    train = [name for name, part in parts.items() if part == "train"]
+def _carved(
+    parts: Mapping[str, str | None],
+    seen: Mapping[str, str],
+    split: ListSplit | SubsetSplit,
+    missing: tuple[str, ...],
+) -> Assignment:
+    """Return the assignment with some of train's groups moved to "val"."""
+    train = {name: seen[name] for name, part in parts.items() if part == "train"}
     if not train:
         raise InputError("data.split: no clip of its train part is below data.root; is it the right root?")
-    return {**parts, **_divide(train, {"val": val}, seed, groups)}
+    carved = {**parts, **_divide(train, {"val": split.val}, split.seed, split.grouping)}
+    return Assignment(carved, split.grouping.names(seen), missing)
 
 
 def _divide(
-    names: Sequence[str], fractions: Mapping[str, float], seed: int, groups: Sequence[str]
+    seen: Mapping[str, str], fractions: Mapping[str, float], seed: int, grouping: Grouping
 ) -> dict[str, str]:
-    """Map names to parts: the first groups in a seeded order fill those of `fractions`, the rest train."""
-    ranked = sorted(_grouped(names, groups), key=lambda group: _rank(group[0], seed))
-    parts = {name: "train" for name in names}
+    """Map clips to parts: the first groups in a seeded order fill those of `fractions`, the rest train.
+
+    `seen` maps each clip to the name by which patterns and the seed know it.
+    """
+    ranked = sorted(grouping.tied(seen), key=lambda group: _rank(seen[group[0]], seed))
+    parts = dict.fromkeys(seen, "train")
     start = 0
     for part, count in _counts(len(ranked), fractions).items():
         for group in ranked[start : start + count]:
@@ -232,35 +285,38 @@ def _rank(name: str, seed: int) -> str:
     return hashlib.sha256(json.dumps([seed, name]).encode()).hexdigest()
 
 
-def _grouped(names: Iterable[str], patterns: Sequence[str]) -> list[list[str]]:
-    """Return the names in groups, each sorted; ties are transitive (union-find over names and ties)."""
-    try:
-        compiled = [re.compile(pattern) for pattern in patterns]
-    except re.error as error:
-        raise InputError(f"data.groups: {error.pattern!r} is no regular expression ({error})") from error
-    parent: dict[object, object] = {}
-    groups: dict[object, list[str]] = {}
+def _fits(entries: Collection[str], names: Iterable[str]) -> dict[str, str]:
+    """Map clips to the entries that they fit: by name, else by the name in another release of AMASS.
+
+    Raises:
+        InputError: if several clips have an entry's name in another release, and none has it as it stands.
+    """
+    fits = {name: name for name in names if name in entries}
+    others = {clip_key(entry).lower(): entry for entry in sorted(set(entries) - set(fits), reverse=True)}
+    found = defaultdict(list)
+    for name in sorted(set(names) - set(fits)):
+        if (entry := others.get(clip_key(name).lower())) is not None:
+            found[entry].append(name)
+    _refuse_several(found.values())
+    return fits | {clips[0]: entry for entry, clips in found.items()}
+
+
+def _check_once(names: Iterable[str]) -> None:
+    """Refuse clips that are there more than once, from several releases of AMASS."""
+    found = defaultdict(list)
     for name in sorted(names):
-        for index, pattern in enumerate(compiled):
-            if match := pattern.search(name):
-                parent[_find(parent, name)] = _find(parent, (index, match.groups()))
-    for name in sorted(names):
-        groups.setdefault(_find(parent, name), []).append(name)
-    return list(groups.values())
+        found[clip_key(name)].append(name)
+    _refuse_several(found.values())
 
 
-def _find(parent: dict[object, object], node: object) -> object:
-    """Return the root of a node, halving the path on the way."""
-    while parent.setdefault(node, node) != node:
-        parent[node] = parent[parent[node]]
-        node = parent[node]
-    return node
-
-
-def _subset(name: str) -> str:
-    """Return the subset of a clip's or a subset's name, in lower case and under its old name."""
-    top = name.split("/")[0].lower()
-    return RENAMED.get(top, top)
+def _refuse_several(found: Iterable[Sequence[str]]) -> None:
+    several = [clips for clips in found if len(clips) > 1]
+    if several:
+        first, second = several[0][:2]
+        raise InputError(
+            f"data.root: {len(several)} clips of the split fit more than one file, the first {first}.npz and "
+            f"{second}.npz; keep one release of AMASS below it"
+        )
 
 
 def _read_lists(folder: Path) -> dict[str, str]:
@@ -285,5 +341,5 @@ def _read_list(file: Path) -> Iterator[str]:
         raise InputError(f"{file}: not a readable list ({error})") from error
     for line in filter(None, map(str.strip, lines)):
         steps = [step for step in line.removesuffix(".npz").split("/") if step not in ("", ".")]
-        subset = file.parent.name
-        yield "/".join(steps[steps.index(subset) :] if subset in steps else steps)
+        own = next((i for i, step in enumerate(steps[:-1]) if subset(step) == subset(file.parent.name)), 0)
+        yield "/".join(steps[own:])

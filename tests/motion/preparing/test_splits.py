@@ -70,3 +70,88 @@ def test_bad_patterns_lists_and_subsets(tmp_path):
         ListSplit(tmp_path / "none")
     with pytest.raises(InputError, match="both"):
         SubsetSplit(["CMU"], ["cmu"])
+
+
+OLD = [
+    *(f"BioMotionLab_NTroje/rub00{n}/000{m}_treadmill norm_poses" for n in range(4) for m in range(2)),
+    *(f"CMU/18_19_Justin/{n}_0{m}_poses" for n in (18, 19) for m in range(2)),
+    *(f"MPI_HDM05/dg/HDM_dg_01-01_0{m}_120_poses" for m in range(3)),
+]
+
+
+def renamed(name: str) -> str:
+    return name.replace("BioMotionLab_NTroje", "BMLrub").replace("MPI_HDM05", "HDM05")
+
+
+def stage_two(name: str) -> str:
+    return renamed(name).replace("_poses", "_stageii").replace(" ", "_")
+
+
+def in_archives(name: str) -> str:
+    return f"{renamed(name).split('/')[0]}/{name}"
+
+
+def write_lists(folder, names=OLD):
+    for number, name in enumerate(names):
+        lists = folder / name.split("/")[0]
+        lists.mkdir(parents=True, exist_ok=True)
+        with open(lists / f"{'test' if number % 4 == 3 else 'train'}_split.txt", "a") as file:
+            file.write(f"{name}.npz\n")
+    return folder
+
+
+@pytest.mark.parametrize("write", [renamed, stage_two, in_archives, str.lower, str.upper])
+@pytest.mark.parametrize("groups", [[], ["^([^/]+/[^/]+)/"]])
+def test_lists_divide_every_release_of_amass_alike(tmp_path, write, groups):
+    split = ListSplit(write_lists(tmp_path), val=0.3, groups=groups)
+    expected, found = split.assign(OLD), split.assign([*map(write, OLD), "BMLrub/rub009/other_stageii"])
+    assert (expected.missing, found.missing) == ((), ())
+    assert set(expected.parts.values()) == {"train", "val", "test"}
+    assert found.parts == {write(name): part for name, part in expected.parts.items()} | {
+        "BMLrub/rub009/other_stageii": None
+    }
+    same = {write(name): write(group) for name, group in expected.groups.items()}
+    assert {name: found.groups[name] for name in same} == same
+
+
+def test_lists_of_a_later_release_fit_the_first_one(tmp_path):
+    split = ListSplit(write_lists(tmp_path, [stage_two(name) for name in OLD]))
+    assert split.assign(OLD).missing == ()
+    assert split.missing(OLD[1:]) == (stage_two(OLD[0]),)
+    assert split.listed == {"BMLrub": 8, "CMU": 4, "HDM05": 3}
+
+
+def test_an_entry_is_the_file_of_its_name_and_two_others_are_refused(tmp_path):
+    split = ListSplit(write_lists(tmp_path))
+    both = [*OLD, stage_two(OLD[0])]
+    assert split.assign(both).parts[stage_two(OLD[0])] is None
+    with pytest.raises(InputError, match=r"1 clips.*BMLrub/.*_poses.npz and BMLrub/.*_stageii.npz"):
+        split.assign([renamed(OLD[0]), stage_two(OLD[0]), *OLD[1:]])
+
+
+def test_subsets_under_every_name_but_once():
+    split = SubsetSplit(["BioMotionLab_NTroje", "CMU"], ["MPI_HDM05"], groups=["^([^/]+/[^/]+)/"])
+    for write in (renamed, stage_two, in_archives, str.lower):
+        found = split.assign([write(name) for name in OLD])
+        assert found.missing == ()
+        assert None not in found.parts.values()
+        assert len(set(found.groups.values())) == 6
+    assert split.missing(OLD[:8]) == ("CMU", "MPI_HDM05")
+    with pytest.raises(InputError, match="keep one release"):
+        split.assign([*OLD, stage_two(OLD[0])])
+
+
+def test_a_column_file_ties_clips_beside_patterns(tmp_path):
+    file = tmp_path / "groups.csv"
+    rows = {name: name.split("/")[0] for name in NAMES if name.startswith("martial")}
+    file.write_text("clip,group\n" + "".join(f"{n}.npz,{rows.get(n, n)}\n" for n in NAMES))
+    split = SeededSplit(0.3, 0.1, 0, TWINS, groups_file=file)
+    found = split.assign(NAMES)
+    assert {found.groups[name] for name in rows} == {"martial"}
+    assert len({found.parts[name] for name in rows}) == 1
+    assert all(found.parts[f"salsa/{n:02}"] == found.parts[f"salsa/{n + 15:02}"] for n in range(1, 16))
+    bare = SeededSplit(0.3, 0.1, 0, TWINS)
+    assert found.parts != bare.assign(NAMES).parts
+    assert split.describe() != bare.describe()
+    file.write_text(file.read_text().replace("martial\n", "other\n"))
+    assert SeededSplit(0.3, 0.1, 0, TWINS, groups_file=file).describe() != split.describe()

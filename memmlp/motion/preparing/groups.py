@@ -1,0 +1,129 @@
+"""Groups of clips that are no replications of each other: of one subject, take or session.
+
+Clips of one group are never divided between parts, and statistics count a group once. What belongs together
+is told by patterns, by a column file, or by both: two clips that match the same pattern anywhere
+(`re.search`) with the same captured groups are tied, and so are two clips with the same group in the file.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from memmlp.common.errors import InputError
+
+COLUMNS = ("clip", "group")
+KEY = "data.split.groups_file"
+
+
+@dataclass(frozen=True)
+class Grouping:
+    """What ties clips together.
+
+    Attributes:
+        patterns: regular expressions.
+        rows: clip name -> its group in the column file; None without a file.
+        file: the column file, for messages.
+    """
+
+    patterns: Sequence[str] = ()
+    rows: Mapping[str, str] | None = None
+    file: Path | None = None
+
+    @classmethod
+    def of(cls, patterns: Sequence[str], file: Path | str | None) -> Grouping:
+        """Make the grouping of patterns and of a column file, if there is one.
+
+        Raises:
+            InputError: if the file can't be read, naming the line that is wrong.
+        """
+        return cls(tuple(patterns), read_groups(Path(file)) if file else None, Path(file) if file else None)
+
+    def check(self, names: Collection[str], files: Iterable[str]) -> None:
+        """Check that the column file has all clips to be split, and no others than those with a file.
+
+        Args:
+            names: clips to be split.
+            files: names of all files, of clips or not.
+
+        Raises:
+            InputError: naming the first clip that is missing or unknown.
+        """
+        if self.rows is None:
+            return
+        for what, found in (
+            ("has no row for", set(names) - set(self.rows)),
+            ("names, but data.root has not,", set(self.rows) - set(files)),
+        ):
+            if found:
+                more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+                raise InputError(f"{KEY}: {self.file} {what} clip {min(found)}{more}")
+
+    def tied(self, seen: Mapping[str, str]) -> list[list[str]]:
+        """Return clips in groups; ties are transitive (union-find over names and ties).
+
+        Args:
+            seen: clip name -> the name that patterns and the order within a group go by.
+
+        Raises:
+            InputError: if a pattern is no regular expression.
+        """
+        try:
+            compiled = [re.compile(pattern) for pattern in self.patterns]
+        except re.error as error:
+            raise InputError(f"data.groups: {error.pattern!r} is no regular expression ({error})") from error
+        order = sorted(seen, key=lambda name: seen[name])
+        parent: dict[object, object] = {}
+        for name in order:
+            for index, pattern in enumerate(compiled):
+                if match := pattern.search(seen[name]):
+                    parent[_find(parent, name)] = _find(parent, (index, match.groups()))
+            if self.rows and name in self.rows:
+                parent[_find(parent, name)] = _find(parent, (KEY, self.rows[name]))
+        groups: dict[object, list[str]] = {}
+        for name in order:
+            groups.setdefault(_find(parent, name), []).append(name)
+        return list(groups.values())
+
+    def names(self, seen: Mapping[str, str]) -> dict[str, str]:
+        """Map each clip to its group's name: the column file's, or else that of the first clip in it."""
+        rows = self.rows or {}
+        return {name: rows.get(group[0], group[0]) for group in self.tied(seen) for name in group}
+
+
+def read_groups(file: Path) -> dict[str, str]:
+    """Read a column file: CSV with the columns `clip` and `group`; others are passed over.
+
+    A clip is named by its path below the data's folder, with or without `.npz`.
+
+    Raises:
+        InputError: naming the line that is wrong.
+    """
+    try:
+        with open(file, encoding="utf-8-sig", newline="") as stream:
+            table = csv.DictReader(stream)
+            rows = [(table.line_num, row) for row in table]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{KEY}: {file}: not a readable CSV file ({error})") from error
+    if missing := [name for name in COLUMNS if name not in (table.fieldnames or ())]:
+        raise InputError(f"{KEY}: {file}: no column {missing[0]}; its first line has to name clip and group")
+    groups: dict[str, str] = {}
+    for line, row in rows:
+        clip, group = ((row[name] or "").strip() for name in COLUMNS)
+        clip = clip.removeprefix("./").removesuffix(".npz")
+        if not clip or not group:
+            raise InputError(f"{KEY}: {file}: line {line} lacks a clip or a group")
+        if groups.setdefault(clip, group) != group:
+            raise InputError(f"{KEY}: {file}: line {line} gives {clip} another group than before")
+    return groups
+
+
+def _find(parent: dict[object, object], node: object) -> object:
+    """Return the root of a node, halving the path on the way."""
+    while parent.setdefault(node, node) != node:
+        parent[node] = parent[parent[node]]
+        node = parent[node]
+    return node
