@@ -105,10 +105,11 @@ def read_groups(file: Path) -> dict[str, str]:
     try:
         with open(file, encoding="utf-8-sig", newline="") as stream:
             table = csv.DictReader(stream)
+            columns = table.fieldnames or ()
             rows = [(table.line_num, row) for row in table]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{KEY}: {file}: not a readable CSV file ({error})") from error
-    if missing := [name for name in COLUMNS if name not in (table.fieldnames or ())]:
+    if missing := [name for name in COLUMNS if name not in columns]:
         raise InputError(f"{KEY}: {file}: no column {missing[0]}; its first line has to name clip and group")
     groups: dict[str, str] = {}
     for line, row in rows:
