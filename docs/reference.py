@@ -20,8 +20,8 @@ from omegaconf import MISSING
 
 import memmlp
 from memmlp.cli.main import COMMANDS, commands
+from memmlp.config.packaged import packaged
 from memmlp.config.schema import SCHEMAS
-from memmlp.config.shipped import shipped
 
 ROOT = Path(__file__).parent.parent
 MARK = "<!-- made from the code by docs/reference.py -->\n\n"
@@ -98,7 +98,7 @@ class Key(typing.NamedTuple):
 
 def config_page() -> str:
     """All groups, their options and keys."""
-    conf = shipped("conf")
+    conf = packaged("conf")
     parts = [
         "# Config keys",
         "`memmlp train GROUP=OPTION GROUP.KEY=VALUE`; the default option stands first. Values such as "

@@ -20,7 +20,7 @@ from memmlp.evaluation.units import UNITS
 from memmlp.live.stream import Offsets, Stream
 from memmlp.runs.lookup import check_trained, find_run, is_trained, list_runs
 from memmlp.runs.run import Run
-from memmlp.tables.measured import load
+from memmlp.tables.measured_run import load
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -14,7 +14,7 @@ from hydra import version
 from memmlp.cli.main import commands
 from memmlp.cli.sweep import split_executor
 from memmlp.config.compose import VERSION_BASE, composed_plain, parse, preflight
-from memmlp.config.plan import find_sweep
+from memmlp.config.plan_sweep import find_sweep
 from memmlp.config.schema import register
 from memmlp.search.spec import parse_search
 
@@ -127,9 +127,9 @@ def _sweeps(parsed: dict[str, Any]) -> None:
     if name.isupper() or name == "all" or OWN.fullmatch(name):  # a reader's, or many
         composes([word for word in rest if not word.startswith("seed=")])
         return
-    jobs = find_sweep(name).with_overrides(rest).jobs()
-    for job in (jobs[0], jobs[-1]):
-        composes(job.overrides)
+    found = find_sweep(name).with_overrides(rest).arm_seeds()
+    for one in (found[0], found[-1]):
+        composes(one.overrides)
 
 
 def _search(parsed: dict[str, Any]) -> None:

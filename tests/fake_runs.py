@@ -12,9 +12,9 @@ import numpy as np
 
 from memmlp.runs.run import Run
 from memmlp.sweep.spec import MODES, Arm, Sweep
-from memmlp.tables.collect import collect, finished
+from memmlp.tables.build_table import collect, finished
 from memmlp.tables.effects import Runs
-from memmlp.tables.measured import Measured, load
+from memmlp.tables.measured_run import Measured, load
 from memmlp.tables.table import Table
 
 Find = Callable[[Arm, int], Run | None]

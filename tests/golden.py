@@ -277,7 +277,7 @@ def ik() -> Numbers:
     return summary("solved", solved)
 
 
-def shipped(graph: str) -> Numbers:
+def deployed(graph: str) -> Numbers:
     """An exported stream on a clip, and what its sizes are."""
     model = tiny.model()
     step = {"graph.streaming": streaming, "graph.naive": lambda network: network}[graph](model)
@@ -350,8 +350,8 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "mode.stream": partial(mode, "stream"),
     "mode.window": partial(mode, "window"),
     "ik.lbfgs": ik,
-    "graph.streaming": partial(shipped, "graph.streaming"),
-    "graph.naive": partial(shipped, "graph.naive"),
+    "graph.streaming": partial(deployed, "graph.streaming"),
+    "graph.naive": partial(deployed, "graph.naive"),
     "int8": int8,
 }  # fmt: skip
 UNSEEN = ("export", "latency")

@@ -20,7 +20,7 @@ from PIL import Image
 import memmlp
 from memmlp.common.files import read_json, write_json
 from memmlp.evaluation.units import UNITS
-from memmlp.runs.evaluated import write_report
+from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.lookup import list_runs
 
 ROOT = Path(memmlp.__file__).parents[1]

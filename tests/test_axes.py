@@ -22,7 +22,7 @@ from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.pipeline.experiment import Experiment
-from memmlp.pipeline.run import vqvae_run
+from memmlp.pipeline.run_stages import vqvae_run
 from memmlp.runs.run import Run
 
 TINY = [

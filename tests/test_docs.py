@@ -185,8 +185,8 @@ def test_the_sweep_of_the_guide_loads(tmp_path: Path):
     path.write_text(examples("sweeps", "yaml")[0])
     sweep = load_sweep(path)
     assert sweep.control == "2, 4, 6, 8"
-    for job in sweep.jobs():
-        composed(job.overrides)
+    for one in sweep.arm_seeds():
+        composed(one.overrides)
 
 
 def test_the_skeleton_of_the_guide_has_the_keys_of_one():

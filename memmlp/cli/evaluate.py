@@ -33,15 +33,15 @@ def evaluate(
     """
     from rich.console import Console
 
-    from memmlp.cli.outcome import metrics_table
+    from memmlp.cli.train_summary import metrics_table
     from memmlp.common.files import write_json
     from memmlp.config.open_run import open_run
     from memmlp.evaluation.predictions import save_predictions as write_predictions
-    from memmlp.pipeline.run import clip_rows, finished
+    from memmlp.pipeline.run_stages import clip_rows, complete_stages
 
     found = open_run(outputs, run, device, overrides)
     experiment = found.experiment
-    results, made = finished(experiment, found.run, found.data, again=again)
+    results, made = complete_stages(experiment, found.run, found.data, again=again)
     said = f"{' and '.join(made)} done" if made else "measured before"
     click.echo(f"run {found.run.id}: {said}")
     Console(highlight=False).print(metrics_table(results))

@@ -176,7 +176,7 @@ def watched(feed: Feed, port: int, no_browser: bool) -> None:
             file, name = Path(feed.network), Path(feed.network).name
         else:
             run = find_run(feed.outputs, feed.network)
-            file, name = run.deployed, f"run {run.id[:8]}"
+            file, name = run.preferred_onnx, f"run {run.id[:8]}"
         stream = Stream(file, space=source.space)
         hub = Hub(greeting(source, name))
         with Server(hub, port) as server:

@@ -31,7 +31,7 @@ def report(words: tuple[str, ...], out: Path | None, outputs: Path) -> None:
     and the memory's controls. OVERRIDES are those that the sweeps were run with; they find the runs again.
     """
     from memmlp.cli.table import write
-    from memmlp.config.shipped import shipped
+    from memmlp.config.packaged import packaged
     from memmlp.report.html import page as written
     from memmlp.report.html import published
     from memmlp.runs.environment import environment
@@ -39,7 +39,7 @@ def report(words: tuple[str, ...], out: Path | None, outputs: Path) -> None:
 
     names = [word for word in words if "=" not in word and not word.startswith("~")] or EVERY
     chapters = chapters_of(names, [word for word in words if word not in names], outputs)
-    folder = shipped("sweeps")
+    folder = packaged("sweeps")
     systems = published(load_sweep(folder / "table01.yaml"), load_sweep(folder / "table17.yaml"))
     git = environment()["git"] or {}
     code = f"{git.get('commit', environment()['version'])[:7]}{' with changes' if git.get('dirty') else ''}"
@@ -51,7 +51,7 @@ def chapters_of(names: Sequence[str], overrides: Sequence[str], outputs: Path) -
     """Return the tables of some names with the finished runs behind them; each run is read once."""
     from memmlp.cli.table import MODES, gathered
     from memmlp.report.html import Chapter
-    from memmlp.tables.measured import load
+    from memmlp.tables.measured_run import load
 
     found = gathered(names, overrides, outputs, MODES["both"], functools.cache(load))
     return [Chapter(sweep, table, runs) for sweep, runs, table in found]

@@ -14,8 +14,8 @@ from memmlp.cli.options import outputs_option
 from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
+    from memmlp.report.kept_results import Kept
     from memmlp.report.markdown import KeptTable
-    from memmlp.report.store import Kept
     from memmlp.tables.table import Table
 
 FOLDER = Path("docs/results")
@@ -47,12 +47,12 @@ def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | N
     """
     from memmlp.cli.rounds import shown
     from memmlp.common.files import plain
-    from memmlp.config.plan import find_sweep, is_path
-    from memmlp.report.store import Kept, load_kept, overrides_of, save, without_paths
-    from memmlp.tables.collect import finished
-    from memmlp.tables.measured import load
-    from memmlp.tables.planned_runs import finder
+    from memmlp.config.plan_sweep import find_sweep, is_path
+    from memmlp.report.kept_results import Kept, load_kept, overrides_of, save, without_paths
+    from memmlp.tables.build_table import finished
+    from memmlp.tables.measured_run import load
     from memmlp.tables.rounds import as_json
+    from memmlp.tables.runs_of_plan import finder
 
     sweep = find_sweep(name).with_overrides(overrides)
     known = shown(sweep, overrides, outputs.absolute())
@@ -104,8 +104,8 @@ def docs(folder: Path, check: bool) -> None:
 
 def sources(folder: Path) -> dict[str, KeptTable]:
     """Return the tables of all results that are kept below a folder, by the stems of their files."""
+    from memmlp.report.kept_results import load_kept
     from memmlp.report.markdown import KeptTable
-    from memmlp.report.store import load_kept
 
     found = {}
     for path in sorted((folder / "data").glob("*.json")):
@@ -117,8 +117,8 @@ def sources(folder: Path) -> dict[str, KeptTable]:
 def _table(kept: Kept) -> Table:
     """Compute the table of kept results, over the seeds that any of their runs has."""
     from memmlp.cli.rounds import of_another
-    from memmlp.config.plan import find_sweep
-    from memmlp.tables.collect import collect
+    from memmlp.config.plan_sweep import find_sweep
+    from memmlp.tables.build_table import collect
     from memmlp.tables.rounds import of_json
 
     sweep = find_sweep(kept.sweep)

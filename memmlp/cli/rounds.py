@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def record(sweep: Sweep, outputs: Path) -> Path:
     """Return the file where a sweep's rounds are kept."""
-    from memmlp.config.plan import sweep_folder
+    from memmlp.config.plan_sweep import sweep_folder
 
     return sweep_folder(sweep, outputs) / "rounds.json"
 
@@ -91,7 +91,7 @@ def until_decided(
     """
     from dataclasses import replace
 
-    from memmlp.config.plan import planned
+    from memmlp.config.plan_sweep import planned
 
     while True:
         spent = rounds.spent(sweep)
@@ -116,10 +116,10 @@ def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
     from filelock import FileLock
 
     from memmlp.common.files import write_json
-    from memmlp.tables.collect import finished
-    from memmlp.tables.measured import load
-    from memmlp.tables.planned_runs import finder
+    from memmlp.tables.build_table import finished
+    from memmlp.tables.measured_run import load
     from memmlp.tables.rounds import advanced, as_json
+    from memmlp.tables.runs_of_plan import finder
 
     path = record(sweep, outputs)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -144,7 +144,7 @@ def _name(rounds: Rounds, sweep: Sweep, plan: Plan, label: str, seeds: int) -> s
 
     The identities include the evaluations that the sweep shows of them.
     """
-    from memmlp.config.plan import digest
+    from memmlp.config.plan_sweep import digest
     from memmlp.tables.rounds import pair_of
 
     keys = {(entry.label, entry.seed): entry.key for entry in plan.entries}
@@ -197,7 +197,7 @@ def shown(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> Shown:
 
     Otherwise the sweep is shown with its own seeds, and a flag says so where rounds were taken.
     """
-    from memmlp.config.plan import planned
+    from memmlp.config.plan_sweep import planned
 
     path = record(sweep, outputs)
     kept = read(path)

@@ -63,7 +63,7 @@ def sweep(
     controls, get more, up to --max-seeds.
     """
     from memmlp.cli import rounds
-    from memmlp.config.plan import find_sweep, planned, sweep_folder
+    from memmlp.config.plan_sweep import find_sweep, planned, sweep_folder
     from memmlp.sweep.executors import sbatch
 
     engine, options, rest = split_executor(overrides)
@@ -161,13 +161,13 @@ def slurm_options(options: dict[str, str]) -> dict[str, object]:
 
 def bring_to_end(chosen: Sweep, plan: Plan, engine: str, options: dict[str, object], workers: int) -> None:
     """Start workers, wait until they have done the plan's runs, and show these as one group in tracking."""
-    from memmlp.config.plan import sweep_folder
+    from memmlp.config.plan_sweep import sweep_folder
     from memmlp.sweep.board import Board
     from memmlp.sweep.controller import oversee
 
     _, fleet = hire(sweep_folder(chosen, plan.outputs), plan, engine, options, workers)
     oversee(plan, fleet, Board())
-    track(plan)
+    show_in_mlflow(plan)
 
 
 def hire(
@@ -185,7 +185,7 @@ def hire(
         options: submitit's parameters.
         workers: how many workers at most.
     """
-    from memmlp.config.work import work, work_alone
+    from memmlp.config.perform_task import work, work_alone
     from memmlp.sweep.controller import Fleet
     from memmlp.sweep.worker import Presence
 
@@ -199,12 +199,12 @@ def hire(
     return path, Fleet(executor(engine, options, folder), task, workers, folder / "workers", presence)
 
 
-def track(plan: Plan) -> None:
+def show_in_mlflow(plan: Plan) -> None:
     """Show the plan's finished runs as one group, where runs are tracked."""
     from omegaconf import OmegaConf
 
     from memmlp.config.build import build_tracking
-    from memmlp.runs.tracking import harmless
+    from memmlp.runs.mlflow_tracking import harmless
 
     labels = {entry.id: entry.label for entry in plan.entries if plan.complete(entry)}
     if labels:
@@ -217,10 +217,10 @@ def show(chosen: Sweep, plan: Plan) -> None:
     """Print the board once, and the runs that earlier versions of the sweep file left behind."""
     from rich.console import Console
 
-    from memmlp.config.plan import orphans
+    from memmlp.config.plan_sweep import orphans
     from memmlp.sweep.board import render
 
-    missing = len(chosen.jobs()) - len(plan.entries)
+    missing = len(chosen.arm_seeds()) - len(plan.entries)
     if plan.entries:
         Console(highlight=False).print(render(plan, plan.states()))
     if missing:
@@ -254,8 +254,8 @@ def report(shown: Shown, words: Sequence[str], chosen: Sweep) -> None:
     """
     from memmlp.cli.rounds import closing
     from memmlp.cli.table import MODES, of_plan, on_screen
-    from memmlp.config.plan import orphans
-    from memmlp.tables.measured import load
+    from memmlp.config.plan_sweep import orphans
+    from memmlp.tables.measured_run import load
 
     plan, known = shown.plan, shown.rounds
     states = plan.states()

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from memmlp.cli.rounds import Shown
     from memmlp.sweep.spec import Sweep
     from memmlp.tables.effects import Runs
-    from memmlp.tables.planned_runs import Read
+    from memmlp.tables.runs_of_plan import Read
     from memmlp.tables.seeds_needed import Need
     from memmlp.tables.table import Table
 
@@ -56,7 +56,7 @@ def table(
 
     OVERRIDES are those that the sweep was run with; they find its runs again.
     """
-    from memmlp.tables.measured import load
+    from memmlp.tables.measured_run import load
 
     if plan and (form or out):
         raise InputError("--plan: goes to the screen alone, without --format and --out")
@@ -115,14 +115,14 @@ def gathered(
         overrides: the command line's overrides.
         outputs: the folder of runs and caches.
         modes: modes of evaluation to show.
-        read: reads a run (`memmlp.tables.measured.load`).
+        read: reads a run (`memmlp.tables.measured_run.load`).
         branch: shows this branch in place of the arms' own; None for theirs.
 
     Raises:
         InputError: where none of them can be composed with the command line's overrides.
     """
     from memmlp.cli.rounds import shown
-    from memmlp.tables.collect import without_runs
+    from memmlp.tables.build_table import without_runs
 
     found, failures = [], []
     for sweep, command in chosen(names, overrides):
@@ -140,8 +140,8 @@ def gathered(
 
 def of_plan(shown: Shown, modes: Sequence[str], command: str, read: Read) -> Found:
     """Return a planned sweep's finished runs and its table."""
-    from memmlp.tables.collect import collect, finished
-    from memmlp.tables.planned_runs import finder, older, states
+    from memmlp.tables.build_table import collect, finished
+    from memmlp.tables.runs_of_plan import finder, older, states
 
     sweep, plan, rounds, flags = shown
     runs = finished(sweep, finder(plan, read))
@@ -152,10 +152,10 @@ def of_plan(shown: Shown, modes: Sequence[str], command: str, read: Read) -> Fou
 
 def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
     """Return the sweeps of some names, with the overrides, and the command that runs each."""
-    from memmlp.config.plan import find_sweep
-    from memmlp.config.shipped import shipped
+    from memmlp.config.packaged import packaged
+    from memmlp.config.plan_sweep import find_sweep
 
-    tables = sorted(path.stem for path in shipped("sweeps").glob("table*.yaml"))
+    tables = sorted(path.stem for path in packaged("sweeps").glob("table*.yaml"))
     every = [one for name in names for one in (tables if name == "all" else [name])]
     return [
         (find_sweep(one).with_overrides(overrides), " ".join(["memmlp sweep", one, *overrides]))
@@ -176,8 +176,8 @@ def on_screen(tables: Sequence[Table]) -> None:
 
 def plans_on_screen(found: Sequence[Found], modes: Sequence[str]) -> None:
     """Print, sweep by sweep, how many seeds the paper's effects would need."""
-    from memmlp.tables.grid import caption
     from memmlp.tables.seeds_needed import needs
+    from memmlp.tables.table_text import caption
 
     for one in found:
         wanted = needs(one.sweep, one.runs, modes)

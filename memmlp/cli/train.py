@@ -16,8 +16,8 @@ from omegaconf import DictConfig
 from memmlp.common.errors import InputError, TrainingDiverged
 from memmlp.config.compose import CONFIG, VERSION_BASE, parse, preflight
 from memmlp.config.explain import explain
+from memmlp.config.packaged import packaged
 from memmlp.config.schema import check, register
-from memmlp.config.shipped import shipped
 
 
 @click.command(
@@ -52,7 +52,7 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
             args=args,
             args_parser=parser,
             task_function=_collecting(job or run_training, failures),
-            config_path=str(shipped("conf")),
+            config_path=str(packaged("conf")),
             config_name=CONFIG,
         )
     for failure in failures[:-1]:
@@ -103,11 +103,11 @@ def run_training(cfg: DictConfig) -> None:
     """Check the config, bring its run to its end, and print the results."""
     import torch
 
-    from memmlp.cli.outcome import show
+    from memmlp.cli.train_summary import show
     from memmlp.config.build import build_experiment
-    from memmlp.pipeline.run import run
+    from memmlp.pipeline.run_stages import run_experiment
 
     check(cfg)
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
-    show(run(build_experiment(cfg)))
+    show(run_experiment(build_experiment(cfg)))

@@ -85,7 +85,7 @@ def prepared(words: Sequence[str], config_dir: Path | None, outputs: Path) -> Se
     Raises:
         InputError: naming the key that is wrong.
     """
-    from memmlp.config.plan import digest
+    from memmlp.config.plan_sweep import digest
     from memmlp.search.spec import parse_search
 
     own = [word for word in words if word.lstrip("+~").partition("=")[0].split(".")[0] == "search"]
@@ -145,7 +145,7 @@ def _check_space(setup: Setup) -> str:
 
 def _tasks(setup: Setup, values: Mapping[str, Value]) -> list[Sequence[RunTask]]:
     """Return the runs of a trial with these values, a list of tasks for each seed; the data is prepared."""
-    from memmlp.config.plan import tasks_of
+    from memmlp.config.plan_sweep import tasks_of
 
     experiments = _experiments(setup, values)
     return [tasks_of(experiment, experiment.data.prepare().digest) for experiment in experiments]
@@ -192,14 +192,14 @@ def search(setup: Setup, study: Study, engine: str, options: dict[str, object], 
 
 def leave(setup: Setup, study: Study) -> None:
     """Write what the search found into its folder."""
-    from memmlp.config.shipped import shipped
+    from memmlp.config.packaged import packaged
     from memmlp.search import results
 
     results.write_trials(study, setup.folder / "trials.csv")
-    groups = [path.name for path in shipped("conf").iterdir() if path.is_dir()]
+    groups = [path.name for path in packaged("conf").iterdir() if path.is_dir()]
     results.write_experiments(study, setup.folder, groups)
     table = f"table{results.TABLE:02d}.yaml"
-    results.write_table(study, shipped("sweeps") / table, setup.folder / table)
+    results.write_table(study, packaged("sweeps") / table, setup.folder / table)
     results.write_plots(study, setup.folder)
 
 

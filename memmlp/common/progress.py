@@ -34,7 +34,7 @@ def progress() -> Progress:
     )
 
 
-def track(items: Iterable[T], description: str, total: int | None = None) -> Iterator[T]:
+def progress_bar(items: Iterable[T], description: str, total: int | None = None) -> Iterator[T]:
     """Yield the items while a progress bar counts them.
 
     Args:

@@ -16,9 +16,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from memmlp.common.errors import InputError
-from memmlp.config.components import built
+from memmlp.config.build_motion import build_motion
 from memmlp.config.compose import composed
-from memmlp.config.motion import build_motion
+from memmlp.config.instantiate import built
 from memmlp.config.schema import check, restored
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
@@ -38,8 +38,8 @@ from memmlp.networks.window_model import WindowModel
 from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.identity import flatten
 from memmlp.runs.lookup import check_trained
+from memmlp.runs.mlflow_tracking import Tracking
 from memmlp.runs.run import Run
-from memmlp.runs.tracking import Tracking
 from memmlp.training.losses import Loss, MotionLoss
 from memmlp.training.network import NetworkTraining
 from memmlp.training.optim import Optim, vqvae_optim

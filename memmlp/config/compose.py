@@ -19,8 +19,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from memmlp.common.errors import InputError
 from memmlp.config.explain import explain
+from memmlp.config.packaged import packaged
 from memmlp.config.schema import check, register
-from memmlp.config.shipped import shipped
 
 VERSION_BASE = "1.3"
 CONFIG = "train"
@@ -81,7 +81,7 @@ def preflight(args: argparse.Namespace) -> list[DictConfig]:
 @contextmanager
 def _hydra(args: argparse.Namespace) -> Iterator[None]:
     """Initialise Hydra with the search path that the arguments ask for, the same as when the jobs run."""
-    path = create_config_search_path(str(_folder(args.config_path or shipped("conf"), "--config-path")))
+    path = create_config_search_path(str(_folder(args.config_path or packaged("conf"), "--config-path")))
     if args.config_dir:
         own = f"file://{_folder(args.config_dir, '--config-dir')}"
         path.prepend(provider="command-line", path=own, anchor=SearchPathQuery(provider="schema"))

@@ -1,4 +1,4 @@
-"""What a trained network is shipped as: its live step as ONNX, checked and timed, and as int8 if asked."""
+"""What a trained network is deployed as: its live step as ONNX, checked and timed, and as int8 if asked."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from memmlp.deploy.parity import TOLERANCE, parity
 from memmlp.deploy.quantization import compared, quantise
 from memmlp.networks.streaming import StreamingGraph, streaming
 from memmlp.networks.window_model import WindowModel
-from memmlp.runs.deployed import Deployed
+from memmlp.runs.deployment_folder import DeploymentFolder
 
 # What is exported of a network, by the graph's name; "auto" is "streaming" where there is such a graph.
 GRAPHS: dict[str, Callable[[WindowModel], WindowModel | StreamingGraph]] = {
@@ -28,7 +28,7 @@ first of them that there is."""
 
 @dataclass(frozen=True)
 class Deployment:
-    """How networks are shipped.
+    """How networks are deployed.
 
     Attributes:
         latency_steps: number of timed steps, after a warm-up.
@@ -40,10 +40,10 @@ class Deployment:
     graph: str = "auto"
     precision: str = "fp32"
 
-    def ship(
+    def deploy(
         self,
         model: WindowModel,
-        deployed: Deployed,
+        deployed: DeploymentFolder,
         run_id: str,
         train: Sequence[Tensor],
         test: Sequence[Tensor],
@@ -83,7 +83,11 @@ class Deployment:
         return record
 
     def _int8(
-        self, network: StreamingGraph, deployed: Deployed, train: Sequence[Tensor], test: Sequence[Tensor]
+        self,
+        network: StreamingGraph,
+        deployed: DeploymentFolder,
+        train: Sequence[Tensor],
+        test: Sequence[Tensor],
     ) -> dict[str, Any]:
         """Write the int8 file beside the float32 one, and return its accuracy, times and size."""
         quantise(deployed.onnx, deployed.int8, network.ends, train)

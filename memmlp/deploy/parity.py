@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from memmlp.common.progress import track
+from memmlp.common.progress import progress_bar
 from memmlp.deploy.session import OnnxStream
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.networks.memory import Blend
@@ -61,7 +61,7 @@ def in_torch(model: WindowModel, clip: Tensor) -> Tensor:
     """Return the world motion (N, 198) that the network streams of a clip's inputs (N, 252 or 54)."""
     state, made = model.initial_state(1), []
     with deterministic(model):
-        for sparse in track(clip[:, None, None, :SPARSE_DIM], "check"):
+        for sparse in progress_bar(clip[:, None, None, :SPARSE_DIM], "check"):
             motion, state = model.advance(sparse, state)
             made.append(motion[0, -1])
     return torch.stack(made)

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from memmlp.common.progress import track
+from memmlp.common.progress import progress_bar
 from memmlp.evaluation import metrics
 from memmlp.evaluation.ik import IK, NoIK
 from memmlp.motion.body import N_JOINTS, POSITION, ROTATION, SPARSE_DIM
@@ -67,7 +67,7 @@ def frame_by_frame(network: Evaluable, clips: Sequence[Tensor], size: int) -> li
     motion = inputs.new_zeros(*inputs.shape[:2], POSITION.stop)
     state = network.initial_state(len(clips))
     active = len(clips)
-    for t in track(range(lengths[0]), "stream"):
+    for t in progress_bar(range(lengths[0]), "stream"):
         while lengths[active - 1] <= t:  # the clips are sorted by length: the last ones end first
             active -= 1
             state = {name: tensor[:active] for name, tensor in state.items()}

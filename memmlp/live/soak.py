@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from memmlp.common.progress import track
+from memmlp.common.progress import progress_bar
 from memmlp.live.stream import Stream
 from memmlp.motion.body import FPS
 
@@ -62,7 +62,7 @@ def soak(stream: Stream, motion: TrackedMotion, times: int) -> Soaked:
     """
     length, finite, errors, size = len(motion.joints), True, np.zeros(TENTHS), 0
     total = length * times
-    for index in track(range(total), "soak"):
+    for index in progress_bar(range(total), "soak"):
         at, tenth = index % length, index * TENTHS // total
         head, left, right = zip(motion.positions[at], motion.rotations[at], strict=True)
         pose = stream.step(head, left, right, index / FPS)

@@ -339,4 +339,4 @@ def _file(source: str | PathLike[str] | Run) -> Path:
     if not isinstance(source, Run | str | PathLike) or not str(source):
         raise InputError(f"source={source!r}: allowed are a run, its folder, or an ONNX file")
     run = source if isinstance(source, Run) else Run(Path(source))
-    return run.deployed if run.folder.is_dir() else run.folder
+    return run.preferred_onnx if run.folder.is_dir() else run.folder

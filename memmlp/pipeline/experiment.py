@@ -13,7 +13,7 @@ from memmlp.evaluation.evaluation import Evaluation
 from memmlp.motion.preparing.source import MotionSource
 from memmlp.networks.architecture import VQVAE_SETTINGS, Architecture
 from memmlp.runs.identity import Identity, deployment_id, evaluation_id
-from memmlp.runs.tracking import Tracking
+from memmlp.runs.mlflow_tracking import Tracking
 from memmlp.training.network import NetworkTraining
 from memmlp.training.vqvae import VQVAETraining
 
@@ -32,7 +32,7 @@ class Experiment:
         vqvae: how a frozen VQ-VAE is trained.
         training: how the network is trained.
         evaluation: how it is evaluated.
-        deployment: how it is shipped.
+        deployment: how it is deployed.
         predictions: folder for predictions of the test clips; None for no such files.
         tracking: shows finished runs elsewhere.
     """
@@ -56,14 +56,14 @@ class Experiment:
         return {mode: evaluation_id(self.config, mode) for mode in self.evaluation.modes}
 
     @property
-    def deployed(self) -> str:
+    def deployment_id(self) -> str:
         """The identity of the deployment."""
         return deployment_id(self.config)
 
     @property
     def stages(self) -> tuple[str, ...]:
         """The identities of the evaluations and the deployment."""
-        return (*self.evaluations.values(), self.deployed)
+        return (*self.evaluations.values(), self.deployment_id)
 
     def vqvae_identity(self, data: str) -> Identity | None:
         """Return the identity of the VQ-VAE's run on data of that digest; None if the network uses none."""

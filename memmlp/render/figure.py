@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from memmlp.common.files import atomic_write
-from memmlp.common.progress import track
+from memmlp.common.progress import progress_bar
 from memmlp.render.raster import draw
 from memmlp.render.sheet import FAINT, Sheet, png
 from memmlp.render.take import Take
@@ -30,7 +30,7 @@ def heatmap_png(path: Path, take: Take, poses: int = POSES) -> None:
     for row, label in enumerate(["truth", *take.predictions]):
         sheet.text(20, TOP + row * step + HEIGHT / 2, label, 17, rotation=90, weight="bold")
     frames = np.linspace(0, len(take.truth) - 1, poses + 2).round().astype(int)[1:-1]
-    for column, frame in enumerate(track(frames.tolist(), "poses")):
+    for column, frame in enumerate(progress_bar(frames.tolist(), "poses")):
         x = LEFT + column * WIDTH
         sheet.text(x + WIDTH / 2, TOP - 16, f"{take.seconds(frame):.2f} s", 17)
         for row, picture in enumerate(views(take, frame)):

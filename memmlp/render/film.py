@@ -12,7 +12,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
-from memmlp.common.progress import track
+from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS
 from memmlp.render.raster import draw
 from memmlp.render.sheet import FAINT, Sheet, indexed
@@ -54,7 +54,7 @@ def pictures(take: Take) -> Iterator[np.ndarray]:
     }
     sheet.colour_bar(len(labels) * WIDTH + 16, TOP + 60, 16, HEIGHT - 120, take.top)
     path, azimuth = take.path(), take.azimuth(len(take.truth) // 2)
-    for frame in track(range(0, len(take.truth), EVERY), "pictures"):
+    for frame in progress_bar(range(0, len(take.truth), EVERY), "pictures"):
         camera = take.camera(azimuth, path[frame], WIDTH, HEIGHT)
         for panel, (joints, errors) in zip(panels, take.rows(frame), strict=True):
             panel.set_data(draw(camera, joints, errors, take.floor))

@@ -17,8 +17,8 @@ from matplotlib.ticker import MaxNLocator, NullFormatter, ScalarFormatter
 from memmlp.statistics import performance_profile
 from memmlp.sweep.spec import COSTS
 from memmlp.tables.distributions import Distribution
-from memmlp.tables.grid import heading
 from memmlp.tables.table import Cell, Table
+from memmlp.tables.table_text import heading
 
 # Placeholder colours for matplotlib, which `_svg` replaces by the page's, so that it has a dark mode.
 INK, FAINT = "#010203", "#010204"

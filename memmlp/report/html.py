@@ -13,14 +13,14 @@ from typing import Any
 from memmlp.report import figures
 from memmlp.report.figures import Curve, Point
 from memmlp.runs.identity import trained_by
-from memmlp.runs.log import Metrics
+from memmlp.runs.metrics_log import Metrics
 from memmlp.sweep.spec import COSTS, Sweep
 from memmlp.tables.distributions import Distribution, distributions
 from memmlp.tables.effects import Runs
 from memmlp.tables.formats import as_html
-from memmlp.tables.grid import caption
-from memmlp.tables.measured import Measured
+from memmlp.tables.measured_run import Measured
 from memmlp.tables.table import Table
+from memmlp.tables.table_text import caption
 
 ERROR = "MPJRE"  # the error in Fig. 1, by Sec. 4.3
 MOST_POINTS = 200  # about how many points a curve has at most

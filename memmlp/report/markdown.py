@@ -9,12 +9,12 @@ from jinja2 import Environment, StrictUndefined, TemplateError
 
 from memmlp.common.errors import InputError
 from memmlp.report.claims import claims
-from memmlp.report.store import Kept
+from memmlp.report.kept_results import Kept
 from memmlp.statistics import Verdict
 from memmlp.tables.formats import escaped, markdown
-from memmlp.tables.grid import MINUS, MISSING, caption, effect_words, number_words, unit, value_words
-from memmlp.tables.measured import UNKNOWN, Measured
+from memmlp.tables.measured_run import UNKNOWN, Measured
 from memmlp.tables.table import Cell, Row, Table
+from memmlp.tables.table_text import MINUS, MISSING, caption, effect_words, number_words, unit, value_words
 
 MARK = "<!-- made by: memmlp results docs -->"
 ORIGIN = {

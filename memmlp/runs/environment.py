@@ -19,6 +19,7 @@ import memmlp
 PACKAGE = Path(memmlp.__file__).parent
 NOT_NUMBERS = ("cli", "config", "live", "render", "report", "search", "statistics", "sweep", "tables")
 """Folders of the package whose code no result of a run comes from."""
+WIRING = ("config/build.py", "config/instantiate.py")  # they decide what reaches the constructors
 PATCH = 1_000_000  # at most so many characters of changes are kept with a run
 
 
@@ -93,11 +94,8 @@ def sources() -> dict[str, str]:
 
 def _counts(path: Path) -> bool:
     """Return whether a run's numbers come from the file at this path below the package."""
-    wiring = path.as_posix() in (
-        "config/build.py",
-        "config/components.py",
-    )  # they decide what reaches the constructors
-    return wiring or (not path.parts[0].startswith("_") and path.parts[0] not in NOT_NUMBERS)
+    room = path.parts[0]
+    return path.as_posix() in WIRING or (not room.startswith("_") and room not in NOT_NUMBERS)
 
 
 def code_digest(text: str) -> str:

@@ -55,7 +55,7 @@ RECIPES: dict[str, int] = {
     "mode.stream": 1,
     "mode.window": 1,
     "ik.lbfgs": 1,
-    # how they are shipped (memmlp.deploy, memmlp.networks.streaming)
+    # how they are deployed (memmlp.deploy, memmlp.networks.streaming)
     "export": 1,
     "graph.streaming": 1,
     "graph.naive": 1,

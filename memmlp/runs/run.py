@@ -17,13 +17,13 @@ import yaml
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, file_digest, now, read_json, sync_folder, write_json
-from memmlp.runs.deployed import Deployed
+from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import changes, environment, host, sources
-from memmlp.runs.evaluated import current, intact
+from memmlp.runs.evaluation_file import current, intact
 from memmlp.runs.identity import belongs, used_as_configured
 from memmlp.runs.lock import Lock
-from memmlp.runs.log import Metrics, MetricsLog
-from memmlp.runs.origin import joined
+from memmlp.runs.metrics_log import Metrics, MetricsLog
+from memmlp.runs.resumed_origin import joined
 
 
 class Run:
@@ -86,35 +86,36 @@ class Run:
         """Return the file of an evaluation, whether it was made or not."""
         return self.evaluations / f"{identity}.json"
 
-    def deployment(self, identity: str) -> Deployed:
+    def deployment(self, identity: str) -> DeploymentFolder:
         """Return the folder of a deployment, whether it was made or not."""
-        return Deployed(self.deployments / identity)
+        return DeploymentFolder(self.deployments / identity)
 
     def has(self, stage: str) -> bool:
         """Return whether the evaluation or deployment of that identity was made."""
         return self.evaluation(stage).is_file() or self.deployment(stage).done
 
     @property
-    def shipped(self) -> Deployed:
+    def preferred_deployment(self) -> DeploymentFolder:
         """The deployment to use, among those with the run's own settings.
 
         One of the present recipes comes first, then one whose int8 file is accurate enough, then the last one
         made.
         """
-        made = [Deployed(path.parent) for path in self.deployments.glob("*/latency.json")]
+        made = [DeploymentFolder(path.parent) for path in self.deployments.glob("*/latency.json")]
         own = [one for one in made if one.done and used_as_configured(one.settings, self.config)]
         best = max(own, key=lambda one: (one.current, one.prefers_int8, one.made), default=None)
-        return best or Deployed(self.deployments / "none")
+        return best or DeploymentFolder(self.deployments / "none")
 
     @property
-    def deployed(self) -> Path:
+    def preferred_onnx(self) -> Path:
         """The ONNX file to use: int8 where there is one that is accurate enough (`export.precision`)."""
-        return self.shipped.int8 if self.shipped.prefers_int8 else self.shipped.onnx
+        deployment = self.preferred_deployment
+        return deployment.int8 if deployment.prefers_int8 else deployment.onnx
 
     @property
     def onnx(self) -> Path:
         """The float32 ONNX file of the deployment to use."""
-        return self.shipped.onnx
+        return self.preferred_deployment.onnx
 
     def __repr__(self) -> str:
         return f"Run({str(self.folder)!r})"
@@ -228,7 +229,7 @@ class Run:
         found = read_json(self.results_path)
         for report in map(read_json, self.own_evaluations):
             found[report["mode"]] = {**found.get(report["mode"], {}), **report["mean"]}
-        latency = self.shipped.record
+        latency = self.preferred_deployment.record
         return found | ({"latency": latency} if latency else {})
 
     @property

@@ -15,7 +15,7 @@ from rich.text import Text
 from memmlp.runs.run import Run
 from memmlp.search.spec import Search
 from memmlp.search.study import Study, deviations
-from memmlp.sweep.board import Screen, progress
+from memmlp.sweep.board import Screen, progress_text
 
 SHOWN = 5  # how many of the best trials are shown
 WORDS = {TrialState.COMPLETE: "complete", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
@@ -76,7 +76,7 @@ def _going(trial: FrozenTrial, outputs: Path) -> Text:
     done = f"{states.count('done')} seeds done, " if "done" in states else ""
     if "running" not in states:
         return Text(f"{done}waiting")
-    return Text(done + progress(runs[states.index("running")], trial.user_attrs["steps"]), style="cyan")
+    return Text(done + progress_text(runs[states.index("running")], trial.user_attrs["steps"]), style="cyan")
 
 
 def trials_table(search: Search, title: str) -> Table:

@@ -16,7 +16,7 @@ from optuna.trial import Trial, TrialState
 
 from memmlp.common.errors import InputError
 from memmlp.runs.identity import inference
-from memmlp.runs.log import Metrics
+from memmlp.runs.metrics_log import Metrics
 from memmlp.runs.run import Run
 from memmlp.search.board import SearchBoard
 from memmlp.search.spec import Objective, Value

@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from memmlp.runs.log import Metrics
+from memmlp.runs.metrics_log import Metrics
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask
 
@@ -112,7 +112,7 @@ def cell(plan: Plan, task: RunTask, state: str) -> Text:
     """Describe a run in a few characters."""
     run = plan.run_of(task)
     if state == "running":
-        return Text(progress(run, total_steps(task)), style=COLOURS[state])
+        return Text(progress_text(run, total_steps(task)), style=COLOURS[state])
     if state == "done":
         return Text(f"done {result(run)}".rstrip(), style=COLOURS[state])
     return Text(WORDS.get(state, state), style=COLOURS.get(state, ""))
@@ -133,7 +133,7 @@ def total_steps(task: RunTask) -> int:
     return int(task.config["vqvae" if task.kind == "vqvae" else "optim"]["steps"])
 
 
-def progress(run: Run, total: int) -> str:
+def progress_text(run: Run, total: int) -> str:
     """Describe a run in training: its steps, the time left, and its loss."""
     log = [entry for entry in run.metrics() if entry.phase == "train"]
     if not log:

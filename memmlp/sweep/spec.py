@@ -73,7 +73,7 @@ class Arm:
 
 
 @dataclass(frozen=True)
-class Job:
+class ArmSeed:
     """One training: an arm with a seed, as overrides of `memmlp train`."""
 
     label: str
@@ -165,10 +165,10 @@ class Sweep:
         """Return the arms that can be run, which are all but the paper's alone."""
         return tuple(arm for arm in self.arms if arm.overrides is not None)
 
-    def jobs(self) -> list[Job]:
+    def arm_seeds(self) -> list[ArmSeed]:
         """Return the trainings that the sweep needs, arm by arm."""
         return [
-            Job(arm.label, seed, (*self.overrides(arm), f"seed={seed}"))
+            ArmSeed(arm.label, seed, (*self.overrides(arm), f"seed={seed}"))
             for arm in self.runnable()
             for seed in self.seeds_of(arm)
         ]

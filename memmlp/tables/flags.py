@@ -10,7 +10,7 @@ import numpy as np
 
 from memmlp.sweep.spec import COSTS, Arm, Sweep
 from memmlp.tables.effects import Runs, control_arm, one_and_the_same
-from memmlp.tables.measured import Measured
+from memmlp.tables.measured_run import Measured
 
 Say = Callable[[Arm, int], str | None]
 BUILT_IN = "builtin"

@@ -15,8 +15,8 @@ from rich.console import Console
 
 from memmlp.common.files import plain
 from memmlp.statistics import Verdict
-from memmlp.tables.grid import MINUS, Grid, Line, caption, grids, legend
 from memmlp.tables.table import Table
+from memmlp.tables.table_text import MINUS, Grid, Line, caption, grids, legend
 
 GAP = "  "  # stands between columns on a terminal
 LABEL = 18  # the largest width of the arms' column on a terminal, characters

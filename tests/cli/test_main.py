@@ -15,7 +15,7 @@ from processes import finished
 import memmlp as package
 from memmlp.cli.main import COMMANDS, main
 from memmlp.common.errors import InputError, TrainingDiverged
-from memmlp.config.shipped import shipped
+from memmlp.config.packaged import packaged
 
 
 @pytest.fixture
@@ -214,4 +214,4 @@ def test_the_configs_are_found_beside_the_package_or_in_it(
     place = tmp_path / "memmlp" / "_conf" if installed else tmp_path / "conf"
     place.mkdir(parents=True)
     monkeypatch.setattr(package, "__file__", str(tmp_path / "memmlp" / "__init__.py"))
-    assert shipped("conf") == place
+    assert packaged("conf") == place

@@ -64,7 +64,7 @@ def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Runs:
     monkeypatch.chdir(tmp_path)
     write(ARMS)
     found = Runs(tmp_path / "outputs")
-    monkeypatch.setattr("memmlp.config.plan.planned", found.planned)
+    monkeypatch.setattr("memmlp.config.plan_sweep.planned", found.planned)
     monkeypatch.setattr("memmlp.cli.sweep.bring_to_end", found.work)
     return found
 

@@ -19,8 +19,8 @@ from processes import PATIENCE, ignoring_interrupts, started, until
 
 from memmlp.cli.sweep import split_executor
 from memmlp.common.errors import InputError
-from memmlp.config.plan import find_sweep, orphans, planned
-from memmlp.config.work import perform
+from memmlp.config.perform_task import perform
+from memmlp.config.plan_sweep import find_sweep, orphans, planned
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.recipes import RECIPES
 from memmlp.runs.run import Run

@@ -14,10 +14,11 @@ from memmlp.common.errors import InputError
 from memmlp.config import schema
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
-from memmlp.config.shipped import shipped
+from memmlp.config.packaged import packaged
 from memmlp.runs.identity import NEUTRAL, flatten
 
-GROUPS = {folder.name: sorted(p.stem for p in folder.glob("*.yaml")) for folder in shipped("conf").glob("*/")}
+FOLDERS = packaged("conf").glob("*/")
+GROUPS = {folder.name: sorted(path.stem for path in folder.glob("*.yaml")) for folder in FOLDERS}
 del GROUPS["search"]  # of `memmlp tune`
 OPTIONS = [f"{group}={name}" for group, names in GROUPS.items() for name in names]
 
@@ -58,7 +59,7 @@ def test_a_profiles_sizes_reach_every_group(profile: str, memory: str):
 
 
 def test_every_size_is_read_by_a_group():
-    raw = "".join(path.read_text() for path in shipped("conf").rglob("*.yaml"))
+    raw = "".join(path.read_text() for path in packaged("conf").rglob("*.yaml"))
     assert [key for key in composed([]).profile if f"${{profile.{key}}}" not in raw] == []
 
 

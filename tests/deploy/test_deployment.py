@@ -24,7 +24,7 @@ from memmlp.motion.coordinates import Heading
 from memmlp.networks.memory import CodeMemory
 from memmlp.networks.streaming import StreamingGraph, streaming
 from memmlp.networks.window_model import WindowModel
-from memmlp.runs.deployed import Deployed
+from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.lookup import list_runs
 
 pytestmark = pytest.mark.slow
@@ -122,27 +122,27 @@ def test_accuracy_is_that_of_the_evaluation(pair):
 def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
     monkeypatch.chdir(home)
     (made,) = (found for found in list_runs(home / "outputs") if found.manifest["kind"] == "memmlp")
-    shipped = made.shipped
-    written = shipped.latency.read_text()
+    deployed = made.preferred_deployment
+    written = deployed.latency.read_text()
     record = json.loads(written)
     assert record["graph"] == "streaming"
     assert 0 < record["step_macs"] < record["macs"]
     cost = record["int8"]
     assert cost["growth"] == pytest.approx(cost["int8"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
     assert cost["median_ms"] > 0
-    assert cost["onnx_bytes"] == shipped.int8.stat().st_size
+    assert cost["onnx_bytes"] == deployed.int8.stat().st_size
     assert made.verify() == []
     assert math.isclose(cost["fp32"]["MPJPE"], made.results["stream"]["rotation"]["MPJPE"], rel_tol=1e-3)
-    for default, used in ((True, shipped.int8), (False, shipped.onnx)):
+    for default, used in ((True, deployed.int8), (False, deployed.onnx)):
         cost["default"] = default
-        shipped.latency.write_text(json.dumps(record))
-        assert made.deployed == used
+        deployed.latency.write_text(json.dumps(record))
+        assert made.preferred_onnx == used
         assert package.Stream(made).network.path == used
         assert package.Stream(str(made.folder)).network.path == used
-    shipped.latency.write_text(written)
+    deployed.latency.write_text(written)
     assert made.verify() == []
-    shipped.int8.write_bytes(b"")
-    assert made.verify() == [f"deployments/{shipped.folder.name}/step.int8.onnx"]
+    deployed.int8.write_bytes(b"")
+    assert made.verify() == [f"deployments/{deployed.folder.name}/step.int8.onnx"]
 
     line = ["export", made.id, "--out", "int8.onnx", "--precision", "int8"]
     assert "MPJPE" in memmlp(*line, "--max-growth", "50").out
@@ -156,10 +156,10 @@ def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
 
 def test_the_naive_graph_by_switch(tmp_path):
     """The deployment of a config is checked by itself, without a run."""
-    shipped = {}
+    deployed = {}
     for graph in ("naive", "auto"):
-        place = Deployed(tmp_path / graph)
-        shipped[graph] = Deployment(1, graph).ship(tiny.model(), place, "0" * 16, CLIPS, CLIPS)
-    assert [record["graph"] for record in shipped.values()] == ["naive", "streaming"]
-    assert shipped["naive"]["step_macs"] == shipped["naive"]["macs"] == shipped["auto"]["macs"]
+        place = DeploymentFolder(tmp_path / graph)
+        deployed[graph] = Deployment(1, graph).deploy(tiny.model(), place, "0" * 16, CLIPS, CLIPS)
+    assert [record["graph"] for record in deployed.values()] == ["naive", "streaming"]
+    assert deployed["naive"]["step_macs"] == deployed["naive"]["macs"] == deployed["auto"]["macs"]
     assert build_experiment(composed(["export.graph=naive"])).deployment.graph == "naive"

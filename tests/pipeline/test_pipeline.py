@@ -17,13 +17,13 @@ from PIL import Image
 
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
-from memmlp.config.shipped import shipped
+from memmlp.config.packaged import packaged
 from memmlp.motion.dataset import MotionDataset
-from memmlp.pipeline.run import vqvae_run
+from memmlp.pipeline.run_stages import vqvae_run
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.recipes import RECIPES
 from memmlp.runs.run import Run
-from memmlp.tables.measured import load
+from memmlp.tables.measured_run import load
 
 
 def motion_run(folder: Path) -> Run:
@@ -37,7 +37,7 @@ def test_a_run_leaves_everything(home):
     assert run.verify() == []
     for name in ("config.yaml", "manifest.json", "metrics.jsonl", "checkpoint.safetensors"):
         assert (run.folder / name).stat().st_size > 0
-    assert run.shipped.done
+    assert run.preferred_deployment.done
     assert len(list(run.evaluations.iterdir())) == 2
     assert set(run.results) == {"window", "stream", "latency"}
     assert run.results["stream"]["rotation"]["MPJPE"] > 0
@@ -197,7 +197,7 @@ def test_foreign_targets_in_a_runs_config_are_refused(home, tmp_path):
     assert "os.system" in command(home, "eval", str(copy), code=2)
 
 
-@pytest.mark.parametrize("name", sorted(path.stem for path in shipped("conf/experiment").glob("*.yaml")))
+@pytest.mark.parametrize("name", sorted(path.stem for path in packaged("conf/experiment").glob("*.yaml")))
 def test_every_experiment_trains_and_streams(home, name, monkeypatch: pytest.MonkeyPatch):
     """Two steps and one validation of each, on the prepared data, without export."""
     monkeypatch.chdir(home)

@@ -19,9 +19,9 @@ from memmlp.report import figures
 from memmlp.report.html import Chapter, page, published
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.spec import Sweep, load_sweep
-from memmlp.tables.collect import without_runs
+from memmlp.tables.build_table import without_runs
 from memmlp.tables.distributions import distributions
-from memmlp.tables.grid import caption
+from memmlp.tables.table_text import caption
 
 SHIPPED = Path(__file__).parent.parent.parent / "sweeps"
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -222,7 +222,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, tuple(found), ())
 
-    monkeypatch.setattr("memmlp.config.plan.planned", plan)
+    monkeypatch.setattr("memmlp.config.plan_sweep.planned", plan)
 
 
 def test_command_writes_the_page(memmlp: Memmlp, planned: None):

@@ -14,12 +14,12 @@ from fake_runs import CLIPS, fake_run, fake_sweep, nothing, runs_of
 from memmlp.cli.results import sources
 from memmlp.common.errors import InputError
 from memmlp.report.claims import NEVER, WORDS, claims
+from memmlp.report.kept_results import Kept, dumps, load_kept, overrides_of, save, without_paths
 from memmlp.report.markdown import KeptTable, Words, pages
-from memmlp.report.store import Kept, dumps, load_kept, overrides_of, save, without_paths
 from memmlp.statistics import Verdict, holm, paired_effects
 from memmlp.sweep.spec import Sweep, load_sweep
-from memmlp.tables.collect import collect
-from memmlp.tables.grid import MINUS
+from memmlp.tables.build_table import collect
+from memmlp.tables.table_text import MINUS
 
 ROOT = Path(__file__).parent.parent.parent
 DOCS = ROOT / "docs" / "results"

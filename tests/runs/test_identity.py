@@ -21,7 +21,7 @@ from memmlp.deploy.deployment import GRAPHS
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline.experiment import Experiment
-from memmlp.pipeline.run import vqvae_run
+from memmlp.pipeline.run_stages import vqvae_run
 from memmlp.runs.identity import NEUTRAL, Identity, deployment_id, evaluation_id, flatten
 from memmlp.runs.run import Run
 
@@ -130,11 +130,11 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
         for mode in settings.modes
     }
     return Outcome(
-        {"training": identity.id, **experiment.evaluations, "deployment": experiment.deployed},
+        {"training": identity.id, **experiment.evaluations, "deployment": experiment.deployment_id},
         {
             "training": digest([t.tolist() for t in model.state_dict().values()]),
             **{mode: digest(rows) for mode, rows in reports.items()},
-            "deployment": digest(shipped(experiment, model, short)),
+            "deployment": digest(deployed(experiment, model, short)),
         },
     )
 
@@ -146,7 +146,7 @@ class Silent:
         """Nothing."""
 
 
-def shipped(experiment: Experiment, model: Any, clip: MotionDataset) -> list[Any]:
+def deployed(experiment: Experiment, model: Any, clip: MotionDataset) -> list[Any]:
     """Return what a deployment has: the graph's kind and numbers, its files, how often it is timed."""
     network = GRAPHS[experiment.deployment.graph](model)
     state, motions = network.initial_state(1), []

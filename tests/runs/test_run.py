@@ -18,7 +18,7 @@ import memmlp.runs.recipes
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, write_json
 from memmlp.runs.environment import environment
-from memmlp.runs.evaluated import intact, write_report
+from memmlp.runs.evaluation_file import intact, write_report
 from memmlp.runs.identity import (
     NEUTRAL,
     Identity,
@@ -31,7 +31,7 @@ from memmlp.runs.identity import (
 )
 from memmlp.runs.lookup import diff, find_run, list_runs
 from memmlp.runs.run import Run
-from memmlp.tables.measured import load
+from memmlp.tables.measured_run import load
 
 CONFIG = {"seed": 0, "model": {"width": 16, "layers": [2, 4]}, "optim": {"lr": 1e-3, "log_every": 5}}
 
@@ -235,10 +235,10 @@ def test_an_evaluation_of_another_run_or_name_is_refused(tmp_path: Path, name: s
 def test_a_deployment_that_lost_a_file_is_made_again(tmp_path: Path):
     """And is not, in silence, the float32 one."""
     run = complete(tmp_path)
-    assert run.deployed == run.deployment("int8-0").int8
+    assert run.preferred_onnx == run.deployment("int8-0").int8
     run.deployment("int8-0").int8.unlink()
     assert not run.has("int8-0")
-    assert run.deployed != run.deployment("int8-0").onnx
+    assert run.preferred_onnx != run.deployment("int8-0").onnx
 
 
 def test_weights_that_changed_since_are_refused(tmp_path: Path):
@@ -250,7 +250,7 @@ def test_weights_that_changed_since_are_refused(tmp_path: Path):
 
 
 def test_todays_recipes_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """What is shown and shipped of a run, where some is of an older recipe, be it the later."""
+    """What is shown and deployed of a run, where some is of an older recipe, be it the later."""
     run = begun(tmp_path)
     config = {"export": {"graph": "naive", "precision": "int8"}, "evaluation": {}}
     fp32 = {"export": {"graph": "naive", "precision": "fp32"}}
@@ -275,7 +275,7 @@ def test_todays_recipes_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(memmlp.runs.recipes.RECIPES, "graph.naive", 2)
     assert run.results["stream"]["rotation"]["MPJPE"] == 2.0
     assert load(run.folder).means["stream"]["rotation"]["MPJPE"] == 2.0
-    assert run.deployed.read_bytes() == b"new"
+    assert run.preferred_onnx.read_bytes() == b"new"
 
 
 def test_a_run_without_its_artifact_cannot_finish(tmp_path: Path):
@@ -414,7 +414,7 @@ def test_a_log_may_go_on_after_a_reset(tmp_path: Path):
 HOLD = """
 import sys, time
 from memmlp.runs.run import Run
-from memmlp.tables.measured import load
+from memmlp.tables.measured_run import load
 with Run(sys.argv[1]).lock():
     print("held", flush=True)
     sys.stdin.read()

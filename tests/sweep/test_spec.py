@@ -18,7 +18,7 @@ ARMS = {"full": [], "none": {"overrides": ["memory=none"], "paper": {"MPJPE": 4.
 
 def test_jobs_are_arms_by_seeds_with_base_and_difference():
     sweep = parse_sweep("s", {"base": ["profile=tiny"], "seeds": [0, 2], "arms": ARMS})
-    assert [(job.label, job.seed, job.overrides) for job in sweep.jobs()] == [
+    assert [(one.label, one.seed, one.overrides) for one in sweep.arm_seeds()] == [
         ("full", 0, ("profile=tiny", "seed=0")),
         ("full", 2, ("profile=tiny", "seed=2")),
         ("none", 0, ("profile=tiny", "memory=none", "seed=0")),
@@ -61,7 +61,7 @@ def test_axes_are_a_grid_over_every_arm():
 
 def test_rows_of_the_paper_alone_are_not_run():
     sweep = parse_sweep("s", {"arms": {"AvatarPoser": {"overrides": None}, "ours": []}})
-    assert [job.label for job in sweep.jobs()] == ["ours"]
+    assert [one.label for one in sweep.arm_seeds()] == ["ours"]
     assert sweep.control == "ours"
 
 
@@ -166,7 +166,7 @@ VALUES = st.recursive(
 @given(st.dictionaries(KEYS, VALUES, max_size=6))
 def test_whatever_stands_in_it_is_a_sweep_or_one_line(content):
     try:
-        said = str(len(parse_sweep("s", content).jobs()))
+        said = str(len(parse_sweep("s", content).arm_seeds()))
     except InputError as error:
         said = str(error)
     assert said not in ("", "0")

@@ -13,7 +13,7 @@ import pytest
 from processes import PATIENCE, started, until
 
 from memmlp.common.errors import InputError, TrainingDiverged
-from memmlp.config.work import check_wanted
+from memmlp.config.perform_task import check_wanted
 from memmlp.runs.run import Run
 from memmlp.sweep import worker
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique

@@ -11,10 +11,10 @@ import pytest
 
 from memmlp.statistics import Verdict
 from memmlp.sweep.spec import Sweep, parse_sweep
-from memmlp.tables.collect import collect
+from memmlp.tables.build_table import collect
 from memmlp.tables.effects import Runs
 from memmlp.tables.formats import markdown
-from memmlp.tables.measured import Measured, Origin
+from memmlp.tables.measured_run import Measured, Origin
 from memmlp.tables.rounds import Rounds, advanced, as_json, begin, of_json, outlook
 
 ORIGIN = Origin("c", False, "d", "cpu")
@@ -100,7 +100,7 @@ def test_the_schedule_is_fixed_at_the_start():
     assert rounds.next_looks(SWEEP) == {"worse": 0, "same": 0, "unsure": 0}
     spent = rounds.spent(SWEEP)
     assert {arm.label: spent.seeds_of(arm) for arm in spent.runnable()} == dict.fromkeys(TRUTH, (4, 2, 5))
-    assert len(spent.jobs()) == 12
+    assert len(spent.arm_seeds()) == 12
     assert begin(SWEEP, 1 + 2).looks == (3,)
 
 

@@ -17,16 +17,16 @@ from processes import finished
 from rich.console import Console
 
 from memmlp.common.errors import InputError
-from memmlp.runs.evaluated import write_report
+from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.run import Run
 from memmlp.statistics import Verdict, holm, paired_effects
 from memmlp.sweep.spec import Sweep, load_sweep, parse_sweep
-from memmlp.tables.collect import collect, without_runs
+from memmlp.tables.build_table import collect, without_runs
 from memmlp.tables.formats import FORMATS, show
-from memmlp.tables.grid import heading
-from memmlp.tables.measured import load
+from memmlp.tables.measured_run import load
 from memmlp.tables.seeds_needed import needs
 from memmlp.tables.table import Effect, Table
+from memmlp.tables.table_text import heading
 
 SHIPPED = Path(__file__).parent.parent.parent / "sweeps"
 FILE = {

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import click
 
-from memmlp.cli.bench.avatar import avatar, soak
-from memmlp.cli.bench.calibration import calibration
 from memmlp.cli.bench.chaos import chaos, chaos_tune
-from memmlp.cli.bench.evaluation import prepare, stream
 from memmlp.cli.bench.latency import latency
+from memmlp.cli.bench.live_frame import avatar
+from memmlp.cli.bench.prepare_data import prepare
+from memmlp.cli.bench.soak import soak
+from memmlp.cli.bench.stream_evaluation import stream
+from memmlp.cli.bench.verdict_simulation import calibration
 
 
 @click.group("bench")

@@ -72,14 +72,14 @@ def exported(
     models: list[str], overrides: tuple[str, ...], folder: Path
 ) -> Iterator[tuple[tuple[str, str], Path]]:
     """Export each model in all variants, with a progress bar, and yield (model, variant) with the file."""
-    from memmlp.common.progress import track
+    from memmlp.common.progress import progress_bar
     from memmlp.config.build import untrained
     from memmlp.deploy.export import export
     from memmlp.deploy.quantization import quantise
     from memmlp.networks.streaming import streaming
 
-    clips = calibration()
-    for name in track(models, "exporting"):
+    clips = calibration_clips()
+    for name in progress_bar(models, "exporting"):
         model = untrained(("profile=paper", *overrides, *MODELS[name]))
         paths = {variant: folder / f"{name}.{variant}.onnx" for variant in VARIANTS}
         stream = streaming(model)
@@ -90,7 +90,7 @@ def exported(
             yield (name, variant), path
 
 
-def calibration() -> list[Any]:
+def calibration_clips() -> list[Any]:
     """Return one short clip (60, 252) of random frames to calibrate int8 with."""
     import torch
 

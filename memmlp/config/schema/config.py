@@ -128,7 +128,7 @@ class EvaluationConfig:
 
 @dataclass
 class ExportConfig:
-    """How a trained network is shipped and timed (conf/export)."""
+    """How a trained network is exported and timed (conf/export)."""
 
     latency_steps: int = at_least(1)
     graph: str = one_of("auto", "streaming", "naive")
@@ -146,14 +146,14 @@ class TrackingConfig:
 @dataclass
 class MLflowTrackingConfig(TrackingConfig):
     name: str = called("mlflow")
-    _target_: str = target("memmlp.runs.tracking.MLflowTracking")
+    _target_: str = target("memmlp.runs.mlflow_tracking.MLflowTracking")
     uri: Optional[str] = key()
 
 
 @dataclass
 class NoTrackingConfig(TrackingConfig):
     name: str = called("none")
-    _target_: str = target("memmlp.runs.tracking.NoTracking")
+    _target_: str = target("memmlp.runs.mlflow_tracking.NoTracking")
 
 
 @dataclass
@@ -267,9 +267,9 @@ def _restored(group: str, content: Mapping[str, Any]) -> Any:
     if group == "data":
         schema = SynthDataConfig if content["synth"] else DATA[content["split"]["name"]]
         return OmegaConf.merge(OmegaConf.structured(schema), _bare(content))
-    shipped = SCHEMAS.get(f"{group}_{content.get('name')}")
-    own = _bare(content) if shipped else dict(content)
-    return OmegaConf.merge(OmegaConf.structured(shipped or GROUPS[group]), own)
+    option = SCHEMAS.get(f"{group}_{content.get('name')}")
+    own = _bare(content) if option else dict(content)
+    return OmegaConf.merge(OmegaConf.structured(option or GROUPS[group]), own)
 
 
 def _bare(content: Mapping[str, Any]) -> dict[str, Any]:

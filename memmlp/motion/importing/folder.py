@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.common.progress import track
+from memmlp.common.progress import progress_bar
 from memmlp.motion.body import load_rest_joints
 from memmlp.motion.clip import FRAME_RATE_RANGE, Skipped
 from memmlp.motion.formats.bvh import Bvh, find_bvh, read_bvh
@@ -96,7 +96,7 @@ def import_folder(
     rest, clips, skipped = load_rest_joints(body), [], []
     chosen = None if skeleton is None else load_skeleton(skeleton)
     with _staging(out) as staging:
-        for relative, path in track(files.items(), "import", len(files)):
+        for relative, path in progress_bar(files.items(), "import", len(files)):
             try:
                 clips.append(_import_file(path, relative, Path(staging), chosen, fps, rest))
             except InputError as error:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from memmlp.common.progress import track
+from memmlp.common.progress import progress_bar
 from memmlp.motion.body import JOINTS, load_rest_joints
 from memmlp.motion.formats.bvh import find_bvh, read_bvh
 from memmlp.motion.formats.npz import read_clip, write_clip
@@ -93,5 +93,5 @@ def verify_folder(source: Path, *, skeleton: str | None = None, body: str = "bui
     files = find_bvh(source)
     return [
         verify(path, skeleton=skeleton, body=body, name=relative.as_posix())
-        for relative, path in track(files.items(), "verify", len(files))
+        for relative, path in progress_bar(files.items(), "verify", len(files))
     ]

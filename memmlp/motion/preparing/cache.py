@@ -22,7 +22,7 @@ import numpy as np
 from filelock import FileLock
 
 from memmlp.common.errors import InputError
-from memmlp.common.progress import track
+from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest, write_manifest
@@ -126,7 +126,7 @@ def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) 
         for part, file in files.items():
             header = {"descr": "<f4", "fortran_order": False, "shape": (frames[part], FRAME_DIM)}
             np.lib.format.write_array_header_1_0(file, header)
-        for record in track(manifest.clips, "writing"):
+        for record in progress_bar(manifest.clips, "writing"):
             clip, _, _ = load(source.root / f"{record.name}.npz", record.name)
             for block in _frames(clip, rest):
                 files[record.split].write(block.tobytes())

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from memmlp.common.errors import InputError
-from memmlp.common.progress import track
+from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS
 from memmlp.motion.clip import Clip, Skipped, resample
 from memmlp.motion.formats.npz import read_clip
@@ -38,7 +38,7 @@ def survey(root: Path, min_frames: int = 2, strict: bool = False) -> Survey:
         InputError: if there are none, or at the first bad one if `strict`.
     """
     clips, skipped, ignored = [], [], 0
-    for file in track(sources(root), "reading"):
+    for file in progress_bar(sources(root), "reading"):
         path = root / file
         if _has_no_poses(path):
             ignored += 1

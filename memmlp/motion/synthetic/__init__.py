@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.common.progress import track
+from memmlp.common.progress import progress_bar
 from memmlp.motion.clip import FRAME_RATE_RANGE, Clip
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.synthetic import actions, gait
@@ -48,7 +48,7 @@ def synthesize(out: Path, *, minutes: float = 10.0, seed: int = 0, fps: float = 
     rounds = math.ceil(len(lengths) / len(ACTIVITIES))
     names = np.concatenate([rng.permutation(list(ACTIVITIES)) for _ in range(rounds)])
     paths = []
-    for index, frames in enumerate(track(lengths, "synthesize")):
+    for index, frames in enumerate(progress_bar(lengths, "synthesize")):
         name = str(names[index])
         path = out / name / f"{name}_{index // len(ACTIVITIES):03d}.npz"
         write_clip(path, synthesize_clip(name, int(rng.integers(2**62)), seconds=frames / fps, fps=fps))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json, write_json
-from memmlp.config.shipped import shipped
+from memmlp.config.packaged import packaged
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 from memmlp.sweep.spec import Arm, Sweep, load_sweep
 
@@ -33,7 +33,7 @@ def find_sweep(name: str) -> Sweep:
     """
     if is_path(name):
         return load_sweep(Path(name))
-    folder = shipped("sweeps")
+    folder = packaged("sweeps")
     stem = f"table{int(name):02d}" if name.isdecimal() else name
     path = folder / f"{stem}.yaml"
     if not path.is_file():
@@ -157,7 +157,7 @@ def _fresh(data: dict[str, Any]) -> bool:
     """Return whether the data that a kept plan relies on is unchanged."""
     from omegaconf import OmegaConf
 
-    from memmlp.config.motion import build_motion
+    from memmlp.config.build_motion import build_motion
 
     cfg: DictConfig = OmegaConf.create(data["config"])
     try:
@@ -172,7 +172,7 @@ def _stamp(sweep: Sweep, outputs: Path) -> str:
     That is the sweep, the outputs folder, the configs, and the package's code.
     """
     package = Path(__file__).parent.parent
-    files = [*shipped("conf").rglob("*.yaml"), *package.rglob("*.py")]
+    files = [*packaged("conf").rglob("*.yaml"), *package.rglob("*.py")]
     texts = [(str(file), file.read_text(encoding="utf-8")) for file in sorted(files)]
     return digest([asdict(sweep), str(outputs), texts])
 

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from memmlp.evaluation.units import UNITS
-from memmlp.pipeline.run import Outcome
+from memmlp.pipeline.run_stages import Outcome
 from memmlp.runs.run import Run
 
 STAGES = ("training", "evaluation", "deployment")

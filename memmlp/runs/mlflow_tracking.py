@@ -79,7 +79,11 @@ class MLflowTracking:
             name = self._mlflow_run(client, self._experiment(client), run)
             self._params(client, name, run)
             self._metrics(client, name, run)
-            files = [*(run.folder / artifact for artifact in self.ARTIFACTS), run.onnx, run.shipped.latency]
+            files = [
+                *(run.folder / artifact for artifact in self.ARTIFACTS),
+                run.onnx,
+                run.preferred_deployment.latency,
+            ]
             for path in filter(Path.is_file, files):
                 client.log_artifact(name, str(path))
             if run.done:

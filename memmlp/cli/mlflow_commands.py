@@ -25,14 +25,14 @@ def sync(uri: str | None, outputs: Path) -> None:
 
     All finished runs and sweeps are shown in its store. It may be repeated at any time.
     """
-    from memmlp.common.progress import track as bar
+    from memmlp.common.progress import progress_bar
     from memmlp.runs.lookup import list_runs
-    from memmlp.runs.tracking import MLflowTracking
+    from memmlp.runs.mlflow_tracking import MLflowTracking
     from memmlp.sweep.plan import Plan
 
     tracking = MLflowTracking(uri, outputs)
     finished = [run for run in list_runs(outputs) if run.done]
-    for run in bar(finished, "runs"):
+    for run in progress_bar(finished, "runs"):
         tracking.project(run)
     known = {run.id for run in finished}
     plans = [Plan.load(path) for path in sorted(outputs.glob("sweeps/*/plan.json"))]
@@ -46,7 +46,7 @@ def sync(uri: str | None, outputs: Path) -> None:
 @outputs_option
 def ui(port: int, outputs: Path) -> None:
     """Open MLflow's page on the tracked runs (needs pip install 'memmlp[ui]')."""
-    from memmlp.runs.tracking import MLflowTracking
+    from memmlp.runs.mlflow_tracking import MLflowTracking
 
     store = MLflowTracking(None, outputs).store()
     program = shutil.which("mlflow")

@@ -50,7 +50,7 @@ def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
     from omegaconf import OmegaConf
 
     from memmlp.config.build import build_experiment
-    from memmlp.pipeline.run import run, vqvae_run
+    from memmlp.pipeline.run_stages import run_experiment, vqvae_run
 
     experiment = build_experiment(OmegaConf.create(dict(task.config)))
     check_identity(experiment, task)
@@ -59,12 +59,12 @@ def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
     if task.kind == "vqvae":
         vqvae_run(experiment, experiment.data.prepare())
     else:
-        run(experiment, partial(check_wanted, path, task.id))
+        run_experiment(experiment, partial(check_wanted, path, task.id))
 
 
 def check_identity(experiment: Experiment, task: RunTask) -> None:
     """Raise InputError where this code and data give the task's config another identity than the plan has."""
-    from memmlp.config.plan import tasks_of
+    from memmlp.config.plan_sweep import tasks_of
 
     digest = experiment.data.prepare().digest
     if task.key not in {found.key for found in tasks_of(experiment, digest)}:

@@ -12,7 +12,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
-from memmlp.runs.evaluated import intact
+from memmlp.runs.evaluation_file import intact
 from memmlp.runs.run import Run
 
 Errors = Mapping[str, Mapping[str, Mapping[str, Any]]]  # values by mode, branch and metric
@@ -120,7 +120,7 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
         folder: the run's folder.
         stages: identities of the evaluations and the deployment to read. By default, or where there are none
             of these, all evaluations that use the network as the run's own config does, and the deployment
-            that the run ships.
+            that the run prefers (`Run.preferred_deployment`).
 
     Raises:
         InputError: naming the file that is damaged.
@@ -136,8 +136,8 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
         for clip in report["clips"]:
             clips.setdefault(clip["name"], {}).setdefault(report["mode"], {}).update(clip)
             groups |= {clip["name"]: clip["group"]} if clip.get("group") else {}
-    deployed = [run.deployment(name) for name in stages or () if run.deployment(name).done] or [run.shipped]
-    latency = deployed[-1].record
+    deployments = [run.deployment(name) for name in stages or () if run.deployment(name).done]
+    latency = (deployments or [run.preferred_deployment])[-1].record
     origin = _evaluated(_origin(manifest), reports)
     return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run)
 

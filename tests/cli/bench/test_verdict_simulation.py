@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from memmlp.cli.bench.calibration import SHARES, GridRow, Shares, Simulated, broken, draw, grid, simulate
+from memmlp.cli.bench import verdict_simulation
+from memmlp.cli.bench.verdict_simulation import (
+    SHARES,
+    GridRow,
+    Shares,
+    Simulated,
+    broken,
+    draw,
+    grid,
+    simulate,
+)
 from memmlp.common.files import read_json
 from memmlp.statistics.crossed import error
-
-MODULE = sys.modules["memmlp.cli.bench.calibration"]  # in the package this name is the command's
 
 
 def test_the_grid_is_all_that_have_two_groups():
@@ -78,14 +85,14 @@ def test_a_broken_promise_is_told():
 
 
 def test_the_command(memmlp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(MODULE, "grid", lambda: [GridRow(3, 10, 2), GridRow(5, 536, 10)])
+    monkeypatch.setattr(verdict_simulation, "grid", lambda: [GridRow(3, 10, 2), GridRow(5, 536, 10)])
     file = tmp_path / "rates.json"
     ran = memmlp("bench", "calibration", "--quick", "--tables", "30", "--json", str(file), "--markdown")
     assert ran.code == 0, ran.err
     (row,) = read_json(file)["cells"]
     assert (row["seeds"], row["clips"], row["size"], row["groups"]) == (3, 10, 2, 5)
     assert f"| 3 x 10 / 2 | {100 * min(s['coverage'] for s in row['shares'].values()):.1f}-" in ran.out
-    monkeypatch.setattr(MODULE, "MOST", 0.8)
+    monkeypatch.setattr(verdict_simulation, "MOST", 0.8)
     ran = memmlp("bench", "calibration", "--quick", "--tables", "30")
     assert ran.code == 1
     assert "broken at 3 seeds x 10 clips, 2 a group: coverage" in ran.out

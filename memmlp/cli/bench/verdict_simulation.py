@@ -423,12 +423,12 @@ def calibration(tables: int, quick: bool, seed: int, file: Path | None, as_markd
 
     from memmlp.common.errors import InputError
     from memmlp.common.files import write_json
-    from memmlp.common.progress import track
+    from memmlp.common.progress import progress_bar
 
     if file and not file.absolute().parent.is_dir():
         raise InputError(f"--json {file}: there is no folder {file.parent}")
     cells = [cell for cell in grid() if not quick or cell.clips <= QUICK]
-    rows = [simulate(cell, tables, seed) for cell in track(cells, "simulating")]
+    rows = [simulate(cell, tables, seed) for cell in progress_bar(cells, "simulating")]
     if file:
         write_json(file, {"seed": seed, "level": LEVEL, "comparisons": TABLE, "cells": rows})
     if as_markdown:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from memmlp.config.components import built
+from memmlp.config.instantiate import built
 from memmlp.motion.preparing.cache import ClipFolder
 from memmlp.motion.preparing.source import MotionSource
 

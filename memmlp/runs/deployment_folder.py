@@ -1,4 +1,4 @@
-"""The folder of a deployment: what a run was shipped as."""
+"""The folder of a deployment: a run's ONNX files and what was measured of them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from memmlp.runs.environment import environment
 from memmlp.runs.identity import belongs, deployment_name
 
 
-class Deployed:
+class DeploymentFolder:
     """A deployment of a run: the folder runs/<id>/deployments/<identity>/.
 
     Attributes:
@@ -48,7 +48,7 @@ class Deployed:
 
     @property
     def record(self) -> dict[str, Any]:
-        """What was measured: sizes, times, int8's accuracy; empty if the run was not shipped."""
+        """What was measured: sizes, times, int8's accuracy; empty if the run was not deployed."""
         # Version 0.1 called the timing yardstick "reference" in its keys.
         return {
             re.sub(r"(^|_)reference(_|$)", r"\1yardstick\2", k): v for k, v in read_json(self.latency).items()

@@ -21,7 +21,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, plain
 from memmlp.sweep.spec import Sweep
 from memmlp.tables.effects import Runs
-from memmlp.tables.measured import Errors, Measured, Origin
+from memmlp.tables.measured_run import Errors, Measured, Origin
 
 DIGITS = 6
 SCALES = re.compile(r"\[\s+([^\[\]{}]*?)\s+\]")  # a list of plain values, which is written on one line

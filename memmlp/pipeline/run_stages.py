@@ -18,10 +18,10 @@ from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
 from memmlp.motion.preparing.source import Prepared
 from memmlp.pipeline.experiment import Experiment
-from memmlp.runs.evaluated import write_report
+from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import Identity, deployment_settings, evaluation_recipes, evaluation_settings
+from memmlp.runs.mlflow_tracking import project_safely
 from memmlp.runs.run import Run
-from memmlp.runs.tracking import project_safely
 from memmlp.training.loop import Watch, unwatched
 
 
@@ -40,7 +40,7 @@ class Outcome:
     results: dict[str, Any]
 
 
-def run(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
+def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     """Bring the experiment's run to its end, doing only what is missing.
 
     Args:
@@ -67,7 +67,7 @@ def run(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     return Outcome(run, tuple(made), results_of(experiment, run))
 
 
-def finished(
+def complete_stages(
     experiment: Experiment, run: Run, data: Prepared, again: bool = False
 ) -> tuple[dict[str, Any], list[str]]:
     """Make what is missing of a trained run's evaluations and deployment, and return its results.
@@ -101,7 +101,7 @@ def finish(experiment: Experiment, run: Run, data: Prepared) -> list[str]:
     if missing:
         evaluate_run(experiment, run, data, missing)
         made.append("evaluation")
-    if not run.has(experiment.deployed):
+    if not run.has(experiment.deployment_id):
         deploy_run(experiment, run, data)
         made.append("deployment")
     return made
@@ -110,7 +110,7 @@ def finish(experiment: Experiment, run: Run, data: Prepared) -> list[str]:
 def results_of(experiment: Experiment, run: Run) -> dict[str, Any]:
     """Return the results that the experiment asks for: mode -> branch -> metric, and "latency"."""
     files = {mode: run.evaluation(name) for mode, name in experiment.evaluations.items() if run.has(name)}
-    latency = run.deployment(experiment.deployed).record
+    latency = run.deployment(experiment.deployment_id).record
     means = {mode: read_json(path)["mean"] for mode, path in files.items()}
     return means | ({"latency": latency} if latency else {})
 
@@ -180,9 +180,9 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared) -> None:
     with timed(run, "export"):
         model = experiment.architecture.load(run.weights())
         clips = [data.open(split).clips() for split in ("train", "test")]
-        deployed = run.deployment(experiment.deployed)
+        deployed = run.deployment(experiment.deployment_id)
         deployed.latency.unlink(missing_ok=True)  # it lacks a file and is made again, from the start
-        record = experiment.deployment.ship(model, deployed, run.id, *clips)
+        record = experiment.deployment.deploy(model, deployed, run.id, *clips)
         deployed.finish(
             {"run": run.manifest["id"], "settings": deployment_settings(experiment.config), **record}
         )

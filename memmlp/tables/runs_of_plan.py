@@ -11,9 +11,9 @@ from memmlp.runs.recipes import outdated
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan
 from memmlp.sweep.spec import Arm
-from memmlp.tables.collect import Find
+from memmlp.tables.build_table import Find
 from memmlp.tables.flags import Say
-from memmlp.tables.measured import Measured
+from memmlp.tables.measured_run import Measured
 
 Read = Callable[[Path, tuple[str, ...]], Measured]
 

@@ -13,10 +13,10 @@ import pytest
 from click.testing import CliRunner
 from processes import finished
 
-from memmlp.cli.track import track
+from memmlp.cli.mlflow_commands import track
 from memmlp.common.files import write_json
+from memmlp.runs.mlflow_tracking import MLflowTracking, NoTracking, project_safely
 from memmlp.runs.run import Run
-from memmlp.runs.tracking import MLflowTracking, NoTracking, project_safely
 from memmlp.sweep.plan import Entry, Plan
 
 pytestmark = pytest.mark.slow
@@ -166,7 +166,7 @@ def test_mlflow_says_nothing(projected: Path, capfd: pytest.CaptureFixture[str])
 
 
 COLD = "import sys; from pathlib import Path; from memmlp.runs.run import Run; " \
-    "from memmlp.runs.tracking import *; " \
+    "from memmlp.runs.mlflow_tracking import *; " \
     "MLflowTracking(None, Path(sys.argv[1])).project(Run.of(sys.argv[1], sys.argv[2]))"  # fmt: skip
 
 
@@ -189,7 +189,7 @@ import sys
 sys.modules["mlflow"] = None
 from pathlib import Path
 from memmlp.runs.run import Run
-from memmlp.runs.tracking import MLflowTracking, NoTracking, project_safely
+from memmlp.runs.mlflow_tracking import MLflowTracking, NoTracking, project_safely
 run = Run.of(sys.argv[1], "0" * 16)
 project_safely(NoTracking(), run)
 print("none works")

@@ -7,7 +7,7 @@ from pathlib import Path
 import memmlp
 
 
-def shipped(name: str) -> Path:
+def packaged(name: str) -> Path:
     """Return the folder `conf` or `sweeps`.
 
     In a checkout it lies beside the package. In an installed package it lies inside, named `_conf` or
