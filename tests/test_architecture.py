@@ -1,0 +1,47 @@
+"""docs/architecture.md has the checked layers, and names the files that there are."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from memmlp.runs.environment import PACKAGE, WIRING, sources
+
+ROOT = Path(__file__).parent.parent
+PAGE = ROOT / "docs" / "architecture.md"
+AS_A_WHOLE = ("schema", "synthetic", "memory", "baselines", "streaming")
+FENCE = re.compile(r"^```\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def blocks() -> list[str]:
+    return FENCE.findall(PAGE.read_text(encoding="utf-8"))
+
+
+def test_layers_are_those_of_the_contract(blocks: list[str]):
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    layers = [layer.replace("memmlp.", "") for layer in contracts[0]["layers"]]
+    assert [block.split("\n")[:-1] for block in blocks].count(layers) == 1
+
+
+def test_page_names_files_that_exist():
+    real = {path.name for path in [*PACKAGE.rglob("*.py"), *ROOT.joinpath("docs").glob("*.py")]}
+    real |= {path.name for path in ROOT.joinpath("tests").rglob("*.py")}
+    named = set(re.findall(r"\b\w+\.py\b", PAGE.read_text(encoding="utf-8")))
+    assert named - real == set()
+
+
+def test_layout_has_every_file_of_the_package():
+    """Commands' files are called like their commands; some folders' lines stand for all of their files."""
+    text = PAGE.read_text(encoding="utf-8")
+    files = [path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if path.name != "__init__.py"]
+    told = [path for path in files if path.parts[0] != "cli" and path.parent.name not in AS_A_WHOLE]
+    assert [str(path) for path in told if not re.search(rf"\b{path.stem}\.py\b", text)] == []
+
+
+def test_wiring_counts_among_the_sources_of_a_run():
+    """A renamed file must not drop out of what a run's numbers come from."""
+    assert set(WIRING) <= set(sources())
