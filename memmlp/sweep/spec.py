@@ -147,19 +147,31 @@ class Sweep:
         `seed=0,1` or `seed=0` sets the seeds.
 
         Raises:
-            InputError: for an override of the outputs folder, which an option of the command sets.
+            InputError: for an override of the outputs folder, which an option of the command sets, and for a
+                key that an arm sets itself, since the arm's value would stand.
         """
-        if any(word.partition("=")[0].lstrip("+") == "paths.outputs" for word in overrides):
+        if any(_key(word) == "paths.outputs" for word in overrides):
             raise InputError("paths.outputs: allowed here is --outputs FOLDER, or MEMMLP_OUTPUTS")
         seeds = [word.partition("=")[2] for word in overrides if word.startswith("seed=")]
         others = tuple(word for word in overrides if not word.startswith("seed="))
+        self._check_keys_of_arms(others)
         chosen = _seeds(seeds[-1].split(","), "seed") if seeds else self.seeds
         return replace(self, extra=(*self.extra, *others), seeds=chosen)
+
+    def _check_keys_of_arms(self, overrides: Iterable[str]) -> None:
+        """Raise InputError for an override of a key that an arm sets itself."""
+        setters = {_key(word): arm.label for arm in self.runnable() for word in arm.overrides or ()}
+        for word in overrides:
+            if (key := _key(word)) in setters:
+                raise InputError(
+                    f"{word}: arm '{setters[key]}' of sweep {self.name} sets {key} itself; "
+                    "allowed are keys that no arm sets"
+                )
 
     def overrides(self, arm: Arm) -> tuple[str, ...]:
         """Return an arm's overrides: the base's, the command line's, its own; the last one for a key wins."""
         words = (*self.base, *self.extra, *(arm.overrides or ()))
-        return tuple({word.partition("=")[0].lstrip("+~"): word for word in words}.values())
+        return tuple({_key(word): word for word in words}.values())
 
     def runnable(self) -> tuple[Arm, ...]:
         """Return the arms that can be run, which are all but the paper's alone."""
@@ -172,6 +184,11 @@ class Sweep:
             for arm in self.runnable()
             for seed in self.seeds_of(arm)
         ]
+
+
+def _key(override: str) -> str:
+    """Return the key or group that an override sets, adds (+) or removes (~)."""
+    return override.partition("=")[0].lstrip("+~")
 
 
 class UniqueKeys(yaml.SafeLoader):

@@ -26,11 +26,21 @@ def test_jobs_are_arms_by_seeds_with_base_and_difference():
     ]
 
 
-def test_the_command_line_stands_over_the_base_and_below_the_arm():
-    content = {"base": ["model.depth=8"], "arms": {"ten": ["model.depth=10"], "base": []}}
+def test_the_command_line_stands_over_the_base_and_beside_the_arm():
+    content = {"base": ["model.depth=8"], "arms": {"wide": ["model.width=10"], "base": []}}
     sweep = parse_sweep("s", content).with_overrides(["model.depth=4", "optim.lr=1"])
-    assert set(sweep.overrides(sweep.arms[0])) == {"model.depth=10", "optim.lr=1"}
+    assert set(sweep.overrides(sweep.arms[0])) == {"model.width=10", "model.depth=4", "optim.lr=1"}
     assert set(sweep.overrides(sweep.arms[1])) == {"model.depth=4", "optim.lr=1"}
+
+
+@pytest.mark.parametrize("word", ["memory.layers=[2]", "+memory.layers=[9]", "~hand"])
+def test_a_key_that_an_arm_sets_is_refused_on_the_command_line(word: str):
+    """The arm's own value would stand, and the override would be lost without a word."""
+    content = {"arms": {"two": ["memory.layers=[2]"], "no hand": ["hand=off"], "all": []}}
+    with pytest.raises(InputError, match=r"arm '(two|no hand)' of sweep s sets .* itself; allowed are keys"):
+        parse_sweep("s", content).with_overrides(["profile=tiny", word])
+    content["arms"]["two"] = content["arms"]["no hand"] = {"overrides": None}  # rows of the paper alone
+    assert parse_sweep("s", content).with_overrides([word]).extra == (word,)
 
 
 def test_seeds_of_the_command_line_replace_the_files():
