@@ -7,6 +7,7 @@ imported where a network is.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -191,7 +192,7 @@ class TrainedRun(os.PathLike[str]):
             true_rotations=arrays["true_rotations"],
             positions=arrays["predicted_positions"],
             rotations=arrays["predicted_rotations"],
-            joints=arrays["predicted_positions_of_position_branch"] if learned else None,
+            position_branch=arrays["predicted_positions_of_position_branch"] if learned else None,
         )
 
     def stream(
@@ -237,7 +238,7 @@ class Prediction:
         true_positions, true_rotations: (N, 22, 3) and (N, 22, 3, 3).
         positions: of the rotation branch (N, 22, 3): forward kinematics, the head on its tracker.
         rotations: of the rotation branch (N, 22, 3, 3).
-        joints: of the position branch (N, 22, 3); None for a network without one.
+        position_branch: of the position branch (N, 22, 3); None for a network without one.
     """
 
     run: str
@@ -247,7 +248,13 @@ class Prediction:
     true_rotations: np.ndarray = field(repr=False)
     positions: np.ndarray = field(repr=False)
     rotations: np.ndarray = field(repr=False)
-    joints: np.ndarray | None = field(repr=False)
+    position_branch: np.ndarray | None = field(repr=False)
+
+    @property
+    def joints(self) -> np.ndarray | None:
+        """Deprecated: the name of `position_branch` in version 0.1."""
+        warnings.warn("Prediction.joints is now Prediction.position_branch", DeprecationWarning, stacklevel=2)
+        return self.position_branch
 
     def __len__(self) -> int:
         """N."""
@@ -306,7 +313,7 @@ class Prediction:
 
     @property
     def _joints(self) -> dict[str, np.ndarray | None]:
-        return {"rotation": self.positions, "position": self.joints}
+        return {"rotation": self.positions, "position": self.position_branch}
 
 
 def _outputs(given: StrPath | None) -> Path:

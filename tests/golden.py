@@ -263,7 +263,7 @@ def mode(name: str) -> Numbers:
     """What a mode makes of clips of unequal length, and the mean of their reports."""
     model, split = tiny.model(NoCodesMemory), frames()
     found = {}
-    for i, motion in enumerate(evaluation.MODES[name](model, split.clips())):
+    for i, motion in enumerate(evaluation.MODE_FUNCTIONS[name](model, split.clips())):
         found |= summary(f"clip {i}", motion)
     mean = evaluation.evaluate(model, split, [name], 2)["mean"][name]["rotation"]
     return found | {key: mean[key] for key in ("MPJPE", "Jitter")}

@@ -200,8 +200,8 @@ def test_a_prediction_is_what_was_measured(run: memmlp.TrainedRun, prediction: m
 def test_a_predictions_arrays(prediction: memmlp.Prediction):
     n = len(prediction)
     assert prediction.true_positions.shape == prediction.positions.shape == (n, 22, 3)
-    assert prediction.joints is not None
-    assert prediction.joints.shape == (n, 22, 3)
+    assert prediction.position_branch is not None
+    assert prediction.position_branch.shape == (n, 22, 3)
     for rotations in (prediction.rotations, prediction.true_rotations):
         product = rotations @ rotations.swapaxes(-1, -2)
         np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), (n, 22, 3, 3)), atol=1e-4)
@@ -215,7 +215,9 @@ def test_a_network_without_a_position_branch_has_no_joints(
     alone = memmlp.load_run(run)
     monkeypatch.setattr(alone.model, "branches", frozenset({"rotation"}))
     found = alone.predict(alone.clips[0], "window")
-    assert found.joints is None
+    assert found.position_branch is None
+    with pytest.warns(DeprecationWarning, match="Prediction.position_branch"):
+        assert found.joints is None
     assert found.errors().shape == (len(found), 22)
     with refused("branch position", "allowed are rotation"):
         found.errors("position")

@@ -49,9 +49,9 @@ def report(words: tuple[str, ...], out: Path | None, outputs: Path) -> None:
 
 def chapters_of(names: Sequence[str], overrides: Sequence[str], outputs: Path) -> list[Chapter]:
     """Return the tables of some names with the finished runs behind them; each run is read once."""
-    from memmlp.cli.table import MODES, gathered
+    from memmlp.cli.table import SHOWN_MODES, gathered
     from memmlp.report.html import Chapter
     from memmlp.tables.measured_run import load
 
-    found = gathered(names, overrides, outputs, MODES["both"], functools.cache(load))
+    found = gathered(names, overrides, outputs, SHOWN_MODES["both"], functools.cache(load))
     return [Chapter(sweep, table, runs) for sweep, runs, table in found]

@@ -253,7 +253,7 @@ def report(shown: Shown, words: Sequence[str], chosen: Sweep) -> None:
     Exits with 1 where something failed.
     """
     from memmlp.cli.rounds import closing
-    from memmlp.cli.table import MODES, of_plan, on_screen
+    from memmlp.cli.table import SHOWN_MODES, of_plan, on_screen
     from memmlp.config.plan_sweep import orphans
     from memmlp.tables.measured_run import load
 
@@ -261,7 +261,7 @@ def report(shown: Shown, words: Sequence[str], chosen: Sweep) -> None:
     states = plan.states()
     failed = [task for task in plan.tasks if states[task.key] in ("failed", "blocked")]
     command = " ".join(["memmlp sweep", *words])
-    found = of_plan(shown, MODES["both"], command, load)
+    found = of_plan(shown, SHOWN_MODES["both"], command, load)
     on_screen([found.table])
     for line in closing(known, chosen, found.runs) if known else ():
         click.echo(line)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from memmlp.tables.seeds_needed import Need
     from memmlp.tables.table import Table
 
-MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", "window")}
+SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", "window")}
 
 
 @click.command("table")
@@ -37,7 +37,7 @@ MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", "windo
     "--out", type=click.Path(path_type=Path, dir_okay=False), help="File; its ending tells the format."
 )
 @click.option(
-    "--mode", type=click.Choice(list(MODES)), default="both", show_default=True, help="Of evaluation."
+    "--mode", type=click.Choice(list(SHOWN_MODES)), default="both", show_default=True, help="Of evaluation."
 )
 @click.option("--branch", type=click.Choice(BRANCHES), help="In place of the paper's for this table.")
 @click.option("--plan", is_flag=True, help="Show how many seeds the paper's effects would need here.")
@@ -61,9 +61,9 @@ def table(
     if plan and (form or out):
         raise InputError("--plan: goes to the screen alone, without --format and --out")
     with _uncollected():
-        found = gathered([name], overrides, outputs, MODES[mode], functools.cache(load), branch)
+        found = gathered([name], overrides, outputs, SHOWN_MODES[mode], functools.cache(load), branch)
     if plan:
-        plans_on_screen(found, MODES[mode])
+        plans_on_screen(found, SHOWN_MODES[mode])
         return
     tables = [one.table for one in found]
     if form is None and out is None:

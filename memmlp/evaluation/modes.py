@@ -96,11 +96,14 @@ def window_by_window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor
     return [whole[-len(clip) :] for whole, clip in zip(motion, clips, strict=True)]
 
 
-MODES: dict[str, Callable[[Evaluable, Sequence[Tensor]], list[Tensor]]] = {"window": window, "stream": stream}
+MODE_FUNCTIONS: dict[str, Callable[[Evaluable, Sequence[Tensor]], list[Tensor]]] = {
+    "window": window,
+    "stream": stream,
+}
 
 
 def evaluate(
-    network: Evaluable, frames: MotionDataset, modes: Sequence[str], batch: int, ik: IK | None = None
+    network: Evaluable, dataset: MotionDataset, modes: Sequence[str], batch: int, ik: IK | None = None
 ) -> dict[str, Any]:
     """Compute the metrics of a split: `{"mean": {mode: {branch: {metric: value}}}, "clips": [...]}`.
 
@@ -108,15 +111,15 @@ def evaluate(
 
     Args:
         network: the network to evaluate.
-        frames: the split.
+        dataset: the split.
         modes: the evaluation modes.
         batch: how many clips are evaluated side by side, at most.
         ik: inverse kinematics, whose result is a further branch.
     """
-    clips = frames.clips()
+    clips = dataset.clips()
     rows: list[dict[str, Any]] = [
         {"name": name, "group": group, "frames": len(clip)}
-        for name, group, clip in zip(frames.names, frames.groups, clips, strict=True)
+        for name, group, clip in zip(dataset.names, dataset.groups, clips, strict=True)
     ]
     for mode in modes:
         for row, clip, motion in zip(rows, clips, predict(network, clips, mode, batch), strict=True):
@@ -127,7 +130,7 @@ def evaluate(
 def predict(network: Evaluable, clips: Sequence[Tensor], mode: str, batch: int) -> list[Tensor]:
     """Predict the motion (N, 198) of each clip (N, 252), at most `batch` clips side by side."""
     groups = [clips[i : i + batch] for i in range(0, len(clips), batch)]
-    return [motion for group in groups for motion in MODES[mode](network, group)]
+    return [motion for group in groups for motion in MODE_FUNCTIONS[mode](network, group)]
 
 
 def clip_report(
@@ -161,12 +164,12 @@ def joint_positions(motion: Tensor) -> Tensor:
     return motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
 
 
-def chunks(frames: MotionDataset, length: int, least: int) -> list[Tensor]:
+def chunks(dataset: MotionDataset, length: int, least: int) -> list[Tensor]:
     """Cut a split's clips into pieces of `length` frames.
 
     Pieces under `least` frames are left out, unless all of them are so short.
     """
-    pieces = [piece for clip in frames.clips() for piece in clip.split(length)]
+    pieces = [piece for clip in dataset.clips() for piece in clip.split(length)]
     return [p for p in pieces if len(p) >= least] or pieces
 
 

@@ -31,7 +31,7 @@ def save_predictions(evaluation: Evaluation, model: WindowModel, test: MotionDat
 
 def predict_clip(model: WindowModel, clip: Tensor, mode: str) -> dict[str, np.ndarray]:
     """What a network makes of a clip's frames (N, 252) in a mode, beside the truth (`prediction_arrays`)."""
-    return prediction_arrays(model.normalizer, clip, modes.MODES[mode](model, [clip])[0], NoIK())
+    return prediction_arrays(model.normalizer, clip, modes.MODE_FUNCTIONS[mode](model, [clip])[0], NoIK())
 
 
 def prediction_arrays(normalizer: Normalizer, clip: Tensor, motion: Tensor, ik: IK) -> dict[str, np.ndarray]:

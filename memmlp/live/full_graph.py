@@ -43,7 +43,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.streaming import StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
-TRACKERS = ("tracker_positions", "tracker_rotations")
+INPUTS = ("tracker_positions", "tracker_rotations")
 OUTPUTS = ("rotations", "positions", "joints")
 OWN = {"seen": (1, 1), "positions": (1, 3, 3), "rotations": (1, 3, 3, 3)}
 """States beside the network's: whether there was a frame before, and its trackers in AMASS' world."""
@@ -132,7 +132,7 @@ def export_full(model: WindowModel | StreamingGraph, path: Path, run_id: str, sp
     save(
         step,
         (torch.zeros(1, 3, 3), torch.eye(3).expand(1, 3, 3, 3), *state.values()),
-        [*TRACKERS, *names],
+        [*INPUTS, *names],
         [*OUTPUTS, *(f"{name}.next" for name in names)],
         path,
         metadata(model, run_id) | {"scope": "full", "space": space},

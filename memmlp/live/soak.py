@@ -66,7 +66,7 @@ def soak(stream: Stream, motion: TrackedMotion, times: int) -> Soaked:
         at, tenth = index % length, index * TENTHS // total
         head, left, right = zip(motion.positions[at], motion.rotations[at], strict=True)
         pose = stream.step(head, left, right, index / FPS)
-        finite &= bool(np.isfinite(pose.positions).all() and np.isfinite(pose.joints).all())
+        finite &= bool(np.isfinite(pose.positions).all() and np.isfinite(pose.position_branch).all())
         finite &= bool(np.isfinite(pose.rotations).all())
         errors[tenth] += 100 * float(np.sqrt(((pose.positions - motion.joints[at]) ** 2).sum(-1)).mean())
         if (index + 1) * TENTHS == total:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -15,13 +16,12 @@ from memmlp.common.errors import InputError
 from memmlp.live.exported import ExportedNetwork
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
 from memmlp.live.spaces import SpaceName, space_of
-from memmlp.live.trackers import Features, Lost, Trackers, t_pose
+from memmlp.live.trackers import TRACKERS, Features, Lost, TrackerFrames, t_pose
 from memmlp.runs.run import Run
 
 if TYPE_CHECKING:
     from memmlp.evaluation.ik import LBFGS
 
-TRACKERS = ("head", "left", "right")
 IDENTITY = np.eye(3)
 NOTHING = np.full((3, 12), np.nan)
 NEUTRAL = np.concatenate([np.zeros(3), IDENTITY.reshape(9)])
@@ -41,8 +41,8 @@ class Pose(NamedTuple):
         positions: the joints (22, 3), metres, by forward kinematics of the rotations, the head on its
             tracker.
         rotations: local rotations (22, 3, 3), or quaternions xyzw (22, 4); the root's is global.
-        joints: the joints (22, 3), metres, from the network's position branch; where it has none, they follow
-            from its rotations.
+        position_branch: the joints (22, 3), metres, from the network's position branch; where it has none,
+            they follow from its rotations.
         held: which of "head", "left", "right" are lost at this sample, and held.
         fresh: whether this call made a frame; if not, the pose is the last frame's.
         restarted: whether the network began anew at this frame, as it does at the first one, and after
@@ -52,10 +52,16 @@ class Pose(NamedTuple):
     time: float
     positions: np.ndarray
     rotations: np.ndarray
-    joints: np.ndarray
+    position_branch: np.ndarray
     held: tuple[str, ...]
     fresh: bool
     restarted: bool
+
+    @property
+    def joints(self) -> np.ndarray:
+        """Deprecated: the name of `position_branch` in version 0.1."""
+        warnings.warn("Pose.joints is now Pose.position_branch", DeprecationWarning, stacklevel=2)
+        return self.position_branch
 
 
 class Offsets(NamedTuple):
@@ -114,7 +120,7 @@ class Stream:
         self.offsets = None if offsets is None else checked_offsets(offsets)
         self.solve = None if ik is None else Solver(ik, self.network.skeleton.rest)
         self._output = OUTPUTS[rotations]
-        self._trackers = Trackers(self.network.skeleton, self.network.fps)
+        self._trackers = TrackerFrames(self.network.skeleton, self.network.fps)
         self._features = Features()
         self._sparse = self.network.sparse[0]
         self._last: Pose | None = None
@@ -214,8 +220,8 @@ class Stream:
             sixd = self.solve(sixd, network.position, self._sparse)
         local = sixd_to_matrix(sixd)
         positions = space.positions_out(network.skeleton.positions(local) + head)
-        joints = space.positions_out(network.position)
-        return Pose(time, positions, self._output(space.pose_out(local)), joints, held, True, restarted)
+        branch = space.positions_out(network.position)
+        return Pose(time, positions, self._output(space.pose_out(local)), branch, held, True, restarted)
 
 
 class Solver:

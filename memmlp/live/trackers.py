@@ -36,6 +36,7 @@ RECOVERY = 0.2  # seconds over which a tracker that returns is led to its true p
 EARLY = 5e-4  # seconds that a frame may be ahead of its sample, for times that are rounded to milliseconds
 SAME = 1e-6  # seconds; a sample this near to a frame is taken as the frame
 
+TRACKERS = ("head", "left", "right")
 NOBODY = (False, False, False)
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # SMPL's body frame (Y up) to AMASS' (Z up)
 
@@ -43,7 +44,7 @@ UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # SMPL's body frame (Y
 Lost = tuple[bool, ...]  # whether head, left and right wrist are lost
 
 
-class Tracked(NamedTuple):
+class TrackerSample(NamedTuple):
     """Head, left and right wrist at a time, in AMASS' world.
 
     Attributes:
@@ -57,14 +58,14 @@ class Tracked(NamedTuple):
     rotations: np.ndarray
 
 
-def between(a: Tracked, b: Tracked, time: float) -> Tracked:
+def between(a: TrackerSample, b: TrackerSample, time: float) -> TrackerSample:
     """Return the trackers at a time, interpolated between the samples before and after it."""
     weight = (time - a.time) / (b.time - a.time)
     positions = a.positions + weight * (b.positions - a.positions)
-    return Tracked(time, positions, slerp(a.rotations, b.rotations, weight))
+    return TrackerSample(time, positions, slerp(a.rotations, b.rotations, weight))
 
 
-def t_pose(skeleton: BodyTree, place: np.ndarray, heading: float) -> Tracked:
+def t_pose(skeleton: BodyTree, place: np.ndarray, heading: float) -> TrackerSample:
     """Return head and wrists of a person in T-pose whose head is at `place` (3,), metres, AMASS' world.
 
     Args:
@@ -74,7 +75,7 @@ def t_pose(skeleton: BodyTree, place: np.ndarray, heading: float) -> Tracked:
     """
     turn = about_vertical(heading) @ UPRIGHT
     rest = skeleton.rest[skeleton.tracked]
-    return Tracked(0.0, place + (rest - rest[0]) @ turn.T, np.tile(turn, (3, 1, 1)))
+    return TrackerSample(0.0, place + (rest - rest[0]) @ turn.T, np.tile(turn, (3, 1, 1)))
 
 
 def about_vertical(angle: float) -> np.ndarray:
@@ -106,13 +107,13 @@ class Hold:
 
     def reset(self) -> None:
         """Forget everything: no tracker was seen yet."""
-        self.last: Tracked | None = None
+        self.last: TrackerSample | None = None
         self.lost: Lost = NOBODY
         self.settled = -np.inf  # time from which all trackers that returned are at their true poses
         self.returned = np.full(3, -np.inf)  # time from which each tracker's difference shrinks
         self.shift, self.turn = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1))
 
-    def __call__(self, sample: Tracked, lost: Lost) -> Tracked:
+    def __call__(self, sample: TrackerSample, lost: Lost) -> TrackerSample:
         """Return the sample with lost trackers filled in, and with returning ones on their way."""
         last = self.last or self._first(sample, lost)
         returning = [was and not is_lost for was, is_lost in zip(self.lost, lost, strict=True)]
@@ -125,7 +126,7 @@ class Hold:
             self.last = held(self.last, lost, last)
         return self.last
 
-    def _first(self, sample: Tracked, lost: Lost) -> Tracked:
+    def _first(self, sample: TrackerSample, lost: Lost) -> TrackerSample:
         """Return what stands in for the last sample when the first one comes: itself, if nothing is lost.
 
         Else it is the T-pose under the head; without a head, that of a person who stands at the origin.
@@ -137,20 +138,20 @@ class Hold:
             return t_pose(self.skeleton, np.array([0.0, 0.0, height]), 0.0)
         return t_pose(self.skeleton, sample.positions[0], heading_of(sample.rotations[0]))
 
-    def _return(self, which: list[bool], last: Tracked, sample: Tracked) -> None:
+    def _return(self, which: list[bool], last: TrackerSample, sample: TrackerSample) -> None:
         """Remember how far the returning trackers are from where they were held."""
         self.returned[which], self.settled = last.time, last.time + self.recovery
         self.shift[which] = (last.positions - sample.positions)[which]
         self.turn[which] = (last.rotations @ sample.rotations.swapaxes(1, 2))[which]
 
-    def _on_their_way(self, sample: Tracked) -> Tracked:
+    def _on_their_way(self, sample: TrackerSample) -> TrackerSample:
         """Return the sample with what is left of these differences added."""
         left = np.clip(1 - (sample.time - self.returned) / self.recovery, 0, 1)
         positions = sample.positions + left[:, None] * self.shift
-        return Tracked(sample.time, positions, turned_by(self.turn, left) @ sample.rotations)
+        return TrackerSample(sample.time, positions, turned_by(self.turn, left) @ sample.rotations)
 
 
-def held(sample: Tracked, lost: Lost, last: Tracked) -> Tracked:
+def held(sample: TrackerSample, lost: Lost, last: TrackerSample) -> TrackerSample:
     """Return the sample with the lost trackers where they last were, as seen from the head."""
     positions, rotations = sample.positions.copy(), sample.rotations.copy()
     if lost[0]:
@@ -159,13 +160,13 @@ def held(sample: Tracked, lost: Lost, last: Tracked) -> Tracked:
     hands = [index for index in (1, 2) if lost[index]]
     positions[hands] = positions[0] + (last.positions[hands] - last.positions[0]) @ turn.T
     rotations[hands] = turn @ last.rotations[hands]
-    return Tracked(sample.time, positions, rotations)
+    return TrackerSample(sample.time, positions, rotations)
 
 
 class Taken(NamedTuple):
     """What a sample brought: the frames that are due, and whether everything began anew with it."""
 
-    frames: list[Tracked]
+    frames: list[TrackerSample]
     restarted: bool
 
 
@@ -183,7 +184,7 @@ class Resampler:
 
     def reset(self) -> None:
         """Forget everything: the next sample is the first."""
-        self.last: Tracked | None = None
+        self.last: TrackerSample | None = None
         self.origin, self.count = 0.0, 0
 
     @property
@@ -199,7 +200,7 @@ class Resampler:
         """Return whether a sample at that time is not newer than the last one."""
         return self.last is not None and -self.gap <= time - self.last.time <= 0
 
-    def take(self, sample: Tracked) -> list[Tracked]:
+    def take(self, sample: TrackerSample) -> list[TrackerSample]:
         """Return the frames that are due with a sample, which must be newer than the last one."""
         if self.last is None:
             self.origin, self.last = sample.time, sample
@@ -212,7 +213,7 @@ class Resampler:
         return frames
 
 
-class Trackers:
+class TrackerFrames:
     """Turns samples of three trackers into frames at the network's rate, by the rules of the module's text.
 
     Args:
@@ -244,7 +245,7 @@ class Trackers:
         restarted = self.grid.restarts(time)
         if restarted:
             self.reset()
-        sample = self.hold(Tracked(time, positions, rotations), lost)
+        sample = self.hold(TrackerSample(time, positions, rotations), lost)
         return Taken(self.grid.take(sample), restarted)
 
 
@@ -252,13 +253,13 @@ class Features:
     """Computes the network's 54 inputs frame by frame, as `memmlp.motion.features.sparse_features` does."""
 
     def __init__(self) -> None:
-        self.last: Tracked | None = None
+        self.last: TrackerSample | None = None
 
     def reset(self) -> None:
         """Forget the last frame: the next one has no velocity."""
         self.last = None
 
-    def write(self, frame: Tracked, sparse: np.ndarray) -> None:
+    def write(self, frame: TrackerSample, sparse: np.ndarray) -> None:
         """Write the inputs of a frame into sparse (54,)."""
         last = self.last or frame
         positions, rotations = frame.positions, frame.rotations

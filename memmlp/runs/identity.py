@@ -59,7 +59,7 @@ class Identity:
     """The identity of a run.
 
     Attributes:
-        kind: "vqvae" or "memmlp".
+        kind: "vqvae", or "memmlp" for every motion network, baselines too; ids are digests of this word.
         config: the resolved config; only the keys that can change a training's result count.
         data: digest of the prepared data.
         upstream: the identity of the run whose artifact this one uses.
@@ -95,7 +95,7 @@ def run_id(kind: str, config: Mapping[str, Any], *, data: str, upstream: str | N
     """Return the identity of a training: 16 hex digits over all that can change its result.
 
     Args:
-        kind: "vqvae" or "memmlp".
+        kind: "vqvae", or "memmlp" for every motion network, baselines too.
         config: the resolved config; keys that are neutral or of a later stage do not count, and 1 counts as
             1.0.
         data: digest of the prepared data.

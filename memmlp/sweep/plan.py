@@ -24,7 +24,7 @@ class RunTask:
 
     Attributes:
         id: the run's id.
-        kind: "vqvae" or "memmlp".
+        kind: "vqvae" or "memmlp" (see `Identity`).
         config: the resolved config of an experiment that needs the run.
         upstream: the id of the run that must be done before; None for none.
         stages: identities of the evaluations and the deployment that are wanted of the run.

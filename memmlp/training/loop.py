@@ -47,7 +47,7 @@ class TrainingTask(Protocol):
         """All parameters and buffers that a checkpoint must hold."""
 
     @property
-    def frames(self) -> MotionDataset:
+    def dataset(self) -> MotionDataset:
         """The training split."""
 
     def parameter_groups(self) -> list[dict]:
@@ -113,7 +113,7 @@ def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimize
     for group in optimiser.param_groups:
         group.setdefault("initial_lr", group["lr"])
         group["lr"] = group["initial_lr"] * optim.factor(step)
-    device = task.frames.frames.device
+    device = task.dataset.frames.device
     mixed = torch.autocast(device.type, torch.bfloat16) if optim.precision == "bf16" else nullcontext()
     with mixed:
         result = task.step(step)
@@ -131,7 +131,7 @@ def check_finite(task: TrainingTask, result: StepResult, step: int) -> None:
     if torch.isfinite(result.loss):
         return
     bad = [name for name, term in result.terms.items() if not torch.isfinite(term)] or ["weighted sum"]
-    names = sorted({task.frames.names[i] for i in result.clips.tolist()})
+    names = sorted({task.dataset.names[i] for i in result.clips.tolist()})
     raise TrainingDiverged(
         f"loss is {float(result.loss.detach())} at step {step + 1}, term {', '.join(bad)}; "
         f"clips of the batch: {', '.join(names[:20])}{' ...' if len(names) > 20 else ''}"

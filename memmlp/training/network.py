@@ -65,17 +65,17 @@ class NetworkTraining:
         Returns:
             The trained network in evaluation mode.
         """
-        frames = data.open("train").to(device)
+        dataset = data.open("train").to(device)
         torch.manual_seed(self.seed)
         frozen = architecture.load_vqvae(codes) if codes else None
-        model = architecture.build(architecture.normalizer(data.manifest, frames.frames), frozen).to(device)
+        model = architecture.build(architecture.normalizer(data.manifest, dataset.frames), frozen).to(device)
         self.rollout.begin(model)
         pieces = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)
         task = MotionTask(
             model,
             self.loss(model.branches).to(device),
             self.rollout.to(device),
-            frames,
+            dataset,
             self.optim,
             self.seed,
             validate=lambda network: modes.quick_stream(network, pieces),
@@ -94,15 +94,15 @@ class MotionTask:
         model: WindowModel,
         loss: Loss,
         rollout: Rollout,
-        frames: MotionDataset,
+        dataset: MotionDataset,
         optim: Optim,
         seed: int,
         validate: Callable[[WindowModel], dict[str, float]],
         weighting: str = "frames",
     ):
-        self.model, self.loss, self.rollout, self.frames = model, loss, rollout, frames
+        self.model, self.loss, self.rollout, self.dataset = model, loss, rollout, dataset
         self.module: nn.Module = nn.ModuleDict({"model": model, "loss": loss, "rollout": rollout})
-        self.sampler = WindowSampler(frames, optim.batch, model.frames, seed, weighting)
+        self.sampler = WindowSampler(dataset, optim.batch, model.frames, seed, weighting)
         self.learn = torch.compile(model.learn) if optim.compile else model.learn
         self._validate = validate
 
@@ -113,7 +113,7 @@ class MotionTask:
 
     def step(self, step: int) -> StepResult:
         """Compute the loss of one training call."""
-        call = self.rollout.draw(self.model, self.frames, self.sampler, step)
+        call = self.rollout.draw(self.model, self.dataset, self.sampler, step)
         motion, state = self.learn(call.sparse, call.state, call.truth)
         self.rollout.keep(state)
         true = call.truth[:, -motion.shape[1] :]

@@ -39,7 +39,7 @@ class Rollout(nn.Module):
     def begin(self, model: WindowModel) -> None:
         """Make room for what is kept between the training steps of a network; here nothing is kept."""
 
-    def draw(self, model: WindowModel, frames: MotionDataset, sampler: WindowSampler, step: int) -> Call:
+    def draw(self, model: WindowModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """Draw the call of a training step."""
         raise NotImplementedError
 
@@ -50,11 +50,11 @@ class Rollout(nn.Module):
 class TeacherForcing(Rollout):
     """The true motion as history: the paper's training (Sec. 3.2.1)."""
 
-    def draw(self, model: WindowModel, frames: MotionDataset, sampler: WindowSampler, step: int) -> Call:
+    def draw(self, model: WindowModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """Draw the call of a training step."""
         clips, end = sampler.draw(step)
         past, stride = model.length, model.stride
-        segment = frames.segments(clips, end, past + stride)
+        segment = dataset.segments(clips, end, past + stride)
         state = model.true_state(segment[:, :past])
         return Call(segment[:, past:, :SPARSE_DIM], state, segment[:, -model.frames :], clips)
 
@@ -69,12 +69,12 @@ class OwnPredictions(Rollout):
         super().__init__()
         self.max_passes = max_passes
 
-    def draw(self, model: WindowModel, frames: MotionDataset, sampler: WindowSampler, step: int) -> Call:
+    def draw(self, model: WindowModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """Draw the call of a training step, after the calls that make its history."""
         clips, end = sampler.draw(step)
         past, stride = model.length, model.stride
         passes = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
-        segment = frames.segments(clips, end, past + stride * (passes + 1))
+        segment = dataset.segments(clips, end, past + stride * (passes + 1))
         sparse = segment[..., :SPARSE_DIM]
         state = model.running_state(sparse[:, :past])
         model.eval()
@@ -117,17 +117,17 @@ class PersistentStreams(Rollout):
         for name, tensor in model.initial_state(1).items():
             self.register_buffer(f"state_{name}", tensor.repeat(self.streams, *[1] * (tensor.dim() - 1)))
 
-    def draw(self, model: WindowModel, frames: MotionDataset, sampler: WindowSampler, step: int) -> Call:
+    def draw(self, model: WindowModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """Draw the call of a training step: the next streams, each one stride further."""
         # The drawn clips and frames are where streams that have ended, or not begun, start afresh.
         clips, end = sampler.draw(step)
         who = (step * len(clips) + torch.arange(len(clips), device=clips.device)) % self.streams
-        going = self.lives[who] & (self.end[who] + model.stride < frames.lengths[self.clip[who]])
+        going = self.lives[who] & (self.end[who] + model.stride < dataset.lengths[self.clip[who]])
         self.clip[who] = torch.where(going, self.clip[who], clips)
         self.end[who] = torch.where(going, self.end[who] + model.stride, end)
         self.lives[who] = True
         past, stride = model.length, model.stride
-        segment = frames.segments(self.clip[who], self.end[who], past + stride)
+        segment = dataset.segments(self.clip[who], self.end[who], past + stride)
         fresh = model.running_state(segment[:, :past, :SPARSE_DIM])
         state = {}
         for name, tensor in fresh.items():

@@ -42,12 +42,12 @@ class VQVAETraining:
         Returns:
             Its errors on the validation frames.
         """
-        frames, validation = (data.open(split).to(device) for split in ("train", "val"))
+        dataset, validation = (data.open(split).to(device) for split in ("train", "val"))
         torch.manual_seed(self.seed)
-        normalizer = architecture.normalizer(data.manifest, frames.frames).to(device)
+        normalizer = architecture.normalizer(data.manifest, dataset.frames).to(device)
         model = architecture.vqvae().to(device)
-        optim = self.optim(len(frames.frames))
-        task = VQVAETask(model, normalizer, frames, validation, optim, self.seed)
+        optim = self.optim(len(dataset.frames))
+        task = VQVAETask(model, normalizer, dataset, validation, optim, self.seed)
         train(task, optim, run, self.seed, "VQ-VAE")
         checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
         return task.validate()
@@ -62,14 +62,14 @@ class VQVAETask:
         self,
         model: VQVAE,
         normalizer: Normalizer,
-        frames: MotionDataset,
+        dataset: MotionDataset,
         validation: MotionDataset,
         optim: Optim,
         seed: int,
     ):
-        self.model, self.normalizer, self.frames, self.validation = model, normalizer, frames, validation
+        self.model, self.normalizer, self.dataset, self.validation = model, normalizer, dataset, validation
         self.module: nn.Module = model
-        self.sampler = WindowSampler(frames, batch=optim.batch, window=1, seed=seed)
+        self.sampler = WindowSampler(dataset, batch=optim.batch, window=1, seed=seed)
         self.used = torch.zeros(len(model.codebook.vectors))
 
     def parameter_groups(self) -> list[dict]:
@@ -79,7 +79,7 @@ class VQVAETask:
     def step(self, step: int) -> StepResult:
         """Compute the loss on a batch of single frames."""
         clips, end = self.sampler.draw(step)
-        frames = self.normalizer.encode(self.frames.segments(clips, end, 1))[:, 0]
+        frames = self.normalizer.encode(self.dataset.segments(clips, end, 1))[:, 0]
         terms, indices = self.model.loss_terms(frames, self.normalizer)
         self.used = torch.bincount(indices, minlength=len(self.used)).float()
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)

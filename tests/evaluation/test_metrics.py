@@ -9,7 +9,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from memmlp.evaluation import metrics
-from memmlp.evaluation.modes import MODES, chunks, clip_report, evaluate, quick_stream, stream, window
+from memmlp.evaluation.modes import (
+    MODE_FUNCTIONS,
+    chunks,
+    clip_report,
+    evaluate,
+    quick_stream,
+    stream,
+    window,
+)
 from memmlp.motion.body import MOTION_DIM, POSITION, SPARSE_DIM
 
 
@@ -146,9 +154,9 @@ def test_windows_do_not_overlap_and_the_tail_is_shifted_back():
 
 def test_modes_differ_and_batches_do_not():
     split, model = tiny.frames((40, 33, 12)), tiny.model()
-    one, many = (evaluate(model, split, list(MODES), batch=batch) for batch in (1, 3))
+    one, many = (evaluate(model, split, list(MODE_FUNCTIONS), batch=batch) for batch in (1, 3))
     assert one["mean"]["window"] != one["mean"]["stream"]
-    for mode in MODES:
+    for mode in MODE_FUNCTIONS:
         for branch in ("rotation", "position"):
             assert one["mean"][mode][branch] == pytest.approx(many["mean"][mode][branch], rel=1e-3)
 

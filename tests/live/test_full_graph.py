@@ -57,7 +57,7 @@ def test_it_is_the_stream(name, network, folder: Path):
     for _ in range(2):
         for index, pose in enumerate(poses):
             given = [part[index : index + 1].astype(np.float32) for part in (positions, rotations)]
-            expected = (pose.rotations, pose.positions, pose.joints)
+            expected = (pose.rotations, pose.positions, pose.position_branch)
             for ours, theirs in zip(full.step(*given), expected, strict=True):
                 np.testing.assert_allclose(ours[0], theirs, atol=1e-4)
         full.reset()

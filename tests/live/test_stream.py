@@ -74,7 +74,7 @@ def largest_difference(network, file: Path, person: wearer.Person) -> float:
     motion = stream(network, [person.frames])[0]
     pairs = [
         (wearer.joints(poses), network.normalizer.pose(motion, person.frames[:, :SPARSE_DIM])),
-        (np.stack([pose.joints for pose in poses]), joint_positions(motion)),
+        (np.stack([pose.position_branch for pose in poses]), joint_positions(motion)),
         (np.stack([pose.rotations for pose in poses]), local_rotations(motion)),
     ]
     return max(float(np.abs(ours - theirs.numpy()).max()) for ours, theirs in pairs)
@@ -116,7 +116,7 @@ def test_every_space_is_the_same_stream(name, file):
     )
     for here, pose in zip(plain, there, strict=True):
         np.testing.assert_allclose(pose.positions, space.positions_out(here.positions), atol=1e-5)
-        np.testing.assert_allclose(pose.joints, space.positions_out(here.joints), atol=1e-5)
+        np.testing.assert_allclose(pose.position_branch, space.positions_out(here.position_branch), atol=1e-5)
         expected = matrix_to_quaternion(space.pose_out(here.rotations))
         assert np.abs((pose.rotations * expected).sum(-1)).min() > 1 - 1e-5
         assert pose.rotations.shape == (N_JOINTS, 4)
@@ -129,7 +129,9 @@ def test_inverse_kinematics_bring_the_pose_to_the_position_branch(network, file)
     motion = stream(network, [frames])[0]
     expected = LBFGS().solutions(network.normalizer, motion, frames[:, :SPARSE_DIM])["combined"]
     there = network.normalizer.pose(expected, frames[:, :SPARSE_DIM]).numpy()
-    targets = np.stack([pose.joints for pose in solved])
+    targets = np.stack([pose.position_branch for pose in solved])
+    with pytest.warns(DeprecationWarning, match="Pose.position_branch"):
+        assert solved[0].joints is solved[0].position_branch
     assert wearer.apart(wearer.joints(solved[1:]), there).max() < 0.1
     assert (
         wearer.apart(wearer.joints(solved), targets) < 0.8 * wearer.apart(wearer.joints(plain), targets)

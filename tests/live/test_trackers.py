@@ -12,8 +12,8 @@ from memmlp.live.trackers import (
     NOBODY,
     Features,
     Hold,
-    Tracked,
-    Trackers,
+    TrackerFrames,
+    TrackerSample,
     about_vertical,
     heading_of,
     t_pose,
@@ -23,12 +23,12 @@ from memmlp.motion.body import JOINTS, PARENTS, SPARSE_DIM
 SKELETON = BodyTree(JOINTS, PARENTS, tiny.REST.numpy())
 TIMES = np.arange(240) / 60
 PERSON = wearer.person(TIMES)
-SAMPLES = [Tracked(*sample) for sample in zip(TIMES, PERSON.positions, PERSON.rotations, strict=True)]
+SAMPLES = [TrackerSample(*sample) for sample in zip(TIMES, PERSON.positions, PERSON.rotations, strict=True)]
 
 
-def frames_of(times: np.ndarray) -> list[Tracked]:
+def frames_of(times: np.ndarray) -> list[TrackerSample]:
     """Return the frames at 60 Hz of samples of the person at those times."""
-    trackers, person = Trackers(SKELETON, 60), wearer.person(times)
+    trackers, person = TrackerFrames(SKELETON, 60), wearer.person(times)
     samples = zip(times, person.positions, person.rotations, strict=True)
     return [frame for sample in samples for frame in trackers.take(*sample, NOBODY).frames]
 
@@ -58,7 +58,7 @@ def test_frames_lie_between_samples(rate, millimetres):
 
 def test_no_frame_is_lost_in_an_hour_of_unix_time():
     """Such times have a resolution of 2e-7 s; at 60 Hz each sample still makes one frame, at its own time."""
-    trackers, start = Trackers(SKELETON, 60), 1.7e9
+    trackers, start = TrackerFrames(SKELETON, 60), 1.7e9
     for index in range(216_000):
         taken = trackers.take(start + index / 60, *SAMPLES[0][1:], NOBODY)
         assert len(taken.frames) == 1

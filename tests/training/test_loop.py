@@ -67,7 +67,7 @@ def test_the_weighting_of_the_data_decides_which_clips_a_step_sees():
         experiment = build_experiment(composed([f"data.weighting={weighting}"]))
         task = motion_task()
         task = MotionTask(
-            task.model, task.loss, TeacherForcing(), task.frames, replace(OPTIM, batch=3000), 0,
+            task.model, task.loss, TeacherForcing(), task.dataset, replace(OPTIM, batch=3000), 0,
             task.validate, experiment.training.weighting,
         )  # fmt: skip
         drawn[weighting] = torch.bincount(task.sampler.draw(0)[0], minlength=3) / 3000
@@ -144,8 +144,8 @@ def test_it_learns_and_logs(make, tmp_path):
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_a_loss_that_is_no_number_stops_with_step_term_and_clips(bad, tmp_path):
     task = motion_task("forced")
-    frames = task.frames.frames
-    start, length = int(task.frames.starts[1]), int(task.frames.lengths[1])
+    frames = task.dataset.frames
+    start, length = int(task.dataset.starts[1]), int(task.dataset.lengths[1])
     frames[start : start + length, 54 + 132 :] = bad
     with pytest.raises(TrainingDiverged, match=r"step \d+, term .*position.*clip1") as stop:
         train(task, OPTIM, Run(tmp_path), 0, "diverge")

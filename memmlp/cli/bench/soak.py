@@ -69,16 +69,16 @@ def _synthetic() -> MotionDataset:
     with tempfile.TemporaryDirectory() as folder:
         synthesize(Path(folder) / "clips", minutes=10)
         prepare(ClipFolder(Path(folder) / "clips", SeededSplit()), Path(folder) / "cache")
-        frames = MotionDataset.open(Path(folder) / "cache", "test")
-        return MotionDataset(frames.frames.clone(), frames.starts, frames.lengths, frames.names)
+        test = MotionDataset.open(Path(folder) / "cache", "test")
+        return MotionDataset(test.frames.clone(), test.starts, test.lengths, test.names)
 
 
-def _motion(frames: MotionDataset) -> TrackedMotion:
+def _motion(clips: MotionDataset) -> TrackedMotion:
     """Join all clips into one motion of trackers and true joints."""
     from memmlp.live.full_graph import trackers_of
     from memmlp.live.soak import TrackedMotion
     from memmlp.motion.body import N_JOINTS, POSITION, SPARSE_DIM
 
-    positions, rotations = trackers_of(frames.frames)
-    joints = frames.frames[:, SPARSE_DIM:][:, POSITION].unflatten(-1, (N_JOINTS, 3))
+    positions, rotations = trackers_of(clips.frames)
+    joints = clips.frames[:, SPARSE_DIM:][:, POSITION].unflatten(-1, (N_JOINTS, 3))
     return TrackedMotion(*(part.double().numpy() for part in (positions[1:], rotations[1:], joints)))

@@ -22,14 +22,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from memmlp.common.errors import InputError
+from memmlp.live.trackers import TRACKERS
 
-TRACKERS = ("head", "left", "right")
 POSE = 7  # numbers of a pose
 PREFIX = "/memmlp/"
 FARTHEST = 1e6  # the largest absolute value of a number in a pose
 
-Tracker = tuple[np.ndarray, np.ndarray] | None
-Trackers = tuple[Tracker, Tracker, Tracker]
+TrackerPose = tuple[np.ndarray, np.ndarray] | None
+TrackerPoses = tuple[TrackerPose, TrackerPose, TrackerPose]
 
 
 class Packet(NamedTuple):
@@ -42,7 +42,7 @@ class Packet(NamedTuple):
         seq: the sample's number; None where the sender gave none.
     """
 
-    trackers: Trackers
+    trackers: TrackerPoses
     time: float | None = None
     seq: int | None = None
 
@@ -122,7 +122,7 @@ def needs_osc() -> None:
         ) from None
 
 
-def _tracker(name: str, values: Any) -> Tracker:
+def _tracker(name: str, values: Any) -> TrackerPose:
     """Return a tracker from its seven numbers. Raises ValueError where they are no pose."""
     if values is None:
         return None

@@ -12,10 +12,10 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.live.player.packets import Packet, Parse, Trackers
+from memmlp.live.player.packets import Packet, Parse, TrackerPoses
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
 from memmlp.live.spaces import Space, SpaceName
-from memmlp.live.trackers import Tracked, between
+from memmlp.live.trackers import TrackerSample, between
 from memmlp.motion.body import (
     FPS,
     MOTION_DIM,
@@ -37,7 +37,7 @@ class PoseSample(NamedTuple):
     """What a source gives: a time (seconds), the trackers, and how many samples were lost before this one."""
 
     time: float
-    trackers: Trackers
+    trackers: TrackerPoses
     dropped: int = 0
 
 
@@ -80,10 +80,10 @@ class TrackedClip:
         self.joints = frames[:, SPARSE_DIM : SPARSE_DIM + MOTION_DIM][:, POSITION].reshape(-1, N_JOINTS, 3)
         self.seconds = (len(frames) - 1) / FPS
 
-    def trackers(self, time: float) -> Trackers:
+    def trackers(self, time: float) -> TrackerPoses:
         """Return position and quaternion (xyzw) of head, left and right wrist at a time, interpolated."""
         first, _ = self._place(time)
-        a, b = (Tracked(i / FPS, self.positions[i], self.rotations[i]) for i in (first, first + 1))
+        a, b = (TrackerSample(i / FPS, self.positions[i], self.rotations[i]) for i in (first, first + 1))
         sample = between(a, b, time)
         head, left, right = zip(sample.positions, matrix_to_quaternion(sample.rotations), strict=True)
         return head, left, right
@@ -99,7 +99,7 @@ class TrackedClip:
         return first, time * FPS - first
 
 
-def in_space(trackers: Trackers, space: Space) -> Trackers:
+def in_space(trackers: TrackerPoses, space: Space) -> TrackerPoses:
     """Bring trackers, positions and quaternions (xyzw), from AMASS' world to a space."""
     positions, rotations = (np.stack(part) for part in zip(*filter(None, trackers), strict=True))
     matrices = space.rotations_out(quaternion_to_matrix(rotations))
