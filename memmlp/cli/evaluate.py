@@ -44,6 +44,8 @@ def evaluate(
     results, made = complete_stages(experiment, found.run, found.data, again=again)
     said = f"{' and '.join(made)} done" if made else "measured before"
     click.echo(f"run {found.run.id}: {said}")
+    if partial := found.run.manifest.get("partial"):
+        click.echo(f"on a part of the data: {partial}")
     Console(highlight=False).print(metrics_table(results))
     if json_path is not None:
         write_json(json_path, {"mean": results, "clips": clip_rows(experiment, found.run)})

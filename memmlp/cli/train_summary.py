@@ -23,6 +23,8 @@ def show(outcome: Outcome) -> None:
     console = Console(highlight=False)
     run, results = outcome.run, outcome.results
     console.print(said(outcome), soft_wrap=True)
+    if partial := run.manifest.get("partial"):
+        console.print(f"on a part of the data: {partial}", style="yellow", soft_wrap=True)
     if changed := run.changed_sources:
         console.print(older_code(run, changed), style="yellow", soft_wrap=True)
     console.print(metrics_table(results))

@@ -211,6 +211,7 @@ def summary(setup: Setup, study: Study) -> None:
     from rich.console import Console
     from rich.text import Text
 
+    from memmlp.pipeline.run import partial_words
     from memmlp.search.board import counts, figures, row, trials_table
     from memmlp.search.results import importances
 
@@ -225,6 +226,9 @@ def summary(setup: Setup, study: Study) -> None:
     if found := importances(study):
         click.echo("importance: " + ", ".join(f"{key} {share:.2f}" for key, share in found))
     click.echo(counts(study))
+    experiment = _experiments(setup, {})[0]
+    if part := partial_words(experiment, experiment.data.prepare()):
+        click.echo(f"on a part of the data: {part}")
     click.echo(f"in {setup.folder}")
     if best:
         words = " ".join(setup.words)

@@ -29,4 +29,5 @@ def build_motion(cfg: DictConfig) -> MotionSource:
 
     split = built(data.split)
     source = ClipFolder(root, split, str(data.body), data.min_frames, data.strict)
-    return MotionSource(source, generate, Path(cfg.paths.outputs) / "cache")
+    caches = Path(cfg.paths.outputs) / "cache"
+    return MotionSource(source, generate, caches, partial=data.get("partial", False))

@@ -59,7 +59,8 @@ def open_found(run: Run, device_name: str = "cpu", overrides: Sequence[str] = ()
     if trained_by(run.config) != trained_by(experiment.config):
         words = ", ".join(overrides)
         raise InputError(f"{words}: changes the training; allowed are keys of evaluation and export")
-    data = experiment.data.prepare()
+    # What it was trained on may be looked at, however much of its list that is: the digest proves it.
+    data = replace(experiment.data, partial=True).prepare()
     if data.digest != run.manifest["data"]:
         root = experiment.data.source.root
         raise InputError(f"run {run.id}: its data has changed since (data.root={root})")

@@ -68,7 +68,7 @@ def planned(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
     path = sweep_folder(sweep, outputs) / "planned.json"
     stamp = _stamp(sweep, outputs)
     kept = read_json(path)
-    if kept.get("stamp") == stamp and all(_fresh(data) for data in kept["data"]):
+    if kept.get("stamp") == stamp and all(_fresh(data, prepare) for data in kept["data"]):
         return Plan.load(path.with_name("plan.json"))
     plan, data = _plan(sweep, outputs, prepare)
     plan.save(path.with_name("plan.json"))
@@ -153,15 +153,16 @@ def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[st
     return known[key]["digest"]
 
 
-def _fresh(data: dict[str, Any]) -> bool:
-    """Return whether the data that a kept plan relies on is unchanged."""
+def _fresh(data: dict[str, Any], prepare: bool) -> bool:
+    """Return whether the data that a kept plan relies on is unchanged, and if `prepare`, fit to train on."""
     from omegaconf import OmegaConf
 
     from memmlp.config.build_motion import build_motion
 
     cfg: DictConfig = OmegaConf.create(data["config"])
     try:
-        return build_motion(cfg).digest() == data["digest"]
+        motion = build_motion(cfg)
+        return (motion.prepare().digest if prepare else motion.digest()) == data["digest"]
     except InputError:
         return False
 

@@ -97,6 +97,8 @@ def finish(experiment: Experiment, run: Run, data: Prepared) -> list[str]:
         The names of the stages that were made.
     """
     made = []
+    if "partial" not in run.manifest:  # a run from before this was recorded
+        run.write_manifest({"partial": partial_words(experiment, data)})
     missing = [mode for mode, identity in experiment.evaluations.items() if not run.has(identity)]
     if missing:
         evaluate_run(experiment, run, data, missing)
@@ -135,6 +137,7 @@ def vqvae_run(experiment: Experiment, data: Prepared) -> Run:
         if run.done:
             return run
         begin(experiment, run, identity, experiment.vqvae.config)
+        run.write_manifest({"partial": partial_words(experiment, data)})
         with timed(run, "train"):
             errors = experiment.vqvae.train(experiment.architecture, data, run, experiment.device)
         write_json(run.results_path, {"val": errors})
@@ -148,7 +151,7 @@ def train_run(
 ) -> None:
     """Train the network of a run, and mark the run as done."""
     begin(experiment, run, experiment.identity(data.digest), experiment.config)
-    run.write_manifest({"body": data.manifest.body})
+    run.write_manifest({"body": data.manifest.body, "partial": partial_words(experiment, data)})
     run.clear_stages()
     weights = codes.weights() if codes else None
     with timed(run, "train"):
@@ -166,7 +169,8 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
         model = experiment.architecture.load(run.weights()).to(experiment.device)
         test = data.open("test").to(experiment.device)
         for mode in modes:
-            settings, name = evaluation_settings(experiment.config, mode), experiment.evaluations[mode]
+            settings = evaluation_settings(experiment.config, mode, experiment.data.grouped)
+            name = experiment.evaluations[mode]
             report = {"mode": mode, "run": run.manifest["id"], "name": name, "settings": settings}
             report |= {"recipes": evaluation_recipes(settings), **machine(experiment)}
             write_report(run.evaluation(name), report | experiment.evaluation.report(model, test, mode))
@@ -193,6 +197,12 @@ def begin(experiment: Experiment, run: Run, identity: Identity, config: dict[str
     above = identity.upstream.id if identity.upstream else None
     facts = {"recipes": identity.recipes, "what": identity.what, **machine(experiment)}
     run.begin(identity.kind, config, data=identity.data, upstream=above, **facts)
+
+
+def partial_words(experiment: Experiment, data: Prepared) -> str | None:
+    """Return in words which part of its list the data is; None where it is all of it."""
+    coverage = data.manifest.coverage
+    return None if coverage.whole else f"{experiment.config['data']['name']}, {coverage}"
 
 
 def machine(experiment: Experiment) -> dict[str, Any]:

@@ -296,7 +296,8 @@ def _runs(entries: Sequence[ReportedRun]) -> str:
         differing = [f"{k}={entry.config.get(k, '-')}" for k in keys if entry.config.get(k) != common.get(k)]
         code = origin.code + (" + changes" if origin.changed else "")
         when = str(manifest.get("started", "-"))[:16].replace("T", " ")
-        row = [entry.measured.id, when, minutes, code, origin.data, "; ".join(differing) or "-"]
+        known = f"{origin.data} ({origin.partial})" if origin.partial else origin.data
+        row = [entry.measured.id, when, minutes, code, known, "; ".join(differing) or "-"]
         rows.append([*row, "; ".join(entry.places)])
     head = (
         "run",

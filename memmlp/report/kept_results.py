@@ -185,7 +185,10 @@ def _record(run: Measured) -> dict[str, Any]:
         for mode, branches in run.means.items()
     }
     costs = {name: _short(cost) for name, cost in run.costs.items()}
-    return {"origin": plain(asdict(run.origin)), "clips": _clips_key(run), "costs": costs, "errors": errors}
+    origin = plain(asdict(run.origin))
+    if run.origin.partial is None:
+        del origin["partial"]
+    return {"origin": origin, "clips": _clips_key(run), "costs": costs, "errors": errors}
 
 
 def _clips(run: Measured) -> list[list[str]]:

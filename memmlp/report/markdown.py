@@ -86,6 +86,7 @@ def origin_words(kept: Kept) -> str:
     for attribute, what in ORIGIN.items():
         values = sorted({str(getattr(run.origin, attribute)) for run in kept.every} - {UNKNOWN})
         parts += [f"{what} {escaped(' and '.join(values))}"] if values else []
+    parts += sorted({escaped(run.origin.partial) for run in kept.every if run.origin.partial})
     recipes = _recipes(kept.every)
     parts += [f"recipes {recipes}"] if recipes else []
     return f"`{kept.command}`: {', '.join(parts)}."

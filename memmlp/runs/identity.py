@@ -105,9 +105,9 @@ def run_id(kind: str, config: Mapping[str, Any], *, data: str, upstream: str | N
     return _digest(what | {"recipes": recipes(list(trained_components(kind, config)))})
 
 
-def evaluation_id(config: Mapping[str, Any], mode: str) -> str:
+def evaluation_id(config: Mapping[str, Any], mode: str, grouped: str | None = None) -> str:
     """Return the identity of a run's evaluation in a mode: a word and 16 hex digits."""
-    return evaluation_name(evaluation_settings(config, mode))
+    return evaluation_name(evaluation_settings(config, mode, grouped))
 
 
 def evaluation_name(settings: Mapping[str, Any]) -> str:
@@ -123,16 +123,19 @@ def evaluation_recipes(settings: Mapping[str, Any]) -> dict[str, int]:
     return recipes(["metrics", f"mode.{settings['mode']}", *solver])
 
 
-def evaluation_settings(config: Mapping[str, Any], mode: str) -> dict[str, Any]:
-    """Return the settings that an evaluation's result follows from, beside the run and its data."""
+def evaluation_settings(config: Mapping[str, Any], mode: str, grouped: str | None = None) -> dict[str, Any]:
+    """Return the settings that an evaluation's result follows from, beside the run and its data.
+
+    `grouped` is a digest of the column file that says which clips belong together; None without one.
+    """
     group = config.get("evaluation", {})
     ik = group.get("ik", "off")
     solver = {"ik": ik} | ({"ik_iterations": group.get("ik_iterations")} if ik != "off" else {})
-    groups = ((config.get("data") or {}).get("split") or {}).get(
-        "groups"
-    )  # its rows say who belongs together
+    patterns = ((config.get("data") or {}).get("split") or {}).get("groups")
+    # A report's rows say who belongs together.
+    groups = {key: value for key, value in {"groups": patterns, "groups_file": grouped}.items() if value}
     drawn = {"batch": group.get("batch")} if inference(config).get("memory.blend") == "sampled" else {}
-    return {"mode": mode, **solver, **inference(config), **({"groups": groups} if groups else {}), **drawn}
+    return {"mode": mode, **solver, **inference(config), **groups, **drawn}
 
 
 def deployment_id(config: Mapping[str, Any]) -> str:

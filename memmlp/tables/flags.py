@@ -48,6 +48,7 @@ def flags(
     yield from _no_numbers(sweep, runs)
     for attribute, what in ORIGIN.items():
         yield from _differing(what, [(getattr(run.origin, attribute), label) for label, run in every])
+    yield from _partial(every)
     yield from _recipes(every)
     changed = [label for label, run in every if run.origin.changed]
     if changed:
@@ -166,6 +167,12 @@ def _differing(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:
     if len(groups) > 1:
         parts = [f"{value} of {_quoted(labels)}" for value, labels in groups.items()]
         yield f"{what} differs: {'; '.join(parts)}"
+
+
+def _partial(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
+    """Flag runs on a part of their protocol's list."""
+    for part in _unique(run.origin.partial for _, run in every if run.origin.partial):
+        yield f"{part}, and no more: {_quoted(label for label, run in every if run.origin.partial == part)}"
 
 
 def _recipes(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:

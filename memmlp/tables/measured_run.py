@@ -38,6 +38,7 @@ class Origin:
         body: whose rest joints the motion is on: "builtin" or the file of a body model.
         recipes: the recipe number of each component.
         vqvae: the id of the VQ-VAE's run; None where there is none.
+        partial: which part of its protocol's list the data is, in words; None where it is all of it.
     """
 
     code: str
@@ -52,6 +53,7 @@ class Origin:
     body: str = UNKNOWN
     recipes: Mapping[str, int] = field(default_factory=dict)
     vqvae: str | None = None
+    partial: str | None = None
 
 
 @dataclass(frozen=True)
@@ -199,6 +201,7 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
         body=of("body"),
         recipes=manifest.get("recipes") or {},
         vqvae=manifest.get("upstream"),
+        partial=manifest.get("partial"),
     )
 
 

@@ -30,6 +30,8 @@ def show_manifest(manifest: Manifest) -> None:
         f"{len(manifest.clips)} clips; skipped {len(manifest.skipped)}, left out by the split {left_out}, "
         f"listed but missing {len(manifest.missing)}; body {manifest.body}"
     )
+    if not manifest.coverage.whole:
+        click.echo(f"{manifest.coverage}: {manifest.coverage.gaps}")
 
 
 def show_rates(clips: tuple[ClipRecord, ...]) -> None:

@@ -14,6 +14,7 @@ from memmlp.config.schema.rules import (
     fraction,
     key,
     one_of,
+    optional,
     positive,
     target,
 )
@@ -31,6 +32,7 @@ class SeededSplitConfig:
     val: float = fraction()
     seed: int = at_least(0)
     groups: list[str] = key(EachOf(empty=True))
+    groups_file: Optional[str] = optional(Existing("file"))
 
 
 @dataclass
@@ -41,6 +43,7 @@ class ListSplitConfig:
     val: float = fraction()
     seed: int = at_least(0)
     groups: list[str] = key(EachOf(empty=True))
+    groups_file: Optional[str] = optional(Existing("file"))
 
 
 @dataclass
@@ -52,6 +55,7 @@ class SubsetSplitConfig:
     val: float = fraction()
     seed: int = at_least(0)
     groups: list[str] = key(EachOf(empty=True))
+    groups_file: Optional[str] = optional(Existing("file"))
 
 
 @dataclass
@@ -89,6 +93,7 @@ class SeededDataConfig(DataConfig):
 class ListDataConfig(DataConfig):
     root: str = key(Existing("folder"))
     synth: Optional[SynthConfig] = None
+    partial: bool = False
     split: ListSplitConfig = field(default_factory=ListSplitConfig)
 
 
@@ -96,4 +101,5 @@ class ListDataConfig(DataConfig):
 class SubsetDataConfig(DataConfig):
     root: str = key(Existing("folder"))
     synth: Optional[SynthConfig] = None
+    partial: bool = False
     split: SubsetSplitConfig = field(default_factory=SubsetSplitConfig)

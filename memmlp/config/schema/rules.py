@@ -108,6 +108,11 @@ def key(rule: object = None) -> Any:
     return field(default=MISSING, metadata={"rule": rule})
 
 
+def optional(rule: object = None) -> Any:
+    """Declare a key that may be null, as it is in runs from before there was the key."""
+    return field(default=None, metadata={"rule": rule})
+
+
 def target(path: str) -> Any:
     """Declare the class that an option of a slot stands for, which nobody can change."""
     return field(default=path, metadata={"rule": OneOf((path,))})

@@ -27,7 +27,7 @@ from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest, write_manifest
 from memmlp.motion.preparing.splits import PARTS, Split
-from memmlp.motion.preparing.survey import Survey, clip_name, load, sources, survey
+from memmlp.motion.preparing.survey import Survey, load, sources, survey
 from memmlp.runs.recipes import RECIPES
 
 FRAMES = 1  # number of a frame's content; a new one changes every digest, and so makes every run again
@@ -92,9 +92,11 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
     found = survey(source.root, source.min_frames, source.strict)
     if not found.clips:
         raise InputError(_no_clips(source.root, found))
-    names, bad = [clip.name for clip in found.clips], [clip_name(file.file) for file in found.skipped]
-    assignment = source.split.assign(names)
-    source.split.grouping.check([name for name, part in assignment.parts.items() if part], [*names, *bad])
+    names, split = [clip.name for clip in found.clips], source.split
+    assignment = split.assign(names)
+    every = [*names, *found.short, *found.damaged]
+    split.grouping.check([name for name, part in assignment.parts.items() if part], every)
+    missing = split.missing(every)
     clips = _place(found.clips, assignment.parts, assignment.groups)
     if not any(clip.split == "train" for clip in clips):
         raise InputError(f"{source.root}: no clip for training (data.root, data.split); give it other data")
@@ -103,13 +105,15 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
         request=request,
         body=_body(source.body, rest),
         rest_joints=tuple(map(tuple, rest.tolist())),
-        split=source.split.describe(),
+        split=split.describe(),
         min_frames=source.min_frames,
         clips=clips,
         skipped=found.skipped,
         ignored=found.ignored,
         left_out=_left_out(assignment.parts),
-        missing=source.split.missing([*names, *bad]),
+        listed=dict(split.listed),
+        missing=missing,
+        damaged=tuple(sorted(set(split.missing([*names, *found.short])) - set(missing))),
         totals={part: _total(clips, part) for part in PARTS},
     )
     _write(source, rest, manifest, out)

@@ -8,6 +8,8 @@ is told by patterns, by a column file, or by both: two clips that match the same
 from __future__ import annotations
 
 import csv
+import hashlib
+import json
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -41,6 +43,13 @@ class Grouping:
             InputError: if the file can't be read, naming the line that is wrong.
         """
         return cls(tuple(patterns), read_groups(Path(file)) if file else None, Path(file) if file else None)
+
+    @property
+    def digest(self) -> str | None:
+        """A digest of what the column file says; None without a file."""
+        if self.rows is None:
+            return None
+        return hashlib.sha256(json.dumps(sorted(self.rows.items())).encode()).hexdigest()
 
     def check(self, names: Collection[str], files: Iterable[str]) -> None:
         """Check that the column file has all clips to be split, and no others than those with a file.

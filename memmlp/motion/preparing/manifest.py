@@ -13,8 +13,9 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
 from memmlp.motion.clip import Skipped
+from memmlp.motion.preparing.coverage import Coverage
 
-FORMAT = 2  # number of the cache's format; a new one makes every cache again
+FORMAT = 3  # number of the cache's format; a new one makes every cache again
 MANIFEST = "manifest.json"
 
 
@@ -60,7 +61,9 @@ class Manifest:
         skipped: bad files.
         ignored: number of npz files without poses (shape.npz and the like).
         left_out: number of sound clips without a part in the split, by top-level folder.
+        listed: number of the split's entries (list entries, subsets) by subset; empty where it has no list.
         missing: entries of the split for which there is no file.
+        damaged: entries of the split whose file is no sound clip; a clip that is too short is not among them.
         totals: part -> clips, frames, hours.
         format: format number of the cache.
     """
@@ -75,7 +78,9 @@ class Manifest:
     skipped: tuple[Skipped, ...]
     ignored: int
     left_out: dict[str, int]
+    listed: dict[str, int]
     missing: tuple[str, ...]
+    damaged: tuple[str, ...]
     totals: dict[str, dict[str, float]]
     format: int = FORMAT
 
@@ -94,7 +99,7 @@ class Manifest:
             data["clips"] = tuple(ClipRecord(**clip) for clip in data["clips"])
             data["skipped"] = tuple(Skipped(**file) for file in data["skipped"])
             data["rest_joints"] = tuple(map(tuple, data["rest_joints"]))
-            return cls(**{**data, "missing": tuple(data["missing"])})
+            return cls(**{**data, **{name: tuple(data[name]) for name in ("missing", "damaged")}})
         except FileNotFoundError as error:
             raise InputError(f"{out}: no finished cache; run memmlp data prepare") from error
         except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
@@ -109,6 +114,11 @@ class Manifest:
     def groups(self) -> dict[str, str]:
         """clip name -> its group; statistics count a group once."""
         return {clip.name: clip.group for clip in self.clips}
+
+    @property
+    def coverage(self) -> Coverage:
+        """How much there is of what the split lists."""
+        return Coverage.of(self.listed, (*self.missing, *self.damaged))
 
     def part(self, split: str) -> list[ClipRecord]:
         """Return the clips of a split, in the order of its array."""

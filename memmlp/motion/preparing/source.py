@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, NamedTuple
 from filelock import FileLock
 
 from memmlp.motion.preparing.cache import ClipFolder, finished, prepare
+from memmlp.motion.preparing.coverage import Coverage
 from memmlp.motion.preparing.manifest import Manifest
+from memmlp.motion.preparing.survey import clip_name, sources
 
 if TYPE_CHECKING:
     from memmlp.motion.dataset import MotionDataset
@@ -49,26 +51,49 @@ class MotionSource:
         source: the folder of clips, its split and body.
         generate: makes a synthetic folder; None for the user's own.
         caches: folder of all caches.
+        partial: whether a part of what the split lists will do.
     """
 
     source: ClipFolder
     generate: Callable[[Path], object] | None
     caches: Path
+    partial: bool = False
 
     @property
     def cache(self) -> Path:
         """The folder of the cache, one for each source, split and body."""
-        key = repr(replace(self.source, root=self.source.root.resolve()))
+        key = repr(replace(self.source, root=self.source.root.resolve())) + (self.grouped or "")
         return self.caches / f"{self.source.root.name}-{hashlib.sha256(key.encode()).hexdigest()[:8]}"
 
+    @property
+    def grouped(self) -> str | None:
+        """A digest of the column file that says which clips belong together; None without one."""
+        return self.source.split.grouping.digest
+
     def prepare(self) -> Prepared:
-        """Return the cache with its manifest; it is made if it is missing or out of date."""
+        """Return the cache with its manifest; it is made if it is missing or out of date.
+
+        Raises:
+            InputError: if the cache can't be made, or if, without `partial`, an entry of the split's list has
+                no clip. A missing file is said before any is read.
+        """
         if self.generate is not None and not self.source.root.exists():
             self.source.root.parent.mkdir(parents=True, exist_ok=True)
             with FileLock(self.source.root.with_name(f".{self.source.root.name}.lock")):
                 if not self.source.root.exists():  # no other process made it while this one waited
                     self._generate(self.generate)
-        return Prepared(self.cache, prepare(self.source, self.cache))
+        if not self.partial:
+            self._listed().check(self.source.root)
+        found = Prepared(self.cache, prepare(self.source, self.cache))
+        if not self.partial:
+            found.manifest.coverage.check(self.source.root)
+        return found
+
+    def _listed(self) -> Coverage:
+        """Return how many entries of the split have a file, whatever is in it."""
+        split = self.source.split
+        names = [clip_name(file) for file in sources(self.source.root)] if split.listed else []
+        return Coverage.of(split.listed, split.missing(names))
 
     def digest(self) -> str | None:
         """Return the digest of the prepared data; None if the cache is missing or out of date."""

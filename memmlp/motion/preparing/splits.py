@@ -54,7 +54,7 @@ class Split(Protocol):
         """Return the part and the group of every name; raises InputError if the split is impossible."""
         ...
 
-    def missing(self, names: Iterable[str]) -> tuple[str, ...]:
+    def missing(self, names: Collection[str]) -> tuple[str, ...]:
         """Return the entries of the split (list entries, subsets) that none of the names fits."""
         ...
 
@@ -112,7 +112,7 @@ class SeededSplit(_Grouped):
         parts = _divide(seen, fractions, self.seed, self.grouping)
         return Assignment(parts, self.grouping.names(seen))
 
-    def missing(self, names: Iterable[str]) -> tuple[str, ...]:
+    def missing(self, names: Collection[str]) -> tuple[str, ...]:
         return ()
 
     @property
@@ -158,7 +158,7 @@ class ListSplit(_Grouped):
         missing = tuple(sorted(set(self.entries) - set(fits.values())))
         return _carved(parts, seen, self, missing)
 
-    def missing(self, names: Iterable[str]) -> tuple[str, ...]:
+    def missing(self, names: Collection[str]) -> tuple[str, ...]:
         return tuple(sorted(set(self.entries) - set(_fits(self.entries, names).values())))
 
     @property
@@ -204,7 +204,7 @@ class SubsetSplit(_Grouped):
         _check_once(name for name, part in parts.items() if part)
         return _carved(parts, {name: unpacked(name) for name in names}, self, self.missing(names))
 
-    def missing(self, names: Iterable[str]) -> tuple[str, ...]:
+    def missing(self, names: Collection[str]) -> tuple[str, ...]:
         present = set(map(subset, names))
         return tuple(name for name in (*self.train, *self.test) if subset(name) not in present)
 
@@ -218,12 +218,8 @@ class SubsetSplit(_Grouped):
 
 def _carving(split: SeededSplit | ListSplit | SubsetSplit) -> dict[str, Any]:
     """Return the settings that every split has."""
-    rows = split.grouping.rows
-    file = (
-        {}
-        if rows is None
-        else {"groups_file_sha256": hashlib.sha256(json.dumps(sorted(rows.items())).encode()).hexdigest()}
-    )
+    digest = split.grouping.digest
+    file = {"groups_file_sha256": digest} if digest else {}
     return {"val": split.val, "seed": split.seed, "groups": list(split.groups), **file}
 
 
@@ -285,7 +281,7 @@ def _rank(name: str, seed: int) -> str:
     return hashlib.sha256(json.dumps([seed, name]).encode()).hexdigest()
 
 
-def _fits(entries: Collection[str], names: Iterable[str]) -> dict[str, str]:
+def _fits(entries: Collection[str], names: Collection[str]) -> dict[str, str]:
     """Map clips to the entries that they fit: by name, else by the name in another release of AMASS.
 
     Raises:

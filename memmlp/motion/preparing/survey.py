@@ -24,11 +24,22 @@ class Survey:
         clips: sound clips, without split and group yet.
         skipped: bad files.
         ignored: number of npz files without motion.
+        short: names of those of the bad files that are sound clips of too few frames.
     """
 
     clips: tuple[ClipRecord, ...]
     skipped: tuple[Skipped, ...]
     ignored: int
+    short: tuple[str, ...] = ()
+
+    @property
+    def damaged(self) -> tuple[str, ...]:
+        """Names of the bad files that are no sound clips."""
+        return tuple(name for file in self.skipped if (name := clip_name(file.file)) not in self.short)
+
+
+class TooShort(InputError):
+    """A sound clip has too few frames."""
 
 
 def survey(root: Path, min_frames: int = 2, strict: bool = False) -> Survey:
@@ -37,7 +48,7 @@ def survey(root: Path, min_frames: int = 2, strict: bool = False) -> Survey:
     Raises:
         InputError: if there are none, or at the first bad one if `strict`.
     """
-    clips, skipped, ignored = [], [], 0
+    clips, skipped, short, ignored = [], [], [], 0
     for file in progress_bar(sources(root), "reading"):
         path = root / file
         if _has_no_poses(path):
@@ -49,7 +60,8 @@ def survey(root: Path, min_frames: int = 2, strict: bool = False) -> Survey:
             if strict:
                 raise
             skipped.append(Skipped(file, str(error).removeprefix(f"{path}: ")))
-    return Survey(tuple(clips), tuple(skipped), ignored)
+            short += [clip_name(file)] if isinstance(error, TooShort) else []
+    return Survey(tuple(clips), tuple(skipped), ignored, tuple(short))
 
 
 def sources(root: Path) -> list[str]:
@@ -78,7 +90,7 @@ def _inspect(path: Path, file: str, min_frames: int) -> ClipRecord:
     name = clip_name(file)
     clip, fps, how = load(path, name)
     if len(clip) < min_frames:
-        raise InputError(f"{path}: {len(clip)} frames at {FPS} Hz, fewer than {min_frames} (data.min_frames)")
+        raise TooShort(f"{path}: {len(clip)} frames at {FPS} Hz, fewer than {min_frames} (data.min_frames)")
     with open(path, "rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
     return ClipRecord(name, "", "", 0, len(clip) - 1, digest, fps, how)

@@ -1,0 +1,84 @@
+"""A protocol whose list isn't all there, as a person meets it: refused, or said wherever its runs are shown."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from command_line import run
+
+from memmlp.config.compose import composed
+from memmlp.config.motion import build_motion
+from memmlp.motion.clip import Clip
+from memmlp.motion.formats.npz import write_clip
+from memmlp.runs.lookup import list_runs
+
+TINY = ["profile=tiny", "tracking=none", "threads=1", "optim.steps=6", "memory=none", "data.split.val=0.2"]
+S1 = ["data=amass_s1", "data.root=amass", "data.split.folder=lists"]
+PART = "amass_s1, 87 % of the list (7 of 8 entries)"
+REFUSED = "data.root: 1 of 8 entries of the split's list have no clip (MPI_HDM05 1 of 4) below amass"
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """A folder with lists of two subsets, all clips of which are there but one, and a sweep."""
+    rng = np.random.default_rng(0)
+    for subset, now in (("CMU", "CMU"), ("MPI_HDM05", "HDM05")):
+        lists = tmp_path / "lists" / subset
+        lists.mkdir(parents=True)
+        entries = [f"{subset}/0{n}/take_poses.npz\n" for n in range(1, 5)]
+        (lists / "train_split.txt").write_text("".join(entries[:3]))
+        (lists / "test_split.txt").write_text(entries[3])
+        for n in range(1, 5):
+            poses = 0.05 * np.cumsum(rng.normal(size=(90, 22, 3)), 0)
+            clip = Clip("", poses, 0.01 * np.cumsum(rng.normal(size=(90, 3)), 0), 60.0)
+            write_clip(tmp_path / "amass" / now / f"0{n}" / "take_stageii.npz", clip)
+    (tmp_path / "amass" / "HDM05" / "02" / "take_stageii.npz").unlink()
+    (tmp_path / "s1.yaml").write_text(yaml.safe_dump({"arms": {"none": []}, "base": ["memory=none"]}))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["train", *TINY], ["sweep", "s1.yaml", *TINY, "--workers", "1"], ["tune", *TINY, "loss=manual"]],
+)
+def test_a_missing_clip_stops_whatever_trains_with_one_line(home, command):
+    said = run(home, *command, *S1, code=2)
+    assert said == f"memmlp: {REFUSED}; data.partial=true takes the part there is\n"
+    assert not list_runs(home / "outputs")
+
+
+def test_a_plan_that_was_made_for_a_look_is_no_way_round(home):
+    with contextlib.chdir(home):
+        build_motion(composed([*S1, "data.split.val=0.2", "data.partial=true"])).prepare()
+    words = ["sweep", "s1.yaml", *TINY, *S1]
+    assert "prepared" not in run(home, *words, "--status")  # the plan is kept
+    assert REFUSED in run(home, *words, "--workers", "1", code=2)
+
+
+def test_data_prepare_shows_the_gap(home):
+    said = run(home, "data", "prepare", "amass", "--split", "lists:lists", "--val", "0.2", "--out", "cache")
+    assert "87 % of the list (7 of 8 entries): 1 of 8 entries" in " ".join(said.split())
+    assert "87 % of the list" in run(home, "data", "inspect", "cache")
+
+
+@pytest.mark.slow
+def test_a_run_on_a_part_says_so_wherever_it_is_shown(home):
+    words = [*TINY, *S1, "data.partial=true"]
+    assert PART in run(home, "train", *words)
+    (made,) = list_runs(home / "outputs")
+    assert made.manifest["partial"] == PART
+    for command in (["train", *words], ["runs", "show", made.id], ["eval", made.id]):
+        assert PART in " ".join(run(home, *command).split())
+    flag = f"{PART}, and no more: 'none'"
+    for command in (["sweep"], ["table"]):
+        assert flag in " ".join(run(home, *command, "s1.yaml", *words).split())
+    run(home, "report", "s1.yaml", *words, "--out", "report.html")
+    assert (home / "report.html").read_text().count("87 % of the list") == 2
+    run(home, "results", "save", "s1.yaml", *words, "--out", "kept")
+    (record,) = json.loads((home / "kept" / "s1.json").read_text())["runs"].values()
+    assert record["origin"]["partial"] == PART
