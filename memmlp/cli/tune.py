@@ -211,7 +211,7 @@ def summary(setup: Setup, study: Study) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    from memmlp.pipeline.run import partial_words
+    from memmlp.pipeline.run_stages import partial_words
     from memmlp.search.board import counts, figures, row, trials_table
     from memmlp.search.results import importances
 

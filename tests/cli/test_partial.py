@@ -1,4 +1,4 @@
-"""A protocol whose list isn't all there, as a person meets it: refused, or said wherever its runs are shown."""
+"""A protocol whose list isn't all there: refused, or said wherever its runs are shown."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import pytest
 import yaml
 from command_line import run
 
+from memmlp.config.build_motion import build_motion
 from memmlp.config.compose import composed
-from memmlp.config.motion import build_motion
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.npz import write_clip
 from memmlp.runs.lookup import list_runs
