@@ -140,8 +140,11 @@ def npz_frames(path: Path) -> np.ndarray:
     from memmlp.motion.clip import resample
     from memmlp.motion.features import motion_frames
     from memmlp.motion.formats.npz import read_clip
+    from memmlp.motion.plausible import check_plausible
 
-    clip, _ = resample(read_clip(path, path.stem))
+    recorded = read_clip(path, path.stem)
+    check_plausible(path, recorded)
+    clip, _ = resample(recorded)
     if len(clip) < 3:
         raise InputError(f"{path}: {len(clip)} frames at 60 Hz; allowed are 3 or more")
     tensors = (torch.tensor(part) for part in (clip.poses, clip.trans, builtin_rest_joints()))

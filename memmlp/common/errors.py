@@ -1,11 +1,24 @@
 """The errors that the command line turns into one line and an exit code."""
 
+import unicodedata
+
+BREAKING = ("Cc", "Cs", "Zl", "Zp")  # Unicode's controls, surrogates, separators of lines and of paragraphs
+
+
+def one_line(text: str) -> str:
+    r"""Return the text with every character that would break its line or a terminal as an escape, like \n."""
+    return "".join(repr(c)[1:-1] if unicodedata.category(c) in BREAKING else c for c in text)
+
 
 class InputError(ValueError):
     """Bad user input, told in one line that names the file or key, what is wrong and what is allowed.
 
-    The command line prints it without a traceback and exits with code 2.
+    The command line prints it without a traceback and exits with code 2. Its message is one line, even
+    if the name of a file in it has a line feed.
     """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(one_line(message))
 
 
 class TrainingDiverged(RuntimeError):

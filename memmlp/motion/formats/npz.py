@@ -1,9 +1,21 @@
-"""Reads and writes motion clips as AMASS npz."""
+"""Reads and writes motion clips as npz of the SMPL family, in AMASS' layout.
+
+Read are the first 22 joints, which all its bodies share, as rotation vectors in radians, Z up, metres:
+
+| body | rotations |
+|---|---|
+| SMPL+H (AMASS' first release) | `poses` (N, 156) |
+| SMPL-X (AMASS' second, `_stageii`) | `poses` (N, 165), and in parts as below |
+| SMPL | `poses` (N, 72) |
+| the body's joints alone | `poses` (N, 66), or any of the above as (N, J, 3) |
+| parts as human_body_prior names them | `root_orient` (N, 3), `pose_body` (N, 63) |
+| parts as the smplx package names them | `global_orient` (N, 3), `body_pose` (N, 63 or 69) |
+
+The translation is `trans` or `transl` (N, 3); the frame rate `mocap_framerate`, `mocap_frame_rate` or `fps`.
+"""
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -11,54 +23,72 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.motion.body import N_JOINTS
 from memmlp.motion.clip import FRAME_RATE_RANGE, Clip
+from memmlp.motion.formats.archive import Npz, brief, open_npz
 
 SMPLH_POSE_DIM = 156
-FRAME_RATE_KEYS = ("mocap_framerate", "mocap_frame_rate")  # SMPL+H and SMPL-X releases
-# The exceptions that NumPy and zipfile raise on damaged bytes.
-DAMAGE = (
-    OSError, ValueError, EOFError, KeyError, AttributeError, TypeError, IndexError, MemoryError,
-    NotImplementedError, SyntaxError, RuntimeError, OverflowError, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
+BODY_DIM = 3 * N_JOINTS
+# Arrays that hold the rotations, side by side, and how many of their columns are read.
+LAYOUTS: tuple[dict[str, int], ...] = (
+    {"poses": BODY_DIM},
+    {"root_orient": 3, "pose_body": BODY_DIM - 3},
+    {"global_orient": 3, "body_pose": BODY_DIM - 3},
+)
+TRANSLATIONS = ("trans", "transl")
+FRAME_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
+FARTHEST = 1e4  # metres from the origin
+
+
+class NoMotion(InputError):
+    """A sound npz of something else than motion, such as AMASS' shape.npz."""
 
 
 def read_clip(path: Path, name: str) -> Clip:
-    """Read an SMPL+H or SMPL-X AMASS npz, without ever unpickling.
+    """Read a clip of the SMPL family, without ever unpickling, in bounded memory (`formats.archive`).
 
     Args:
         path: the file.
         name: the clip's name.
 
     Raises:
-        InputError: if the file is damaged, of the wrong shapes, empty, or not finite; the message names it.
+        NoMotion: if it is a sound npz without rotations.
+        InputError: if the file is damaged, of the wrong shapes, empty, too large, or not finite; the message
+            names it. Whether it is a person's motion is another question (`motion.plausible`).
     """
-    try:
-        # The file is opened here, since np.load does not close one that is no zip.
-        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
-            missing = {"poses", "trans"} - set(file.files)
-            rate_key = next((key for key in FRAME_RATE_KEYS if key in file.files), None)
-            if missing or rate_key is None:
-                keys = ", ".join(sorted(missing) or [FRAME_RATE_KEYS[0]])
-                raise InputError(f"{path}: no {keys} in it, so it is no AMASS motion")
-            poses, trans, rate = file["poses"], file["trans"], file[rate_key]
-    except InputError:
-        raise
-    except DAMAGE as error:
-        raise InputError(f"{path}: not a readable npz ({_brief(error)})") from error
-    fps = _frame_rate(path, rate)
-    if poses.ndim != 2 or poses.shape[1] < 3 * N_JOINTS or not np.issubdtype(poses.dtype, np.floating):
-        raise InputError(f"{path}: poses is {poses.dtype} {poses.shape}, not floats (N, >= {3 * N_JOINTS})")
-    if trans.shape != (len(poses), 3) or not np.issubdtype(trans.dtype, np.floating):
-        raise InputError(f"{path}: trans is {trans.dtype} {trans.shape}, not floats ({len(poses)}, 3)")
-    if len(poses) == 0:
-        raise InputError(f"{path}: no frames")
-    body = poses[:, : 3 * N_JOINTS].astype(np.float64)
-    trans = trans.astype(np.float64)
+    with open_npz(path) as file:
+        layout, trans_key, rate_key = _keys(file)
+        parts = [file.columns(key, count, exact=count == 3) for key, count in layout.items()]
+        trans = file.columns(trans_key, 3, exact=True)
+        fps = _frame_rate(path, file.scalar(rate_key))
+    lengths = {len(part) for part in (*parts, trans)}
+    if len(lengths) > 1:
+        keys = ", ".join((*layout, trans_key))
+        raise InputError(f"{path}: {keys} have different lengths, {sorted(lengths)}")
+    body = np.concatenate(parts, 1) if len(parts) > 1 else parts[0]
+    _check_numbers(path, body, trans)
+    return Clip(name, body.reshape(-1, N_JOINTS, 3), trans, fps)
+
+
+def _keys(file: Npz) -> tuple[dict[str, int], str, str]:
+    """Return the layout of a file, and its keys of translation and frame rate."""
+    if not any(key in file.names for layout in LAYOUTS for key in layout):
+        raise NoMotion(f"{file.path}: no poses in it, so it is no motion")
+    layout = next((layout for layout in LAYOUTS if set(layout) <= file.names), None)
+    trans = next((key for key in TRANSLATIONS if key in file.names), None)
+    rate = next((key for key in FRAME_RATES if key in file.names), None)
+    if layout is None or trans is None or rate is None:
+        found = {"poses": layout, "trans": trans, "mocap_framerate": rate}
+        missing = ", ".join(key for key, value in found.items() if value is None)
+        raise InputError(f"{file.path}: no {missing} in it, so it is no AMASS motion")
+    return layout, trans, rate
+
+
+def _check_numbers(path: Path, body: np.ndarray, trans: np.ndarray) -> None:
+    """Raise InputError for numbers that are not finite or beyond all bounds."""
     bad = ~(np.isfinite(body).all(1) & np.isfinite(trans).all(1))
     if bad.any():
         raise InputError(f"{path}: NaN or Inf in {bad.sum()} frames, first in frame {bad.argmax()}")
-    if np.abs(trans).max() > 1e4 or np.abs(body).max() > 1e4:
-        raise InputError(f"{path}: values beyond 1e4, so it is not in metres and radians")
-    return Clip(name, body.reshape(-1, N_JOINTS, 3), trans, fps)
+    if np.abs(trans).max() > FARTHEST or np.abs(body).max() > FARTHEST:
+        raise InputError(f"{path}: values beyond {FARTHEST:g}, so it is not in metres and radians")
 
 
 def write_clip(path: Path, clip: Clip) -> None:
@@ -87,13 +117,8 @@ def _frame_rate(path: Path, value: np.ndarray) -> float:
         item = value.item()
         fps = float(item.decode() if isinstance(item, bytes) else item)
     except (ValueError, OverflowError) as error:
-        raise InputError(f"{path}: the frame rate is no number ({_brief(error)})") from error
+        raise InputError(f"{path}: the frame rate is no number ({brief(error)})") from error
     low, high = FRAME_RATE_RANGE
     if not low <= fps <= high:
         raise InputError(f"{path}: a frame rate of {fps:g} Hz; allowed: {low:g} to {high:g}")
     return fps
-
-
-def _brief(error: Exception) -> str:
-    """Shorten an exception's message to one line."""
-    return " ".join(str(error).split())[:120] or type(error).__name__

@@ -24,10 +24,11 @@ from filelock import FileLock
 from memmlp.common.errors import InputError
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
-from memmlp.motion.clip import Clip
+from memmlp.motion.clip import Clip, resample
+from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest, write_manifest
 from memmlp.motion.preparing.splits import PARTS, Split
-from memmlp.motion.preparing.survey import Survey, load, sources, survey
+from memmlp.motion.preparing.survey import Survey, sources, survey
 from memmlp.runs.recipes import RECIPES
 
 FRAMES = 1  # number of a frame's content; a new one changes every digest, and so makes every run again
@@ -131,7 +132,7 @@ def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) 
             header = {"descr": "<f4", "fortran_order": False, "shape": (frames[part], FRAME_DIM)}
             np.lib.format.write_array_header_1_0(file, header)
         for record in progress_bar(manifest.clips, "writing"):
-            clip, _, _ = load(source.root / f"{record.name}.npz", record.name)
+            clip, _ = resample(read_clip(source.root / f"{record.name}.npz", record.name))
             for block in _frames(clip, rest):
                 files[record.split].write(block.tobytes())
         for file in files.values():

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import os
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from memmlp.common.errors import InputError
+from memmlp.common.errors import InputError, one_line
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS
-from memmlp.motion.clip import Clip, Skipped, resample
-from memmlp.motion.formats.npz import read_clip
+from memmlp.motion.clip import Skipped, resample
+from memmlp.motion.formats.npz import NoMotion, read_clip
+from memmlp.motion.plausible import check_plausible
 from memmlp.motion.preparing.manifest import ClipRecord
 
 
@@ -51,15 +51,14 @@ def survey(root: Path, min_frames: int = 2, strict: bool = False) -> Survey:
     clips, skipped, short, ignored = [], [], [], 0
     for file in progress_bar(sources(root), "reading"):
         path = root / file
-        if _has_no_poses(path):
-            ignored += 1
-            continue
         try:
             clips.append(_inspect(path, file, min_frames))
+        except NoMotion:
+            ignored += 1
         except InputError as error:
             if strict:
                 raise
-            skipped.append(Skipped(file, str(error).removeprefix(f"{path}: ")))
+            skipped.append(Skipped(file, str(error).removeprefix(one_line(f"{path}: "))))
             short += [clip_name(file)] if isinstance(error, TooShort) else []
     return Survey(tuple(clips), tuple(skipped), ignored, tuple(short))
 
@@ -76,31 +75,18 @@ def sources(root: Path) -> list[str]:
     return found
 
 
-def _has_no_poses(path: Path) -> bool:
-    """Return whether a file is a sound npz of something else than motion; only its directory is read."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return "poses.npy" not in archive.namelist()
-    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile):
-        return False
-
-
 def _inspect(path: Path, file: str, min_frames: int) -> ClipRecord:
     """Return the record of a sound clip, without split and start; raise InputError for any other file."""
     name = clip_name(file)
-    clip, fps, how = load(path, name)
-    if len(clip) < min_frames:
-        raise TooShort(f"{path}: {len(clip)} frames at {FPS} Hz, fewer than {min_frames} (data.min_frames)")
+    clip = read_clip(path, name)
+    check_plausible(path, clip)
+    resampled, how = resample(clip)
+    if len(resampled) < min_frames:
+        few = f"{len(resampled)} frames at {FPS} Hz"
+        raise TooShort(f"{path}: {few}, fewer than {min_frames} (data.min_frames)")
     with open(path, "rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    return ClipRecord(name, "", "", 0, len(clip) - 1, digest, fps, how)
-
-
-def load(path: Path, name: str) -> tuple[Clip, float, str]:
-    """Read a clip, and return it at 60 Hz with its original frame rate and how it was resampled."""
-    clip = read_clip(path, name)
-    resampled, how = resample(clip)
-    return resampled, clip.fps, how
+    return ClipRecord(name, "", "", 0, len(resampled) - 1, digest, clip.fps, how)
 
 
 def clip_name(file: str) -> str:

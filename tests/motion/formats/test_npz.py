@@ -2,6 +2,7 @@
 
 import io
 import pickle
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -10,14 +11,16 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.motion.clip import Clip
-from memmlp.motion.formats.npz import read_clip, write_clip
+from memmlp.motion.formats import archive
+from memmlp.motion.formats.npz import NoMotion, read_clip, write_clip
 
 
 def arrays(frames: int = 20, width: int = 156) -> dict[str, np.ndarray]:
+    """Someone who stands, Z up, and sways."""
     rng = np.random.default_rng(0)
     return {
-        "poses": rng.normal(size=(frames, width)) * 0.3,
-        "trans": rng.normal(size=(frames, 3)),
+        "poses": rng.normal(size=(frames, width)) * 0.1 + np.eye(1, width) * np.pi / 2,
+        "trans": rng.normal(size=(frames, 3)) * 0.01 + [0.0, 0.0, 0.95],
         "betas": np.zeros(16),
         "gender": np.array("male"),
         "mocap_framerate": np.array(120.0),
@@ -30,12 +33,12 @@ def npz(**values: object) -> bytes:
     return buffer.getvalue()
 
 
-@pytest.mark.parametrize("width", [156, 165, 66])
+@pytest.mark.parametrize("width", [156, 165, 72, 66])
 @pytest.mark.parametrize(
     ("key", "rate"),
     [("mocap_framerate", np.array(120.0)), ("mocap_framerate", np.array([120.0])), ("mocap_framerate", 120),
      ("mocap_framerate", np.array(b"120")), ("mocap_framerate", np.array("120.0")),
-     ("mocap_frame_rate", 120.0)],
+     ("mocap_frame_rate", 120.0), ("fps", 120)],
 )  # fmt: skip
 def test_every_spelling_is_read(key, rate, width, tmp_path):
     values = arrays(width=width)
@@ -46,6 +49,41 @@ def test_every_spelling_is_read(key, rate, width, tmp_path):
     assert clip.fps == 120
     np.testing.assert_allclose(clip.poses.reshape(20, 66), values["poses"][:, :66])
     np.testing.assert_allclose(clip.trans, values["trans"])
+
+
+def parted(root: str, body: str, trans: str, width: int) -> dict[str, np.ndarray]:
+    """The motion of `arrays` under other keys, with `width` columns of body joints."""
+    good = arrays()
+    parts = {root: good["poses"][:, :3], body: good["poses"][:, 3 : 3 + width], trans: good["trans"]}
+    return parts | {"mocap_frame_rate": np.array(120.0)}
+
+
+@pytest.mark.parametrize(
+    "values",
+    [parted("root_orient", "pose_body", "trans", 63), parted("global_orient", "body_pose", "transl", 63),
+     parted("global_orient", "body_pose", "transl", 69),
+     arrays() | {"poses": arrays()["poses"].reshape(20, 52, 3)},
+     {key: np.asfortranarray(value) for key, value in arrays().items()},
+     arrays() | {"poses": arrays()["poses"].astype(">f8")},
+     arrays() | {"poses": arrays()["poses"].astype("g")}],
+)  # fmt: skip
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_every_layout_gives_the_same_clip(values, save, tmp_path, monkeypatch):
+    monkeypatch.setattr(archive, "BLOCK", 15_000)  # several blocks an array
+    save(tmp_path / "a.npz", **values)
+    clip = read_clip(tmp_path / "a.npz", "a")
+    np.testing.assert_array_equal(clip.poses.reshape(20, 66), arrays()["poses"][:, :66])
+    np.testing.assert_array_equal(clip.trans, arrays()["trans"])
+
+
+def test_parts_of_another_size_are_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    good = parted("root_orient", "pose_body", "trans", 63)
+    for change in ({"pose_body": good["pose_body"][:, :60]}, {"root_orient": good["pose_body"]},
+                   {"root_orient": good["root_orient"][:5]}):  # fmt: skip
+        path.write_bytes(npz(**(good | change)))
+        with pytest.raises(InputError, match=r"a\.npz: .*(root_orient|pose_body)"):
+            read_clip(path, "a")
 
 
 def test_written_clips_are_read_back(tmp_path):
@@ -160,3 +198,99 @@ def test_all_structural_damage_is_refused(tmp_path):
         path.write_bytes(content)
         with pytest.raises(InputError, match=path.name):
             read_clip(path, "bad")
+
+
+def repacked(data: bytes, **entries: bytes) -> bytes:
+    """The npz with the bytes of some entries replaced."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(buffer, "w") as new:
+        for name in old.namelist():
+            new.writestr(name, entries.get(name.removesuffix(".npy"), old.read(name)))
+    return buffer.getvalue()
+
+
+def entry(name: str) -> bytes:
+    with zipfile.ZipFile(io.BytesIO(npz(**arrays()))) as packed:
+        return packed.read(f"{name}.npy")
+
+
+@pytest.mark.parametrize(
+    "poses",
+    [
+        npz(**arrays()),  # the entry is itself a zip
+        entry("poses").replace(b"(20, 156)", b"(20, 156 "),  # tokenize.TokenError
+        entry("poses").replace(b"'<f8'", b"'|O8'"),
+        entry("poses").replace(b"(20, 156)", b"(-2,-156)"),
+        entry("poses").replace(b"(20, 156)", b"(21, 156)"),
+        b"\x93NUMPY\x01\x00\xff\xff" + b"(" * 65535,
+        b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + bytes(20),
+        b"\x93NUMPY\x03\x00" + entry("poses")[8:],
+        b"",
+    ],
+)
+def test_damaged_entries_are_one_line(poses, tmp_path):
+    (tmp_path / "a.npz").write_bytes(repacked(npz(**arrays()), poses=poses))
+    with pytest.raises(InputError, match=r"a\.npz: .*(poses|readable)") as caught:
+        read_clip(tmp_path / "a.npz", "a")
+    assert "\n" not in str(caught.value)
+
+
+def peak_of_refusal(path: Path, match: str) -> int:
+    """Return the most bytes that were allocated while the file was refused."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=match):
+            read_clip(path, "a")
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("shape", [(5000, 156), (100, 8000)])
+def test_a_small_file_that_unpacks_to_much_is_refused_before_it_does(shape, tmp_path, monkeypatch):
+    """It says so itself; the bound is lowered, so that the test need not pack gigabytes."""
+    monkeypatch.setattr(archive, "MAX_ROWS", 500)
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, **(arrays() | {"poses": np.zeros(shape)}))
+    assert path.stat().st_size < 100_000
+    assert peak_of_refusal(path, r"poses is float64 .*; allowed: up to \(500, 1000\)") < 500_000
+
+
+def test_a_file_that_unpacks_to_more_than_it_says_is_refused(tmp_path):
+    path, honest = tmp_path / "a.npz", io.BytesIO()
+    np.savez_compressed(honest, **(arrays() | {"poses": np.zeros((5000, 156))}))
+    data = honest.getvalue()
+    said = (128 + 5000 * 156 * 8).to_bytes(4, "little")
+    lie = (128 + 20 * 156 * 8).to_bytes(4, "little")
+    assert said in data
+    path.write_bytes(data.replace(said, lie))
+    assert peak_of_refusal(path, "poses") < 500_000
+
+
+def test_a_huge_directory_is_not_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(archive, "BLOCK", 5000)
+    path = tmp_path / "a.npz"
+    path.write_bytes(npz(**arrays(), **{f"x{i}": np.zeros(1) for i in range(200)}))
+    assert peak_of_refusal(path, "a part of more than") < 500_000
+
+
+def test_what_is_no_zip_is_said_without_advice_to_unpickle(tmp_path):
+    (tmp_path / "a.npz").write_text("not an npz\n")
+    with pytest.raises(InputError, match=r"a\.npz: no zip, so no npz") as caught:
+        read_clip(tmp_path / "a.npz", "a")
+    assert "unsafe" not in str(caught.value)
+    assert "pickle" not in str(caught.value)
+
+
+def test_the_message_is_one_line_whatever_the_file_is_called(tmp_path):
+    path = tmp_path / "a\nb\x1b[2J.npz"
+    path.write_bytes(b"")
+    with pytest.raises(InputError) as caught:
+        read_clip(path, "a")
+    assert str(caught.value).isprintable()
+
+
+def test_an_npz_without_motion_is_known(tmp_path):
+    np.savez(tmp_path / "shape.npz", betas=np.zeros(16))
+    with pytest.raises(NoMotion):
+        read_clip(tmp_path / "shape.npz", "shape")

@@ -1,0 +1,124 @@
+"""Whether a clip can be a person's motion in radians, metres and with Z up, since no file says its units.
+
+The limits leave room for what people do (jump, lie, crawl, climb, dance far from the origin, on a floor of
+any height): units that are wrong are wrong by factors of 39 to 1000, and a wrong axis by 90 degrees.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from memmlp.common.errors import InputError
+from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
+from memmlp.motion.clip import Clip
+
+HEAD, ANKLES = JOINTS.index("head"), [JOINTS.index("left_ankle"), JOINTS.index("right_ankle")]
+MOST_TURN = 4 * math.pi  # a rotation vector has no reason to be longer than pi; fits wind up to 2 pi and more
+MOST_SPEED = 30.0  # m/s; the fastest runner reached 12.4
+MOST_HEIGHT = 10.0  # metres of the pelvis over z = 0 beyond which the feet have to prove that they stand
+SAMPLES = 100  # frames looked at for posture
+
+
+def check_plausible(path: Path, clip: Clip) -> None:
+    """Raise InputError, which names the file, for a clip that cannot be a person's motion."""
+    reason = implausible(clip)
+    if reason is not None:
+        raise InputError(f"{path}: {reason}")
+
+
+def implausible(clip: Clip) -> str | None:
+    """Return why a clip cannot be a person's motion in radians, metres and with Z up, or None."""
+    return _degrees(clip) or _too_fast(clip) or _too_high(clip) or _y_up(clip)
+
+
+def unusual(clip: Clip) -> str | None:
+    """Return what a reader should know of a clip that may be sound all the same, or None."""
+    if _never_upright(_joints(clip, _spread(clip))):
+        return "the head is never above the pelvis, so it lies throughout, or Z is not up"
+    height = _height(clip)
+    return f"the pelvis is at z = {height:.0f} m" if abs(height) > MOST_HEIGHT else None
+
+
+def _degrees(clip: Clip) -> str | None:
+    share = (np.linalg.norm(clip.poses, axis=-1).max(1) > MOST_TURN).mean()
+    if share <= 0.5:
+        return None
+    return (
+        f"rotations beyond two turns in {share:.0%} of the frames, so poses is in degrees; allowed: radians"
+    )
+
+
+def _too_fast(clip: Clip) -> str | None:
+    """Judge by a quarter of the frames, since recordings have glitches."""
+    speeds = np.linalg.norm(np.diff(clip.trans, axis=0), axis=-1) * clip.fps
+    if len(speeds) == 0 or np.quantile(speeds, 0.75) <= MOST_SPEED:
+        return None
+    fast = f"the pelvis moves at {np.quantile(speeds, 0.75):.0f} m/s in a quarter of the frames"
+    return f"{fast}, so trans is not in metres, or the frame rate is wrong; allowed: {MOST_SPEED:g} m/s"
+
+
+def _too_high(clip: Clip) -> str | None:
+    """Judge a great height by the feet: on a high floor one stands still while the pelvis moves on."""
+    height = _height(clip)
+    if abs(height) <= MOST_HEIGHT or _feet_hold(clip):
+        return None
+    where = f"the pelvis is at z = {height:.0f} m and no joint is at rest while it moves"
+    return f"{where}, so trans is not in metres; allowed: a floor within {MOST_HEIGHT:g} m"
+
+
+def _y_up(clip: Clip) -> str | None:
+    """Find a person who never stands along Z, but does along Y, and there on a floor.
+
+    Someone who lies throughout with the head towards +Y hardly has the feet at y = 0, and does not rise by a
+    metre while they keep to a plane.
+    """
+    joints = _joints(clip, _spread(clip))
+    if _standing(joints, axis=2) > 0.02 or _standing(joints, axis=1) < 0.6:
+        return None
+    low, middle, high = np.quantile(joints[:, :, 1].min(1), [0.05, 0.5, 0.95])
+    if abs(middle) > 0.2 and (high - low > 0.35 or np.ptp(joints[:, 0, 2]) < 1.0):
+        return None
+    return "the person stands along Y and never along Z, so Y is up; allowed: Z up"
+
+
+def _height(clip: Clip) -> float:
+    return float(np.median(clip.trans[:, 2]))
+
+
+def _standing(joints: np.ndarray, axis: int) -> float:
+    """Return the share of frames with the head well above the pelvis, and that above an ankle, on an axis."""
+    heights = joints[:, :, axis] - joints[:, :1, axis]
+    return float(((heights[:, HEAD] > 0.4) & (heights[:, ANKLES].min(1) < -0.5)).mean())
+
+
+def _never_upright(joints: np.ndarray) -> bool:
+    return bool((joints[:, HEAD, 2] - joints[:, 0, 2] > 0.2).mean() < 0.02)
+
+
+def _feet_hold(clip: Clip) -> bool:
+    """Return whether, in half of the frames in which the pelvis moves, some joint moves at half its speed."""
+    frames = _spread(clip, len(clip) - 1)
+    moved = np.linalg.norm(_joints(clip, frames + 1) - _joints(clip, frames), axis=-1)
+    moving = moved[:, 0] * clip.fps > 0.01
+    return bool(moving.any() and np.median(moved[moving].min(1) / moved[moving, 0]) < 0.5)
+
+
+def _spread(clip: Clip, last: int | None = None) -> np.ndarray:
+    """Return indices of up to SAMPLES frames, spread over the clip."""
+    last = len(clip) if last is None else last
+    return np.arange(last)[:: max(1, -(-last // SAMPLES))]
+
+
+def _joints(clip: Clip, frames: np.ndarray) -> np.ndarray:
+    """Return the joints' positions (n, 22, 3), metres, world, in some frames, on the built-in body."""
+    rest, poses = builtin_rest_joints(), clip.poses[frames]
+    local = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(*poses.shape, 3)
+    rotations, positions = [local[:, 0]], [clip.trans[frames] + rest[0]]
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        positions.append(positions[parent] + rotations[parent] @ (rest[joint] - rest[parent]))
+        rotations.append(rotations[parent] @ local[:, joint])
+    return np.stack(positions, 1)

@@ -1,0 +1,90 @@
+"""Plausibility: degrees, other units and another axis are refused; whatever people do is not."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from memmlp.motion.clip import Clip
+from memmlp.motion.plausible import implausible, unusual
+from memmlp.motion.synthetic import synthesize_clip
+
+ACTIVITIES = ("walking", "jumping", "sitting", "idling")
+Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+
+
+@cache
+def motion(activity: str) -> Clip:
+    return synthesize_clip(activity, 3, seconds=4)
+
+
+def turned(clip: Clip, matrix: np.ndarray) -> Clip:
+    """The clip in another world: its root and translation turned."""
+    poses = clip.poses.copy()
+    poses[:, 0] = (Rotation.from_matrix(matrix) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+    return replace(clip, poses=poses, trans=clip.trans @ matrix.T)
+
+
+def moved(clip: Clip, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Clip:
+    return replace(clip, trans=np.add(clip.trans, [x, y, z]))
+
+
+def lying(clip: Clip, heading: float = 0.0) -> Clip:
+    """The clip's limbs on someone on their back, the head towards a heading (0 is +Y), hardly moving."""
+    pose = Rotation.from_euler("z", heading, degrees=True) * Rotation.from_rotvec([0, 0, 0.05])
+    poses = clip.poses.copy()
+    poses[:, 0] = pose.as_rotvec()
+    poses[:, 1:] *= 0.3
+    return replace(clip, poses=poses, trans=0.05 * clip.trans + [0.4, 1.7, 0.1])
+
+
+@pytest.mark.parametrize("activity", ACTIVITIES)
+def test_what_people_do_passes(activity):
+    clip = motion(activity)
+    for sound in (clip, moved(clip, z=-2.5), moved(clip, z=8.0), moved(clip, 700.0, -300.0)):
+        assert implausible(sound) is None
+        assert unusual(sound) is None
+    single = replace(clip, poses=clip.poses[:1], trans=clip.trans[:1])
+    assert implausible(single) is None
+
+
+@pytest.mark.parametrize("heading", [0, 90, 180, 250])
+def test_lying_and_crawling_pass_and_are_told(heading):
+    assert implausible(lying(motion("idling"), heading)) is None
+    assert "head" in unusual(lying(motion("idling"), heading))
+    crawling = lying(motion("walking"), heading)
+    along = np.linspace(0, 3, len(crawling))[:, None] * [0.3, 1.0, 0.0]
+    assert implausible(replace(crawling, trans=crawling.trans + along)) is None
+
+
+def test_a_floor_at_any_height_passes_where_feet_stand_on_it():
+    for z in (-40.0, 100.0):
+        clip = moved(motion("walking"), z=z)
+        assert implausible(clip) is None
+        assert f"z = {z + 1:.0f} m" in unusual(clip)
+
+
+def test_a_glitch_or_a_wound_up_root_passes():
+    clip = motion("walking")
+    trans, poses = clip.trans.copy(), clip.poses.copy()
+    trans[10:12] += 50.0
+    norms = np.linalg.norm(poses[:, 0], axis=-1, keepdims=True)
+    poses[:, 0] *= (norms + 2 * np.pi) / norms
+    assert implausible(replace(clip, trans=trans, poses=poses)) is None
+
+
+@pytest.mark.parametrize("activity", ACTIVITIES)
+def test_other_units_and_another_axis_are_refused(activity):
+    clip = motion(activity)
+    assert "degrees" in implausible(replace(clip, poses=np.degrees(clip.poses)))
+    for scale in (39.37, 100.0, 1000.0):
+        assert "not in metres" in implausible(replace(clip, trans=scale * clip.trans))
+    assert "Y is up" in implausible(turned(clip, Y_UP))
+
+
+def test_someone_who_hardly_moves_in_centimetres_is_refused():
+    clip = motion("idling")
+    still = replace(clip, trans=clip.trans[0] + 0.05 * (clip.trans - clip.trans[0]))
+    assert "at z = " in implausible(replace(still, trans=100 * still.trans))
