@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import click
 
-from memmlp.cli.data.show import show_skipped
+from memmlp.cli.data.show import show_skipped, show_some
 from memmlp.cli.options import PATH
 from memmlp.common.errors import InputError
 
@@ -18,22 +19,42 @@ from memmlp.common.errors import InputError
     "--skeleton", help="A shipped joint map or the path of one; by default the joints' names decide."
 )
 @click.option("--fps", multiple=True, metavar="[FOLDER=]HZ", help="True frame rate, for all or one folder.")
+@click.option(
+    "--floor",
+    default="auto",
+    show_default=True,
+    metavar="auto|none|METRES",
+    help="auto puts the lowest stable contact of the feet at 0; METRES is the floor's height in the files.",
+)
+@click.option(
+    "--take", multiple=True, metavar="REGEX", help="Clips that match alike share one floor; repeatable."
+)
 @click.option("--body", default="builtin", show_default=True, help="builtin, or an SMPL-H model.npz.")
 @click.option("--strict", is_flag=True, help="Stop at the first bad file instead of skipping it.")
 def import_(
-    source: Path, out: Path, skeleton: str | None, fps: tuple[str, ...], body: str, strict: bool
+    source: Path,
+    out: Path,
+    skeleton: str | None,
+    fps: tuple[str, ...],
+    floor: str,
+    take: tuple[str, ...],
+    body: str,
+    strict: bool,
 ) -> None:
     """Import BVH files as AMASS npz.
 
-    SOURCE is a folder or one file. The clips are brought to the 22-joint tree.
+    SOURCE is a folder or one file. The clips are brought to the 22-joint tree, and each is compared with its
+    file; what looks wrong is said.
     """
-    from memmlp.motion.importing.folder import import_folder
+    from memmlp.motion.importing.folder import How, import_folder
 
-    rates = dict(map(_rate, fps))
-    report = import_folder(source, out, skeleton=skeleton, fps=rates, body=body, strict=strict)
+    how = How(skeleton, dict(map(_rate, fps)), body, _floor(floor), take, strict)
+    report = import_folder(source, out, how)
     for note in report.notes:
         click.echo(f"note: {note}")
     show_skipped([f"{file.file}: {file.reason}" for file in report.skipped])
+    faulty = [clip for clip in report.clips if clip.faults]
+    show_some([f"warning: {clip.source}: {'; '.join(clip.faults)}" for clip in faulty], "clips with warnings")
     minutes = sum(clip.frames / clip.fps for clip in report.clips) / 60
     maps = ", ".join(sorted({clip.skeleton for clip in report.clips}))
     click.echo(f"{len(report.clips)} clips, {minutes:.1f} minutes, skeleton {maps}, in {out}")
@@ -47,3 +68,16 @@ def _rate(text: str) -> tuple[str, float]:
         return folder, float(rate)
     except ValueError:
         raise InputError(f"--fps {text}: no frame rate; allowed: HZ or FOLDER=HZ, such as salsa=60") from None
+
+
+def _floor(text: str) -> str | float:
+    """Parse auto, none or metres. Raises InputError for anything else."""
+    if text in ("auto", "none"):
+        return text
+    try:
+        height = float(text)
+    except ValueError:
+        height = math.nan
+    if not abs(height) <= 1000:
+        raise InputError(f"--floor {text}: no height; allowed: auto, none, or metres up to 1000")
+    return height

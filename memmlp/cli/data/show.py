@@ -42,7 +42,12 @@ def show_rates(clips: tuple[ClipRecord, ...]) -> None:
 
 def show_skipped(lines: list[str]) -> None:
     """Print the first few skipped files and the number of the others."""
+    show_some([f"skipped {line}" for line in lines], "skipped")
+
+
+def show_some(lines: list[str], what: str) -> None:
+    """Print the first few lines, and how many more of them there are."""
     for line in lines[:SHOWN]:
-        click.echo(f"skipped {line}")
+        click.echo(line)
     if len(lines) > SHOWN:
-        click.echo(f"skipped {len(lines) - SHOWN} more")
+        click.echo(f"{len(lines) - SHOWN} more {what}")

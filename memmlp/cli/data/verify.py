@@ -8,34 +8,44 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from memmlp.cli.data.show import SHOWN
 from memmlp.cli.options import PATH
-
-MOST_MM, MOST_DEGREES = 1.0, 3.0  # the largest errors that an import may have
 
 
 @click.command("verify")
 @click.argument("source", type=PATH)
 @click.option("--skeleton", help="A shipped joint map or the path of one.")
 @click.option("--body", default="builtin", show_default=True, help="builtin, or an SMPL-H model.npz.")
-def verify(source: Path, skeleton: str | None, body: str) -> None:
-    """Check imports against the BVH files' joints.
+@click.option("--all", "every", is_flag=True, help="Show every file and not only those with faults.")
+def verify(source: Path, skeleton: str | None, body: str, every: bool) -> None:
+    """Check imports against the files themselves.
 
-    Exits with 1 if an error is too large. "worst mm" is the largest distance of any mapped joint, on the
-    clip's own bones. "worst degrees" is the largest angle between directions of upper arms, forearms, thighs
-    and shins on the body.
+    Each file is imported, and what would be kept is compared with the file's own joints: "worst mm" is the
+    largest distance of any mapped joint on the file's own bones, "worst degrees" the largest angle between a
+    segment (trunk, neck, arms, legs, feet) on the body and in the file. A body that no person has is a fault
+    too: the head below the pelvis, knees that bend forward, feet that point backward or hang above the floor,
+    odd lengths. Goes on past bad files; exits with 1 if any file has a fault or can't be imported.
     """
-    from memmlp.motion.importing.verify import verify_folder
+    from memmlp.motion.importing.verify import Unusable, verify_folder
 
-    rows = verify_folder(source, skeleton=skeleton, body=body)
-    table = Table("clip", "skeleton")
+    table = Table("file", "skeleton")
     for name in ("frames", "worst mm", "worst degrees"):
         table.add_column(name, justify="right")
-    for row in rows:
-        table.add_row(
-            row.name, row.skeleton, str(row.frames), f"{row.worst_mm:.4f}", f"{row.worst_degrees:.4f}"
-        )
+    table.add_column("at")
+    sound, bad, worst = 0, [], (0.0, 0.0)
+    for row in verify_folder(source, skeleton=skeleton, body=body):
+        if isinstance(row, Unusable):
+            bad.append(f"{row.name}: {row.reason}")
+            continue
+        worst = max(worst[0], row.mm.value), max(worst[1], row.degrees.value)
+        sound += not row.faults
+        bad += [f"{row.name}: {fault}" for fault in row.faults]
+        if every or row.faults or sound + len(bad) <= SHOWN:
+            numbers = (str(row.frames), f"{row.mm.value:.4f}", f"{row.degrees.value:.4f}")
+            table.add_row(row.name, row.skeleton, *numbers, f"{row.mm}; {row.degrees}")
     Console(highlight=False).print(table)
-    mm, degrees = max(row.worst_mm for row in rows), max(row.worst_degrees for row in rows)
-    click.echo(f"worst of {len(rows)} clips: {mm:.4f} mm, {degrees:.4f} degrees")
-    if mm > MOST_MM or degrees > MOST_DEGREES:
-        raise click.ClickException(f"more than {MOST_MM:g} mm or {MOST_DEGREES:g} degrees")
+    for line in bad:
+        click.echo(line)
+    click.echo(f"{sound} files without a fault; worst {worst[0]:.4f} mm, {worst[1]:.4f} degrees")
+    if bad:
+        raise click.ClickException(f"{len(bad)} faults")

@@ -8,8 +8,8 @@ channels, if it has any, replace the numbers of its OFFSET.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NoReturn
 
@@ -113,6 +113,31 @@ class Bvh:
             rotations[node] = rotations[end.parent]
             positions[node] = positions[end.parent] + rotations[end.parent] @ end.offset
         return rotations.swapaxes(0, 1), positions.swapaxes(0, 1)
+
+    def posed(self, angles: Mapping[str, Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the nodes' global rotations (J+E, 3, 3) and positions (J+E, 3) in a pose.
+
+        Args:
+            angles: joint -> the values of its rotation channels, degrees, in the file's order; the others'
+                are zero, and so are the root's position channels.
+
+        Raises:
+            InputError: if there is no such joint, or not as many channels.
+        """
+        values = []
+        for joint, name in enumerate(self.names):
+            turns = [channel for channel in self.channels[joint] if channel.endswith("rotation")]
+            told = iter(angles.get(name, [0.0] * len(turns)))
+            if len(angles.get(name, turns)) != len(turns):
+                wrong = f"{len(angles[name])} rotations for {name}"
+                raise InputError(
+                    f"{self.path}: {wrong}; allowed: {len(turns)}, one for each rotation channel"
+                )
+            for channel in self.channels[joint]:
+                shift = 0.0 if joint == 0 else self.offsets[joint][AXES.index(channel[0])]
+                values.append(next(told) if channel.endswith("rotation") else shift)
+        rotations, positions = replace(self, values=np.array([values])).kinematics()
+        return rotations[0], positions[0]
 
     def _joint_values(self, joint: int) -> np.ndarray:
         """Return the values (N, c) of a joint's channels."""

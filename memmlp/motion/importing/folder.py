@@ -7,8 +7,8 @@ import json
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +17,15 @@ from memmlp.common.errors import InputError
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import load_rest_joints
 from memmlp.motion.clip import FRAME_RATE_RANGE, Skipped
-from memmlp.motion.formats.bvh import Bvh, find_bvh, read_bvh
-from memmlp.motion.formats.npz import write_clip
-from memmlp.motion.importing.retarget import retarget
+from memmlp.motion.formats.bvh import find_bvh, read_bvh
+from memmlp.motion.formats.npz import read_clip, write_clip
+from memmlp.motion.importing.convert import AUTO, convert, lowered
+from memmlp.motion.importing.rates import folder_key, true_rate
+from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.skeleton import SkeletonMap, find_skeleton, is_number, load_skeleton
+from memmlp.motion.preparing.splits import group_names
 
 RECORD = "import.json"
-HEADER = "the header's"
 
 
 @dataclass(frozen=True)
@@ -31,24 +33,30 @@ class Imported:
     """One imported clip.
 
     Attributes:
-        source: the BVH file's path below its folder.
+        source: the file's path below its folder.
         sha256: digest of that file.
         clip: the npz file's path below its folder.
         skeleton: name of the skeleton map.
+        rest_pose: the pose from which the skeleton was read, in words.
         frames: number of frames.
         header_fps: frame rate that the file's header tells, Hz.
         fps: frame rate of the clip, Hz.
         fps_reason: where that rate is from.
+        floor: height of the floor that was taken off, metres; None where none was found or asked for.
+        faults: what is wrong with the clip, a sentence each (`fidelity.compare`).
     """
 
     source: str
     sha256: str
     clip: str
     skeleton: str
+    rest_pose: str
     frames: int
     header_fps: float
     fps: float
     fps_reason: str
+    floor: float | None
+    faults: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -57,7 +65,7 @@ class ImportReport:
 
     Attributes:
         clips: the clips that it wrote.
-        notes: one line for each folder whose header rate it corrected.
+        notes: what a person has to know of them: folders whose header rate it corrected, notes of the maps.
         skipped: the files that it skipped.
     """
 
@@ -66,50 +74,84 @@ class ImportReport:
     skipped: tuple[Skipped, ...]
 
 
-def import_folder(
-    source: Path,
-    out: Path,
-    *,
-    skeleton: str | None = None,
-    fps: Mapping[str, float] = {},
-    body: str = "builtin",
-    strict: bool = False,
-) -> ImportReport:
-    """Write each BVH file of a folder, or a single one, as out/<its path>.npz, and out/import.json about it.
+@dataclass(frozen=True)
+class How:
+    """How files are imported.
+
+    Attributes:
+        skeleton: a shipped map or the path of one; None lets each file's joints decide.
+        fps: true frame rates, Hz, by folder below the source ("" for all); they override what is known of a
+            file, what stands beside it and what its header says.
+        body: `builtin`, or an SMPL-H model.npz.
+        floor: `auto`: the lowest stable contact of the feet is at 0; `none`: left as the file has it; or the
+            floor's height in the files, metres.
+        takes: patterns (regular expressions); clips that match one alike were recorded at once, and have one
+            floor.
+        strict: whether a bad file raises; otherwise it is skipped and reported.
+    """
+
+    skeleton: str | None = None
+    fps: Mapping[str, float] = field(default_factory=dict)
+    body: str = "builtin"
+    floor: str | float = AUTO
+    takes: Sequence[str] = ()
+    strict: bool = False
+
+
+def import_folder(source: Path, out: Path, how: How | None = None) -> ImportReport:
+    """Write each file of a folder, or a single one, as out/<its path>.npz, and out/import.json about it.
 
     Args:
         source: folder or file.
         out: folder; it must hold no clips other than this import's.
-        skeleton: a shipped map or the path of one; by default each file's joints decide.
-        fps: true frame rates, Hz, by folder below source ("" for all); they override the map's and the
-            header's.
-        body: `builtin`, or an SMPL-H model.npz.
-        strict: whether a bad file raises; otherwise it is skipped and reported.
+        how: how files are imported.
 
     Raises:
         InputError: with nothing written, if there are no files, several of the same name, a rate that fits no
             folder, clips of another import in `out`, or no file that could be imported; also if `out` cannot
             be written.
     """
-    files = find_bvh(source)
-    _check_import(files, out, fps)
-    rest, clips, skipped = load_rest_joints(body), [], []
-    chosen = None if skeleton is None else load_skeleton(skeleton)
+    how, files = how or How(), find_bvh(source)
+    _check_import(files, out, how.fps)
+    rest, clips, skipped = load_rest_joints(how.body), [], []
+    chosen = None if how.skeleton is None else load_skeleton(how.skeleton)
+    takes = group_names([relative.as_posix() for relative in files], how.takes)
+    maps: dict[str, SkeletonMap] = {}
     with _staging(out) as staging:
         for relative, path in progress_bar(files.items(), "import", len(files)):
             try:
-                clips.append(_import_file(path, relative, Path(staging), chosen, fps, rest))
+                recording = read_bvh(path)
+                skeleton = chosen or find_skeleton(recording)
+                clips.append(_import_file(recording, relative, Path(staging), skeleton, how, rest, source))
+                maps[skeleton.name] = skeleton
             except InputError as error:
-                if strict or len(files) == 1:
+                if how.strict or len(files) == 1:
                     raise
                 source_name = relative.as_posix()
                 skipped.append(Skipped(source_name, str(error).replace(str(path), source_name)))
         if not clips:
             raise InputError(f"{source}: no usable BVH file of {len(files)}; the first: {skipped[0].reason}")
-        notes = dict.fromkeys(_note(clip) for clip in clips if clip.fps != clip.header_fps)
-        report = ImportReport(tuple(clips), tuple(notes), tuple(skipped))
-        _publish(Path(staging), out, report, Path(body).name)
+        clips = _one_floor_a_take(clips, takes, Path(staging))
+        rates = dict.fromkeys(_note(clip) for clip in clips if clip.fps != clip.header_fps)
+        notes = [f"{skeleton.name}: {skeleton.note}" for skeleton in maps.values() if skeleton.note]
+        report = ImportReport(tuple(clips), (*rates, *notes), tuple(skipped))
+        _publish(Path(staging), out, report, Path(how.body).name)
     return report
+
+
+def _one_floor_a_take(clips: list[Imported], takes: Mapping[str, str], staging: Path) -> list[Imported]:
+    """Lower the clips of a take by its lowest floor instead of each by its own."""
+    floors: dict[str, float] = {}
+    for clip in clips:
+        if clip.floor is not None:
+            floors[takes[clip.source]] = min(clip.floor, floors.get(takes[clip.source], clip.floor))
+    for index, clip in enumerate(clips):
+        floor = floors.get(takes[clip.source])
+        if floor is not None and floor != clip.floor:
+            path = staging / clip.clip
+            write_clip(path, lowered(read_clip(path, clip.clip), floor - (clip.floor or 0.0)))
+            clips[index] = replace(clip, floor=floor)
+    return clips
 
 
 def _npz(relative: Path) -> Path:
@@ -126,16 +168,11 @@ def _check_import(files: Mapping[Path, Path], out: Path, fps: Mapping[str, float
     if foreign or (out.exists() and not out.is_dir()):
         wrong = f"has other clips, such as {foreign[0].as_posix()}" if foreign else "is a file"
         raise InputError(f"{out}: {wrong}; allowed: a new folder, or that of the same import")
-    folders = sorted({_key(folder) for relative in files for folder in relative.parents})
+    folders = sorted({folder_key(folder) for relative in files for folder in relative.parents})
     for folder, rate in fps.items():
         if folder not in folders or not is_number(rate, *FRAME_RATE_RANGE):
             allowed = f"1 to 1000 Hz for {', '.join(map(repr, folders))} ('' is all)"
             raise InputError(f"fps: {rate!r} for {folder!r}; allowed: {allowed}")
-
-
-def _key(folder: Path) -> str:
-    """Return a folder below source as `fps` names it."""
-    return "" if folder == Path() else folder.as_posix()
 
 
 def _staging(out: Path) -> tempfile.TemporaryDirectory:
@@ -148,45 +185,34 @@ def _staging(out: Path) -> tempfile.TemporaryDirectory:
 
 
 def _import_file(
-    path: Path,
+    recording: Recording,
     relative: Path,
     folder: Path,
-    skeleton: SkeletonMap | None,
-    fps: Mapping[str, float],
+    skeleton: SkeletonMap,
+    how: How,
     rest: np.ndarray,
+    source: Path,
 ) -> Imported:
     """Write one clip below the staging folder."""
-    bvh = read_bvh(path)
-    chosen = skeleton or find_skeleton(bvh)
-    rate, reason = _rate(bvh, chosen, relative, fps)
+    sha256 = hashlib.sha256(recording.path.read_bytes()).hexdigest()
+    top = source if source.is_dir() else source.parent
+    rate = true_rate(recording.fps, relative, sha256, top, how.fps)
     name = relative.with_suffix("").as_posix()
-    clip = retarget(bvh, chosen, rest, name=name, fps=rate)
-    write_clip(folder / _npz(relative), clip)
+    converted = convert(recording, skeleton, rest, name=name, fps=rate.fps, floor=how.floor)
+    write_clip(folder / _npz(relative), converted.clip)
     return Imported(
         source=relative.as_posix(),
-        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+        sha256=sha256,
         clip=_npz(relative).as_posix(),
-        skeleton=chosen.name,
-        frames=len(clip),
-        header_fps=bvh.fps,
-        fps=rate,
-        fps_reason=reason,
+        skeleton=skeleton.name,
+        rest_pose=converted.rest_pose,
+        frames=len(converted.clip),
+        header_fps=recording.fps,
+        fps=rate.fps,
+        fps_reason=rate.reason,
+        floor=converted.floor,
+        faults=converted.fidelity.faults,
     )
-
-
-def _rate(bvh: Bvh, skeleton: SkeletonMap, relative: Path, fps: Mapping[str, float]) -> tuple[float, str]:
-    """Return the true frame rate and where it is from.
-
-    It is the one given for the nearest folder, or known from the map, or the header's.
-    """
-    for folder in relative.parents:
-        if _key(folder) in fps:
-            return float(fps[_key(folder)]), f"given for {_key(folder) or 'all'}"
-    folder_name = bvh.path.resolve().parent.name
-    known = float(skeleton.rates.get(folder_name, bvh.fps))
-    if known != bvh.fps:
-        return known, f"known of {folder_name} in {skeleton.name}"
-    return bvh.fps, HEADER
 
 
 def _note(clip: Imported) -> str:

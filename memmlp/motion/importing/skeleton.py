@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import yaml
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS
-from memmlp.motion.clip import FRAME_RATE_RANGE
-from memmlp.motion.formats.bvh import Bvh
+
+if TYPE_CHECKING:
+    from memmlp.motion.importing.recording import Recording
 
 SKELETONS = Path(__file__).parent / "skeletons"
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # Y-up axes to the world's: y becomes z
-HIPS = (1, 2)
-LEGS = {1: 4, 2: 5, 4: 7, 5: 8}  # joint -> the joint at the other end of its bone
-LIMBS = LEGS | {16: 18, 17: 19, 18: 20, 19: 21}
-REQUIRED = ("pelvis", "head", *(JOINTS[joint] for joint in sorted({*LIMBS, *LIMBS.values()})))
+REQUIRED = (
+    "pelvis", "head", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle",
+    "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
+)  # fmt: skip
+FOUND = "auto"  # a unit or up axis that is found in each file
 
 
 @dataclass(frozen=True)
@@ -28,24 +32,28 @@ class SkeletonMap:
 
     Attributes:
         name: the map's name.
-        unit: the file's unit in metres.
-        up: the file's up axis, `y` (zero pose facing +Z) or `z` (facing -Y); left is +X in both.
+        joints: body joint -> the file's node (a joint, or `<joint>.end`) that stands for it.
+        unit: the file's unit in metres, None where it is to be found from the legs.
+        up: the file's up axis, `y` or `z`, None where it is to be found from the motion.
         calibration_frame: whether frame 0 is a calibration pose, not motion.
-        joints: body joint -> the BVH node (a joint, or `<joint>.end`) that stands for it.
-        rates: true frame rates, Hz, of folders whose headers are known to be wrong.
+        rest: the pose in which the person stands, from which the skeleton is read: `auto` (the zero pose
+            where that is one, else the straightest frame), a frame's number, or the rotation values, degrees,
+            of each joint as the file would have them in a frame.
+        note: what a person who imports such files has to know.
     """
 
     name: str
-    unit: float
-    up: str
-    calibration_frame: bool
     joints: dict[str, str]
-    rates: dict[str, float] = field(default_factory=dict)
+    unit: float | None = None
+    up: str | None = None
+    calibration_frame: bool = False
+    rest: str | int | dict[str, list[float]] = FOUND
+    note: str = ""
 
     @property
     def upright(self) -> np.ndarray:
-        """The rotation (3, 3) from the file's axes to Y-up axes."""
-        return np.eye(3) if self.up == "y" else Z_UP.T
+        """The rotation (3, 3) from the file's axes to Y-up axes; the up axis is known by now."""
+        return {"y": np.eye(3), "z": Z_UP.T}[str(self.up)]
 
 
 def shipped_skeletons() -> tuple[str, ...]:
@@ -68,24 +76,28 @@ def load_skeleton(which: str) -> SkeletonMap:
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         brief = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: {brief}; allowed: a readable YAML map") from error
-    _check_map(path, content)
-    return SkeletonMap(**content)
+    return _parsed(path, content)
 
 
-def find_skeleton(bvh: Bvh) -> SkeletonMap:
-    """Find the one shipped map all of whose nodes the file has.
+def find_skeleton(recording: Recording) -> SkeletonMap:
+    """Find the shipped map all of whose nodes the file has; of several, the one with the most nodes.
 
     Raises:
-        InputError: if there is none, or more than one.
+        InputError: if there is none, or none has more than all others.
     """
     maps = [load_skeleton(name) for name in shipped_skeletons()]
-    fitting = [skeleton for skeleton in maps if set(skeleton.joints.values()) <= set(bvh.nodes)]
+    fitting = [skeleton for skeleton in maps if set(skeleton.joints.values()) <= set(recording.nodes)]
+    most = max((len(skeleton.joints) for skeleton in fitting), default=0)
+    fitting = [skeleton for skeleton in fitting if len(skeleton.joints) == most]
     if len(fitting) == 1:
         return fitting[0]
     state = "fits more than one skeleton" if fitting else "has an unknown skeleton"
     known = ", ".join(skeleton.name for skeleton in fitting or maps)
-    listed = ", ".join(bvh.names[:60]) + (", ..." if len(bvh.names) > 60 else "")
-    raise InputError(f"{bvh.path}: {state} with the joints {listed}; allowed: {known}, or a map by skeleton=")
+    names = [name for name in recording.nodes if not name.endswith(".end")]
+    listed = ", ".join(names[:60]) + (", ..." if len(names) > 60 else "")
+    raise InputError(
+        f"{recording.path}: {state} with the joints {listed}; allowed: {known}, or a map by skeleton="
+    )
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -99,26 +111,35 @@ class _StrictLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _check_map(path: Path, content: object) -> None:
-    """Raise InputError unless the YAML has exactly what a SkeletonMap needs."""
+def _parsed(path: Path, content: object) -> SkeletonMap:
+    """Return the map that a YAML file holds. Raises InputError unless it has what a SkeletonMap needs."""
 
     def require(good: bool, key: str, allowed: str) -> None:
         if not good:
             raise InputError(f"{path}: {key} is wrong or missing; allowed: {allowed}")
 
-    keys = {"name", "unit", "up", "calibration_frame", "joints"}
-    if not isinstance(content, dict) or not keys <= set(content) <= keys | {"rates"}:
-        raise InputError(f"{path}: not the keys of a map; allowed: {', '.join(sorted(keys))}, and rates")
-    joints, rates = content["joints"], content.get("rates", {})
-    require(_is_text(content["name"]), "name", "text")
-    require(is_number(content["unit"], 1e-6, 1e3), "unit", "a number of metres from 1e-6 to 1000")
-    require(content["up"] in ("y", "z"), "up", "y or z")
-    require(isinstance(content["calibration_frame"], bool), "calibration_frame", "true or false")
-    require(isinstance(rates, dict), "rates", "folder: Hz")
-    for folder, rate in rates.items():
-        good = _is_text(folder) and is_number(rate, *FRAME_RATE_RANGE)
-        require(good, f"rates.{folder}", "a folder's name and 1 to 1000 Hz")
+    needed, more = ("name", "joints"), ("unit", "up", "calibration_frame", "rest", "note")
+    if not isinstance(content, dict) or not set(needed) <= set(content) <= {*needed, *more}:
+        raise InputError(
+            f"{path}: not the keys of a map; allowed: {', '.join(needed)}, and {', '.join(more)}"
+        )
+    told = {"unit": FOUND, "up": FOUND, "calibration_frame": False, "rest": FOUND, "note": "", **content}
+    require(_is_text(told["name"]), "name", "text")
+    numbers = "a number of metres from 1e-6 to 1000, or auto"
+    require(told["unit"] == FOUND or is_number(told["unit"], 1e-6, 1e3), "unit", numbers)
+    require(told["up"] in ("y", "z", FOUND), "up", "y, z or auto")
+    require(isinstance(told["calibration_frame"], bool), "calibration_frame", "true or false")
+    require(_is_rest(told["rest"]), "rest", "auto, a frame's number, or JOINT: [degrees, degrees, degrees]")
+    require(told["note"] == "" or _is_text(told["note"]), "note", "text")
+    _check_joints(require, told["joints"])
+    unit, up = (None if told[key] == FOUND else told[key] for key in ("unit", "up"))
+    return SkeletonMap(**{**told, "unit": unit, "up": up})
+
+
+def _check_joints(require: Callable[[bool, str, str], None], joints: object) -> None:
+    """Require that a map's joints are those of the body, with the needed ones, and different nodes."""
     require(isinstance(joints, dict), "joints", f"{', '.join(JOINTS)}, each with the file's joint")
+    assert isinstance(joints, dict)
     for joint, node in joints.items():
         allowed = f"a joint of the file for each of {', '.join(JOINTS)}"
         require(joint in JOINTS and _is_text(node), f"joints.{joint}", allowed)
@@ -126,6 +147,15 @@ def _check_map(path: Path, content: object) -> None:
         require(joint in joints, f"joints.{joint}", f"a joint's name; {', '.join(REQUIRED)} are needed")
     node, count = Counter(joints.values()).most_common(1)[0]
     require(count == 1, f"joints: {node}", "each of the file's joints once")
+
+
+def _is_rest(value: object) -> bool:
+    if not isinstance(value, dict):
+        return value == FOUND or (isinstance(value, int) and not isinstance(value, bool) and value >= 0)
+    return bool(value) and all(
+        _is_text(node) and isinstance(turns, list) and all(is_number(turn, -360, 360) for turn in turns)
+        for node, turns in value.items()
+    )
 
 
 def _is_text(value: object) -> bool:

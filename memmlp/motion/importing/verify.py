@@ -1,97 +1,79 @@
-"""The check of an import: compares the written clip with the BVH file that it came from."""
+"""The check of files: imports each, reads back what an import would keep, and compares."""
 
 from __future__ import annotations
 
-import math
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-import torch
-
+from memmlp.common.errors import InputError
 from memmlp.common.progress import progress_bar
-from memmlp.motion.body import JOINTS, load_rest_joints
+from memmlp.motion.body import load_rest_joints
 from memmlp.motion.formats.bvh import find_bvh, read_bvh
 from memmlp.motion.formats.npz import read_clip, write_clip
-from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
-from memmlp.motion.importing.retarget import fit, limb_angles, retarget
-from memmlp.motion.importing.skeleton import LIMBS, Z_UP, find_skeleton, load_skeleton
+from memmlp.motion.importing.convert import AUTO, convert
+from memmlp.motion.importing.fidelity import Fidelity, compare
+from memmlp.motion.importing.skeleton import find_skeleton, load_skeleton
 
 
 @dataclass(frozen=True)
-class Fidelity:
-    """How far an import is from its source, in the worst frame.
+class Unusable:
+    """A file that can't be imported.
 
     Attributes:
-        name: the file's path below the source folder.
-        skeleton: name of the skeleton map.
-        frames: number of frames compared.
-        worst_mm: largest distance, in millimetres, between a mapped joint in the file and in the import posed
-            on the source's own bones.
-        worst_joint: the body joint where that is.
-        worst_degrees: largest angle between a limb (upper arm, forearm, thigh, shin) in the file and on the
-            body.
+        name: its path below the folder.
+        reason: why, in one line.
     """
 
     name: str
-    skeleton: str
-    frames: int
-    worst_mm: float
-    worst_joint: str
-    worst_degrees: float
+    reason: str
 
 
-def verify(path: Path, *, skeleton: str | None = None, body: str = "builtin", name: str = "") -> Fidelity:
-    """Import one file to an npz, read it back, and compare it with the file's own kinematics.
-
-    The file's side uses `Bvh.kinematics` alone, the other side the npz and `geometry.forward_kinematics`
-    alone. A joint below an unmapped source joint that turns has no bone of constant length: the distance then
-    shows it.
+def verify(
+    path: Path,
+    *,
+    skeleton: str | None = None,
+    body: str = "builtin",
+    name: str | None = None,
+    floor: str | float = AUTO,
+) -> Fidelity:
+    """Import a file, read the npz that came of it, and compare it with the file.
 
     Args:
-        path: the BVH file.
+        path: the file.
         skeleton: a shipped map or the path of one; by default the file's joints decide.
-        body: "builtin", or an SMPL-H model.npz.
+        body: `builtin`, or an SMPL-H model.npz.
         name: the name to report; by default the file's.
+        floor: as `convert` has it.
 
     Raises:
         InputError: if the file is damaged or fits no map.
     """
-    bvh, rest = read_bvh(path), load_rest_joints(body)
-    chosen = load_skeleton(skeleton) if skeleton else find_skeleton(bvh)
+    recording, rest = read_bvh(path), load_rest_joints(body)
+    chosen = load_skeleton(skeleton) if skeleton else find_skeleton(recording)
+    converted = convert(recording, chosen, rest, name=name or path.name, floor=floor)
     with tempfile.TemporaryDirectory() as folder:
-        write_clip(Path(folder) / "clip.npz", retarget(bvh, chosen, rest))
-        clip = read_clip(Path(folder) / "clip.npz", name)
-    fitted = fit(bvh, chosen, rest)
-    nodes = bvh.kinematics()[1][int(chosen.calibration_frame) :, fitted.nodes]
-    expected = chosen.unit * nodes @ (Z_UP @ chosen.upright).T
-    local = axis_angle_to_matrix(torch.from_numpy(clip.poses))
-    root = torch.from_numpy(rest[0] + clip.trans)
-    own_root = (root - local[:, 0] @ torch.from_numpy(fitted.anchor)) / fitted.scale
-    own = forward_kinematics(local, own_root, torch.from_numpy(fitted.own_rest))[1].numpy()
-    distance = np.linalg.norm(own - expected, axis=-1).max(0)
-    bodily = forward_kinematics(local, root, torch.from_numpy(rest))[1].numpy()
-    start, end = list(LIMBS), list(LIMBS.values())
-    angles = limb_angles(bodily[:, end] - bodily[:, start], expected[:, end] - expected[:, start])
-    return Fidelity(
-        name=name or path.name,
-        skeleton=chosen.name,
-        frames=len(clip),
-        worst_mm=1000 * float(distance.max()),
-        worst_joint=JOINTS[int(distance.argmax())],
-        worst_degrees=math.degrees(float(angles.max())),
-    )
+        write_clip(Path(folder) / "clip.npz", converted.clip)
+        clip = read_clip(Path(folder) / "clip.npz", converted.clip.name)
+    return compare(clip, converted.performance, rest, chosen.name)
 
 
-def verify_folder(source: Path, *, skeleton: str | None = None, body: str = "builtin") -> list[Fidelity]:
+def verify_folder(
+    source: Path, *, skeleton: str | None = None, body: str = "builtin", floor: str | float = AUTO
+) -> Iterator[Fidelity | Unusable]:
     """Verify each BVH file of a folder, or a single one.
 
     Raises:
-        InputError: at the first bad file.
+        InputError: if there is no file, or no such skeleton or body.
     """
     files = find_bvh(source)
-    return [
-        verify(path, skeleton=skeleton, body=body, name=relative.as_posix())
-        for relative, path in progress_bar(files.items(), "verify", len(files))
-    ]
+    load_rest_joints(body)
+    if skeleton is not None:
+        load_skeleton(skeleton)
+    for relative, path in progress_bar(files.items(), "verify", len(files)):
+        name = relative.as_posix()
+        try:
+            yield verify(path, skeleton=skeleton, body=body, name=name, floor=floor)
+        except InputError as error:
+            yield Unusable(name, str(error).replace(f"{path}: ", ""))

@@ -1,0 +1,229 @@
+"""What a body looks like: its segments, the stance from which a skeleton is read, how its joints lie in it.
+
+All positions (..., 22, 3) here are in Y-up axes and metres. `mapped` (22,) says which joints a file has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from memmlp.motion.body import HEAD, JOINTS, PARENTS
+
+CHAINS = ((0, 3, 6, 9, 12, 15), (1, 4, 7, 10), (2, 5, 8, 11), (13, 16, 18, 20), (14, 17, 19, 21))
+HIPS, SHOULDERS = (1, 2), (16, 17)  # left, right
+LIMBS = {1: 4, 2: 5, 4: 7, 5: 8, 16: 18, 17: 19, 18: 20, 19: 21}  # joint -> the other end of its bone
+LEGS = {joint: end for joint, end in LIMBS.items() if joint < 6}
+FEET = {7: 10, 8: 11}
+SPINE, ANKLES = (3, 6, 9, 12), (7, 8)
+HINGES = {1: (1.0, 0.0, 0.0), 2: (1.0, 0.0, 0.0), 16: (0.0, -1.0, 0.0), 17: (0.0, 1.0, 0.0)}
+"""Thighs and upper arms -> the axis about which the joint at their end bends, in the body's rest pose."""
+
+LEFT, UP, DOWN = np.eye(3)[0], np.eye(3)[1], -np.eye(3)[1]
+TRUNK, THIGHS, SHINS = 45.0, 60.0, 75.0  # degrees: largest angles from the vertical in a stance, a runner's
+LEVEL = 30.0  # degrees: largest angle of the line of the hips from the horizontal in a stance
+ARMS = 100.0  # degrees: largest angle of an upper arm or forearm from a T-pose's in a stance
+SHORTEST = 1e-3  # metres
+BENT = 15.0  # degrees by which a knee or elbow must bend in a stance to show its axis
+HINGE_BEND, HINGE_AGREEMENT = 0.1, 0.8  # mean sine of the bend and agreement of its axes, to be known
+
+
+class Segment(NamedTuple):
+    """The straight line from a joint to the next one of its chain that the file has.
+
+    Attributes:
+        start: the joint whose rotation turns it.
+        end: the joint at its end.
+    """
+
+    start: int
+    end: int
+
+    @property
+    def name(self) -> str:
+        """The segment in words."""
+        return f"{JOINTS[self.start]} to {JOINTS[self.end]}"
+
+
+def segments(mapped: np.ndarray) -> tuple[Segment, ...]:
+    """Return the segments of trunk, neck, arms, legs and feet between mapped joints."""
+    chains = [[joint for joint in chain if mapped[joint]] for chain in CHAINS]
+    return tuple(Segment(*pair) for chain in chains for pair in pairwise(chain))
+
+
+def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the angles (...), degrees, between directions (..., 3); accurate at 0."""
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1)))
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors (..., 3) with length 1."""
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def least_rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return the smallest rotations (..., 3, 3) that turn directions (..., 3) onto others.
+
+    Where a direction has no length there is nothing to turn, and the identity is returned.
+    """
+    axis = np.cross(source, target)
+    norm = np.linalg.norm(axis, axis=-1, keepdims=True)
+    angle = np.arctan2(norm, (source * target).sum(-1, keepdims=True))
+    turn = axis * np.divide(angle, norm, out=np.zeros_like(norm), where=norm > 0)
+    return Rotation.from_rotvec(turn.reshape(-1, 3)).as_matrix().reshape(*turn.shape, 3)
+
+
+def aligned(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Return the rotation (3, 3) that turns one direction exactly, and another as far as that lets it.
+
+    Each is a pair: what is turned, and what it is turned onto.
+    """
+    (a, to_a), (b, to_b) = first, second
+    once = least_rotation(a, to_a)
+    axis = unit(to_a)
+    turned, wanted = (v - (v @ axis) * axis for v in (once @ b, to_b))
+    angle = np.arctan2(np.cross(turned, wanted) @ axis, turned @ wanted)
+    return Rotation.from_rotvec(angle * axis).as_matrix() @ once
+
+
+# A stance
+
+
+def why_no_stance(pose: np.ndarray) -> str | None:
+    """Say why a pose (22, 3) isn't that of a person who stands upright; None where it is.
+
+    Which way the person faces, and what is left and what is right, does not matter here.
+    """
+    for start, end in ((0, HEAD), *LIMBS.items()):
+        if np.linalg.norm(pose[end] - pose[start]) < SHORTEST:
+            return f"{JOINTS[start]} and {JOINTS[end]} are at the same place"
+    if np.linalg.norm(pose[HIPS[0]] - pose[HIPS[1]]) < SHORTEST:
+        return "the hips are at the same place"
+    for start, end, along, most in _verticals():
+        angle = angles(pose[end] - pose[start], along)
+        word = "up" if along is UP else "down"
+        if angle > most:
+            return f"{JOINTS[start]} to {JOINTS[end]} is {angle:.0f} degrees from {word}"
+    tilt = abs(90 - angles(pose[HIPS[0]] - pose[HIPS[1]], UP))
+    if tilt > LEVEL:
+        return f"the line of the hips is {tilt:.0f} degrees from level"
+    return None
+
+
+def wrong_sides(pose: np.ndarray, mapped: np.ndarray) -> str | None:
+    """Say what contradicts the hips about left and forward in a stance (22, 3); None where nothing does."""
+    left = pose[HIPS[0]] - pose[HIPS[1]]
+    forward = np.cross(left, UP)
+    if (pose[SHOULDERS[0]] - pose[SHOULDERS[1]]) @ left < 0:
+        return "the left shoulder is on the side of the right hip"
+    feet = [pose[toes] - pose[ankle] for ankle, toes in FEET.items() if mapped[ankle] and mapped[toes]]
+    if feet and unit(np.mean(feet, axis=0)) @ unit(forward) < 0:
+        return "the feet point backward, so left and right may be swapped"
+    return None
+
+
+def arms_lifted(pose: np.ndarray) -> bool:
+    """Return whether an arm of a stance that faces +Z (22, 3) is far from a T-pose's."""
+    ends = ((16, 18, LEFT), (18, 20, LEFT), (17, 19, -LEFT), (19, 21, -LEFT))
+    return any(angles(pose[end] - pose[start], along) > ARMS for start, end, along in ends)
+
+
+def unevenness(poses: np.ndarray) -> np.ndarray:
+    """Return how far poses (N, 22, 3) are from standing straight: a sum of angles (N,), degrees."""
+    total = sum(angles(poses[:, end] - poses[:, start], along) for start, end, along, _ in _verticals())
+    left, across = (poses[:, a] - poses[:, b] for a, b in (HIPS, SHOULDERS))
+    bends = [angles(poses[:, e] - poses[:, m], poses[:, m] - poses[:, s]) for s, m, e in _joints_of_arms()]
+    return total + np.abs(90 - angles(left, UP)) + angles(left, across) + 0.5 * sum(bends)
+
+
+def facing(pose: np.ndarray) -> np.ndarray:
+    """Return the turn (3, 3) about the vertical after which a stance (22, 3) has its left on +X."""
+    left = pose[HIPS[0]] - pose[HIPS[1]]
+    return Rotation.from_rotvec(np.arctan2(left[2], left[0]) * UP).as_matrix()
+
+
+def _verticals() -> Iterator[tuple[int, int, np.ndarray, float]]:
+    """Yield the segments that are vertical in a stance, which way, and how many degrees they may be off."""
+    yield 0, HEAD, UP, TRUNK
+    for start, end in LEGS.items():
+        yield start, end, DOWN, THIGHS if start in HIPS else SHINS
+
+
+def _joints_of_arms() -> tuple[tuple[int, int, int], ...]:
+    return ((16, 18, 20), (17, 19, 21))
+
+
+# Joints in a stance
+
+
+def orientations(stance: np.ndarray, mapped: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Return how a body's joints must be turned (22, 3, 3) to stand as in a stance (22, 3) that faces +Z.
+
+    Every segment points as in the stance. About themselves, the pelvis follows the hips, the chest the
+    shoulders, the spine both; limbs take the least turn from the body's rest pose (22, 3), the lower ones
+    from the upper ones; the head is upright and looks where the chest faces. Wrists and toes go on straight.
+    """
+    result = np.tile(np.eye(3), (len(JOINTS), 1, 1))
+    ends = {segment.start: segment.end for segment in segments(mapped)}
+    hips, shoulders = (unit(stance[left] - stance[right]) for left, right in (HIPS, SHOULDERS))
+    chest = aligned((UP, UP), (LEFT, shoulders))
+    trunk = next(end for end in (*SPINE, HEAD) if _long(stance, 0, end) and mapped[end])
+    result[0] = aligned((rest[1] - rest[2], hips), (rest[trunk] - rest[0], stance[trunk] - stance[0]))
+    for step, joint in enumerate(SPINE, start=1):
+        left = unit(hips + min(step / 3, 1.0) * (shoulders - hips))
+        result[joint] = aligned((UP, UP), (LEFT, left))
+    result[HEAD] = chest
+    for joint in range(1, len(JOINTS)):
+        parent = PARENTS[joint]
+        if joint in (4, 5, 18, 19) or not mapped[joint]:
+            result[joint] = result[parent]
+        elif joint in (13, 14, 16, 17):
+            result[joint] = chest
+        end = ends.get(joint)
+        if end is None:
+            result[joint] = result[joint] if joint == HEAD else result[parent]
+        elif _long(stance, joint, end):
+            bone = result[joint] @ (rest[end] - rest[joint])
+            result[joint] = least_rotation(bone, stance[end] - stance[joint]) @ result[joint]
+    return result
+
+
+def _long(pose: np.ndarray, start: int, end: int) -> bool:
+    return bool(np.linalg.norm(pose[end] - pose[start]) > SHORTEST)
+
+
+def bend(stance: np.ndarray, joint: int) -> np.ndarray | None:
+    """Return the axis (3,) of a knee or elbow that is bent in a stance (22, 3); None where it is straight."""
+    middle, end = LIMBS[joint], LIMBS[LIMBS[joint]]
+    upper, lower = stance[middle] - stance[joint], stance[end] - stance[middle]
+    return unit(np.cross(upper, lower)) if angles(upper, lower) > BENT else None
+
+
+def hinge(upper: np.ndarray, positions: np.ndarray, joint: int) -> np.ndarray | None:
+    """Find the axis about which the joint at the end of a thigh or upper arm bends, from the motion.
+
+    Args:
+        upper: global rotations (N, 3, 3) of the thigh or upper arm.
+        positions: the joints' positions (N, 22, 3).
+        joint: the joint that turns it, of `HINGES`.
+
+    Returns:
+        The axis (3,) in the thigh's or upper arm's own frame; None where it bends too little or about too
+        many axes to tell.
+    """
+    middle, end = LIMBS[joint], LIMBS[LIMBS[joint]]
+    bones = unit(positions[:, middle] - positions[:, joint]), unit(positions[:, end] - positions[:, middle])
+    bends = np.einsum("nij,ni->nj", upper, np.cross(*bones))
+    total, sizes = bends.sum(0), np.linalg.norm(bends, axis=-1)
+    known = sizes.mean() > HINGE_BEND and np.linalg.norm(total) > HINGE_AGREEMENT * sizes.sum()
+    return unit(total) if known else None
+
+
+def turned_to_hinge(orientation: np.ndarray, joint: int, bone: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Return an orientation (3, 3) of a limb, turned about its bone (3,) to bend about an axis (3,)."""
+    along = orientation @ bone
+    return aligned((along, along), (orientation @ np.array(HINGES[joint]), axis)) @ orientation

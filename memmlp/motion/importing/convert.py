@@ -1,0 +1,77 @@
+"""One recording on its own skeleton -> a clip on the body: axes, stance, rotations, floor, and the check."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from memmlp.motion.clip import Clip
+from memmlp.motion.importing.axes import settle
+from memmlp.motion.importing.fidelity import Fidelity, compare, pose
+from memmlp.motion.importing.floor import find_floor
+from memmlp.motion.importing.recording import Performance, Recording, perform
+from memmlp.motion.importing.retarget import fit, to_body
+from memmlp.motion.importing.skeleton import SkeletonMap
+
+AUTO, NONE = "auto", "none"  # what a floor may be beside a height
+
+
+@dataclass(frozen=True)
+class Converted:
+    """A recording brought to the body.
+
+    Attributes:
+        clip: the motion, world (Z up), its floor at 0 where one is known.
+        performance: what it was made from.
+        fidelity: how far it is from that, and what is wrong with it.
+        floor: height of the floor in the recording, metres on the body's scale, which was taken off; None
+            where it is unknown or was not asked for.
+        rest_pose: the pose from which the skeleton was read, in words.
+    """
+
+    clip: Clip
+    performance: Performance
+    fidelity: Fidelity
+    floor: float | None
+    rest_pose: str
+
+
+def convert(
+    recording: Recording,
+    skeleton: SkeletonMap,
+    rest: np.ndarray,
+    *,
+    name: str,
+    fps: float | None = None,
+    floor: str | float = AUTO,
+) -> Converted:
+    """Bring a recording to a body.
+
+    Args:
+        recording: the file's motion.
+        skeleton: its skeleton map.
+        rest: the body's rest joints (22, 3), metres.
+        name: the clip's name.
+        fps: the true frame rate, Hz; by default the file's.
+        floor: `auto`, found from the feet; `none`, left as it is; or its height in the file, metres.
+
+    Raises:
+        InputError: as `retarget.fit` and `recording.perform` do.
+    """
+    settled = settle(recording, skeleton)
+    performance = perform(recording, settled)
+    fitted = fit(recording, settled, performance, rest)
+    clip = to_body(performance, fitted, rest, name, fps or recording.fps)
+    height = find_floor(pose(clip, rest)[1], clip.fps) if floor == AUTO else None
+    if isinstance(floor, float):
+        height = floor * fitted.scale
+    clip = lowered(clip, height or 0.0)
+    return Converted(
+        clip, performance, compare(clip, performance, rest, skeleton.name), height, fitted.rest_pose
+    )
+
+
+def lowered(clip: Clip, height: float) -> Clip:
+    """Return a clip moved down by a height, metres."""
+    return replace(clip, trans=clip.trans - [0.0, 0.0, height])

@@ -1,0 +1,220 @@
+"""The check of an import: a clip beside the file that it came from, and beside what people look like.
+
+Nothing here uses what the import was fitted with. The clip is posed on the built-in body (or another) by
+forward kinematics; the file's joints are taken from the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from memmlp.motion.body import HEAD, JOINTS, PARENTS
+from memmlp.motion.clip import Clip
+from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
+from memmlp.motion.importing.anatomy import FEET, HIPS, LIMBS, SHOULDERS, angles, segments, unit
+from memmlp.motion.importing.recording import Performance
+from memmlp.motion.importing.skeleton import Z_UP
+
+MOST_MM, MOST_DEGREES = 1.0, 3.0  # the largest errors that an import may have
+SHORTEST = 1e-2  # metres: a shorter segment has no direction to speak of
+TRUNK = 25.0  # degrees between pelvis to head on the body and in the file
+UPRIGHT_SHARE = 0.5  # of the frames, in which the head must be above the pelvis
+BENT, FORWARD_SHARE = 0.35, 0.3  # sine of a knee's bend that counts; share of it that may be the wrong way
+LENGTHS = (0.5, 2.0)  # of a limb to the legs' length, over the same on the body
+HEAD_TURN = 90.0  # degrees
+SIDES = 1.25  # left over right
+FLOOR = 0.3  # metres: how far from the floor feet may stay through a whole clip
+STRETCH = 0.02  # metres by which a segment may change its length
+
+
+class Worst(NamedTuple):
+    """The largest of some errors.
+
+    Attributes:
+        value: the error.
+        where: the joint or segment.
+        frame: the frame of the clip.
+    """
+
+    value: float
+    where: str
+    frame: int
+
+    def __str__(self) -> str:
+        return f"{self.where}, frame {self.frame}"
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """How far an import is from its file, in the worst frame.
+
+    Attributes:
+        name: the file's path below the folder.
+        skeleton: the map's name.
+        frames: number of frames compared.
+        mm: largest distance, millimetres, between a joint in the file and in the import posed on the file's
+            own bones; a bone is as long as it is in the file at that frame.
+        degrees: largest angle, degrees, between the directions of a segment on the body and in the file.
+        faults: what is wrong, a sentence each; what `data verify` and `data import` say of the clip.
+    """
+
+    name: str
+    skeleton: str
+    frames: int
+    mm: Worst
+    degrees: Worst
+    faults: tuple[str, ...]
+
+
+def compare(clip: Clip, performance: Performance, rest: np.ndarray, skeleton: str) -> Fidelity:
+    """Compare a clip on a body, rest joints (22, 3) in metres, with the performance that it came from."""
+    rotations, positions = pose(clip, rest)
+    expected = performance.positions @ Z_UP.T
+    mm = _on_own_bones(rotations, expected, performance.mapped)
+    degrees = _segments(positions, expected, performance.mapped)
+    found = Fidelity(clip.name, skeleton, len(clip), mm, degrees, ())
+    faults = (
+        *_unlike_the_file(found, positions, expected, performance.mapped),
+        *_unlike_people(rotations, positions, performance.mapped),
+        *_odd_lengths(expected, rest),
+    )
+    return replace(found, faults=faults)
+
+
+def pose(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return global rotations (N, 22, 3, 3) and positions (N, 22, 3) of a clip on a body."""
+    local = axis_angle_to_matrix(torch.from_numpy(clip.poses))
+    joints = torch.from_numpy(rest)
+    rotations, positions = forward_kinematics(local, joints[0] + torch.from_numpy(clip.trans), joints)
+    return rotations.numpy(), positions.numpy()
+
+
+def _on_own_bones(rotations: np.ndarray, expected: np.ndarray, mapped: np.ndarray) -> Worst:
+    """Return the worst distance, mm, of joints posed by a clip's rotations on the bones of the file.
+
+    Where a bone points from its joint is the mean over the frames, so rotations that do not turn with the
+    file's joints put the next joint elsewhere.
+    """
+    posed = expected.copy()
+    for joint in np.flatnonzero(mapped)[1:]:
+        parent = PARENTS[joint]
+        while not mapped[parent]:
+            parent = PARENTS[parent]
+        there = expected[:, joint] - expected[:, parent]
+        length = np.linalg.norm(there, axis=-1, keepdims=True)
+        own = np.einsum("nij,ni->nj", rotations[:, parent], there).mean(0)
+        size = np.linalg.norm(own)
+        way = rotations[:, parent] @ (own / size) * length if size > 1e-9 else there
+        posed[:, joint] = posed[:, parent] + way
+    return _worst(1000 * np.linalg.norm(posed - expected, axis=-1), JOINTS)
+
+
+def _segments(positions: np.ndarray, expected: np.ndarray, mapped: np.ndarray) -> Worst:
+    """Return the worst angle, degrees, between segments on the body and in the file."""
+    named = {segment.name: (segment.start, segment.end) for segment in segments(mapped)}
+    named |= {"right_hip to left_hip": HIPS[::-1]}
+    off = np.zeros((len(positions), len(named)))
+    for column, (start, end) in enumerate(named.values()):
+        there = expected[:, end] - expected[:, start]
+        long = np.linalg.norm(there, axis=-1) > SHORTEST
+        off[:, column] = np.where(long, angles(positions[:, end] - positions[:, start], there), 0.0)
+    return _worst(off, list(named))
+
+
+def _worst(errors: np.ndarray, names: list[str] | tuple[str, ...]) -> Worst:
+    """Return the largest of errors (N, names)."""
+    frame, column = np.unravel_index(int(errors.argmax()), errors.shape)
+    return Worst(float(errors[frame, column]), names[column], int(frame))
+
+
+# What is wrong
+
+
+def _unlike_the_file(
+    found: Fidelity, positions: np.ndarray, expected: np.ndarray, mapped: np.ndarray
+) -> Iterator[str]:
+    """Yield what differs from the file."""
+    if found.mm.value > MOST_MM:
+        where, frame = found.mm.where, found.mm.frame
+        yield f"{where} is {found.mm.value:.1f} mm off on the file's own bones in frame {frame}"
+    if found.degrees.value > MOST_DEGREES:
+        where, frame = found.degrees.where, found.degrees.frame
+        yield f"{where} points {found.degrees.value:.1f} degrees off the file's in frame {frame}"
+    trunk = [array[:, HEAD] - array[:, 0] for array in (positions, expected)]
+    off = angles(*trunk)
+    if np.median(off) > TRUNK:
+        yield f"pelvis to head points {np.median(off):.0f} degrees off the file's in half of the frames"
+    for segment in segments(mapped):
+        lengths = np.linalg.norm(expected[:, segment.end] - expected[:, segment.start], axis=-1)
+        if np.ptp(lengths) > STRETCH:
+            change = f"{segment.name} changes its length by {1000 * np.ptp(lengths):.0f} mm in the file"
+            yield f"{change}, which no body's does: a joint between them turns, or the map is wrong"
+
+
+def _unlike_people(rotations: np.ndarray, positions: np.ndarray, mapped: np.ndarray) -> Iterator[str]:
+    """Yield what no person's body does."""
+    upright = (positions[:, HEAD, 2] > positions[:, 0, 2]).mean()
+    if upright < UPRIGHT_SHARE:
+        yield f"the head is below the pelvis in {1 - upright:.0%} of the frames"
+    wrong = _forward_bends(rotations, positions)
+    if wrong > FORWARD_SHARE:
+        yield f"the knees bend forward in {wrong:.0%} of their bends"
+    yield from _backward_feet(rotations, positions, mapped)
+    yield from _odd_head(rotations)
+    lowest = float(np.quantile(positions[:, [7, 8, 10, 11], 2].min(1), 0.05))
+    if abs(lowest) > FLOOR:
+        side = "above" if lowest > 0 else "below"
+        yield f"the feet stay {abs(lowest):.2f} m {side} the floor"
+
+
+def _forward_bends(rotations: np.ndarray, positions: np.ndarray) -> float:
+    """Return the share of all bending of the knees that is forward, to the pelvis."""
+    bends = []
+    for hip in HIPS:
+        knee, ankle = LIMBS[hip], LIMBS[LIMBS[hip]]
+        thigh, shin = positions[:, knee] - positions[:, hip], positions[:, ankle] - positions[:, knee]
+        bends.append((np.cross(unit(thigh), unit(shin)) * rotations[:, 0, :, 0]).sum(-1))
+    strong = np.concatenate(bends)
+    strong = strong[np.abs(strong) > BENT]
+    return float((strong < 0).mean()) if len(strong) else 0.0
+
+
+def _backward_feet(rotations: np.ndarray, positions: np.ndarray, mapped: np.ndarray) -> Iterator[str]:
+    feet = [positions[:, toes] - positions[:, ankle] for ankle, toes in FEET.items() if mapped[toes]]
+    backward = [(foot * rotations[:, 0, :, 2]).sum(-1) < 0 for foot in feet]
+    if backward and np.mean(backward) > 0.5:
+        yield f"the feet point backward in {np.mean(backward):.0%} of the frames"
+
+
+def _odd_head(rotations: np.ndarray) -> Iterator[str]:
+    """Yield how the head is turned on the trunk, if no neck turns so far in half of the frames."""
+    turns = [angles(rotations[:, HEAD, :, axis], rotations[:, 0, :, axis]) for axis in (1, 2)]
+    turn = max(np.median(angle) for angle in turns)
+    if turn > HEAD_TURN:
+        yield f"the head is turned by {turn:.0f} degrees against the pelvis in half of the frames"
+
+
+def _odd_lengths(expected: np.ndarray, rest: np.ndarray) -> Iterator[str]:
+    """Yield the limbs whose lengths in the file are no body's."""
+
+    def length(at: np.ndarray, start: int, end: int) -> float:
+        return float(np.median(np.linalg.norm(at[..., end, :] - at[..., start, :], axis=-1)))
+
+    def legs(at: np.ndarray) -> float:
+        return sum(length(at, start, LIMBS[start]) for start in (1, 2, 4, 5)) / 2
+
+    for left, right in ((1, 2), (4, 5), (16, 17), (18, 19)):
+        both = [length(expected, start, LIMBS[start]) for start in (left, right)]
+        if max(both) > SIDES * min(both):
+            name = f"{JOINTS[left]} to {JOINTS[LIMBS[left]]}"
+            yield f"{name} is {both[0]:.2f} m and the right one {both[1]:.2f} m"
+    for start, end in (*LIMBS.items(), (0, HEAD), SHOULDERS):
+        share = length(expected, start, end) / legs(expected) * legs(rest) / length(rest, start, end)
+        if not LENGTHS[0] <= share <= LENGTHS[1]:
+            name = f"{JOINTS[start]} to {JOINTS[end]}"
+            yield f"{name} is {share:.2f} times as long as on a person with such legs"

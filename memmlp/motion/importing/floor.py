@@ -1,0 +1,32 @@
+"""The floor of a clip: where its feet stand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from memmlp.motion.importing.anatomy import FEET
+
+CONTACT = 0.02  # metres: height of the toe joint above the floor it stands on (the built-in body's)
+STILL = 0.15  # metres a second: a toe that stands is slower
+SECONDS = 0.2  # toes must stand as long in all for a floor to be known
+LOWEST = 0.05  # share of the standing toes that may be lower: noise, and feet that sink in
+
+
+def find_floor(positions: np.ndarray, fps: float) -> float | None:
+    """Return the height of the floor, metres: below the lowest toes that stand still.
+
+    Args:
+        positions: global joint positions (N, 22, 3), world (Z up).
+        fps: frames per second.
+
+    Returns:
+        None where no toe stands long enough for a floor to be known.
+    """
+    toes = positions[:, list(FEET.values())]
+    if len(toes) < 2:
+        return None
+    speed = np.linalg.norm(np.gradient(toes, axis=0), axis=-1) * fps
+    standing = toes[..., 2][speed < STILL]
+    if len(standing) < SECONDS * fps:
+        return None
+    return float(np.quantile(standing, LOWEST)) - CONTACT

@@ -1,0 +1,83 @@
+"""A recording's true frame rate: told by a person, beside the data, known of the file, or its header's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+
+from memmlp.common.errors import InputError
+from memmlp.motion.clip import FRAME_RATE_RANGE
+from memmlp.motion.importing.skeleton import is_number
+
+SIDECAR = "motion.yaml"  # beside the files or in a folder above them; `fps: 60` is what it may hold
+HEADER = "the header's"
+DIGITS = 16  # of a file's digest, by which it is known
+
+
+class Rate(NamedTuple):
+    """A frame rate.
+
+    Attributes:
+        fps: frames per second.
+        reason: where it is from, in words.
+    """
+
+    fps: float
+    reason: str
+
+
+def true_rate(header: float, relative: Path, sha256: str, top: Path, told: Mapping[str, float]) -> Rate:
+    """Return a file's frame rate.
+
+    Args:
+        header: the rate that the file tells, Hz.
+        relative: the file's path below `top`.
+        sha256: the file's digest.
+        top: the folder that is imported.
+        told: rates by folder below `top` ("" for all), which override everything else.
+
+    Raises:
+        InputError: if a folder's `motion.yaml` is damaged.
+    """
+    for folder in relative.parents:
+        if folder_key(folder) in told:
+            return Rate(float(told[folder_key(folder)]), f"given for {folder_key(folder) or 'all'}")
+    for folder in relative.parents:
+        fps = _sidecar(top / folder / SIDECAR)
+        if fps is not None:
+            return Rate(fps, f"in {(folder / SIDECAR).as_posix()}")
+    known = _known().get(sha256[:DIGITS])
+    return Rate(header, HEADER) if known is None else Rate(known, "known of this file")
+
+
+def folder_key(folder: Path) -> str:
+    """Return a folder below the imported one as `--fps` names it; "" is that one itself."""
+    return "" if folder == Path() else folder.as_posix()
+
+
+@cache
+def _known() -> dict[str, float]:
+    """Return the true rates of files with wrong headers, by the first digits of their digests."""
+    path = Path(__file__).with_name("known_rates.yaml")
+    return {digest: float(fps) for digest, fps in yaml.safe_load(path.read_text("utf-8")).items()}
+
+
+@cache
+def _sidecar(path: Path) -> float | None:
+    """Return the rate that a folder's `motion.yaml` tells; None where there is none."""
+    if not path.is_file():
+        return None
+    try:
+        content = yaml.safe_load(path.read_text("utf-8"))
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        raise InputError(f"{path}: {' '.join(str(error).split())[:120]}; allowed: readable YAML") from error
+    good = (
+        isinstance(content, dict) and set(content) == {"fps"} and is_number(content["fps"], *FRAME_RATE_RANGE)
+    )
+    if not good:
+        raise InputError(f"{path}: no frame rate; allowed: fps, 1 to 1000 Hz, and nothing else")
+    return float(content["fps"])

@@ -1,0 +1,119 @@
+"""The pose of a file in which the person is known to stand, from which its skeleton is read.
+
+A zero pose may be a T-pose, or nothing that a person can be: bones that lie along one axis, a folded body, a
+person who lies. Then a frame of the motion serves, or rotations that the skeleton's map gives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from memmlp.common.errors import InputError
+from memmlp.motion.importing import anatomy
+from memmlp.motion.importing.recording import Performance, Recording
+from memmlp.motion.importing.skeleton import SkeletonMap
+
+TRIED = 500  # frames of a file, evenly spread, among which a stance is looked for
+
+
+@dataclass(frozen=True)
+class RestPose:
+    """A stance, turned so that the person faces +Z (Y up, metres).
+
+    Attributes:
+        rotations: global rotations (22, 3, 3) of the mapped joints' nodes.
+        positions: their positions (22, 3).
+        source: where it is from, in words.
+        straight: whether it is a zero pose, whose limbs are taken as not turned about themselves.
+    """
+
+    rotations: np.ndarray
+    positions: np.ndarray
+    source: str
+    straight: bool
+
+
+def find_rest_pose(recording: Recording, skeleton: SkeletonMap, performance: Performance) -> RestPose:
+    """Find the pose in which the person stands: the map's, else the zero pose, else the straightest frame.
+
+    Raises:
+        InputError: if there is none, or left and right contradict each other in it.
+    """
+    if isinstance(skeleton.rest, dict):
+        return _given(recording, skeleton, performance)
+    if skeleton.rest != "auto":
+        return _frame(performance, _checked_frame(performance, int(skeleton.rest)), "given")
+    why = anatomy.why_no_stance(performance.zero)
+    if why is None:
+        eyes = np.tile(np.eye(3), (len(performance.zero), 1, 1))
+        rest = _turned(eyes, performance.zero, "the zero pose", straight=True)
+        _check_sides(performance, rest)
+        if not anatomy.arms_lifted(rest.positions):
+            return rest
+        why = "an arm is more than 100 degrees from a T-pose's"
+    return _straightest(performance, why)
+
+
+def _given(recording: Recording, skeleton: SkeletonMap, performance: Performance) -> RestPose:
+    """Return the pose whose joints have the map's rotations."""
+    assert isinstance(skeleton.rest, dict)
+    rotations, positions = (array[performance.nodes] for array in recording.posed(skeleton.rest))
+    upright = skeleton.upright
+    pose = skeleton.unit * positions @ upright.T
+    rest = _turned(upright @ rotations @ upright.T, pose, "the map's rest pose", straight=False)
+    why = anatomy.why_no_stance(rest.positions)
+    if why is not None:
+        wrong = f"rest of skeleton {skeleton.name} is no person who stands: {why}"
+        raise InputError(f"{recording.path}: {wrong}; allowed: rotations of a stance")
+    _check_sides(performance, rest)
+    return rest
+
+
+def _straightest(performance: Performance, why: str) -> RestPose:
+    """Return the frame in which the person stands straightest; `why` is what is wrong with the zero pose."""
+    frames = np.unique(np.linspace(0, len(performance) - 1, TRIED).astype(int))
+    order = frames[np.argsort(anatomy.unevenness(performance.positions[frames]), kind="stable")]
+    for frame in order:
+        if anatomy.why_no_stance(performance.positions[frame]) is None:
+            return _frame(performance, int(frame), "the straightest")
+    best = anatomy.why_no_stance(performance.positions[order[0]])
+    wrong = f"the person stands neither in the zero pose ({why}) nor in any frame (at best, {best})"
+    raise InputError(
+        f"{performance.path}: {wrong}; allowed: another up or joints, or rest, in the skeleton's map"
+    )
+
+
+def _frame(performance: Performance, frame: int, how: str) -> RestPose:
+    pose, rotations = performance.positions[frame], performance.rotations[frame]
+    rest = _turned(rotations, pose, f"frame {frame}, {how}", straight=False)
+    _check_sides(performance, rest)
+    return rest
+
+
+def _checked_frame(performance: Performance, frame: int) -> int:
+    """Return the frame's number if the person stands in it; raise InputError otherwise."""
+    if not 0 <= frame < len(performance):
+        raise InputError(
+            f"{performance.path}: no frame {frame} for rest; allowed: 0 to {len(performance) - 1}"
+        )
+    why = anatomy.why_no_stance(performance.positions[frame])
+    if why is not None:
+        raise InputError(
+            f"{performance.path}: rest: frame {frame}: {why}; allowed: a frame of a person who stands"
+        )
+    return frame
+
+
+def _turned(rotations: np.ndarray, positions: np.ndarray, source: str, straight: bool) -> RestPose:
+    """Turn a stance about the vertical to face +Z."""
+    turn = anatomy.facing(positions)
+    return RestPose(turn @ rotations, positions @ turn.T, source, straight)
+
+
+def _check_sides(performance: Performance, rest: RestPose) -> None:
+    why = anatomy.wrong_sides(rest.positions, performance.mapped)
+    if why is not None:
+        allowed = "a map with left on the left, and the file's true up axis"
+        raise InputError(f"{performance.path}: in {rest.source}, {why}; allowed: {allowed}")
