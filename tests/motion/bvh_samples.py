@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from itertools import permutations
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import PARENTS, builtin_rest_joints
+from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh import END, Bvh, EndSite, read_bvh
-from memmlp.motion.importing.retarget import fit
-from memmlp.motion.importing.skeleton import Z_UP, load_skeleton
+from memmlp.motion.importing.skeleton import Z_UP, SkeletonMap
 
+REST = builtin_rest_joints()
 # Joint, parent, offset; a * before an end site's joint, which comes with the offset only.
 DAZ = """
 hip - 0 0 0; abdomen hip 0 20.7 -0.7; chest abdomen 0 11.7 -0.5; neck chest 0 22.2 -2.2; head neck -0.2
@@ -43,7 +44,8 @@ LeftForeArm LeftArm 4.97 0 0; LeftHand LeftForeArm 3.36 0 0; *LeftHand 0.8 0 0; 
 TREES = {"cmu_daz": DAZ, "cmu_motionbuilder": MOTIONBUILDER}
 FOLDED = ("lButtock", "rButtock", "LHipJoint", "RHipJoint", "Neck1")  # unmapped, between mapped ones
 POSITIONS = ("Xposition", "Yposition", "Zposition")
-ORDERS = [tuple(axis + "rotation" for axis in order) for order in permutations("XYZ")]
+ZXY = ("Zrotation", "Xrotation", "Yrotation")
+ORDERS = [tuple(axis + "rotation" for axis in order) for order in itertools.permutations("XYZ")]
 
 
 @dataclass
@@ -86,11 +88,8 @@ class Sample:
         return [*lines, "}"]
 
 
-def person(skeleton: str, frames: int, seed: int, folded: bool = False) -> Sample:
-    """Make a file of random rotations, frame 0 being the zero pose.
-
-    Joints that lie between mapped ones turn only if `folded`.
-    """
+def tree(skeleton: str, seed: int = 3) -> Sample:
+    """Make the skeleton of `TREES`, without motion; the rotation channels' order is drawn for each joint."""
     random = np.random.default_rng(seed)
     names, parents, offsets, ends = [], [], [], []
     for entry in TREES[skeleton].replace("\n", " ").split(";"):
@@ -103,12 +102,21 @@ def person(skeleton: str, frames: int, seed: int, folded: bool = False) -> Sampl
             offsets.append([float(word) for word in rest[1:]])
     channels = [ORDERS[random.integers(len(ORDERS))] for _ in names]
     channels[0] = (*POSITIONS, *channels[0])
-    values = random.uniform(-180, 180, (frames, sum(map(len, channels))))
+    return Sample(names, parents, offsets, ends, channels, np.empty((0, sum(map(len, channels)))))
+
+
+def person(skeleton: str, frames: int, seed: int, folded: bool = False) -> Sample:
+    """Make a file of random rotations, frame 0 being the zero pose.
+
+    Joints that lie between mapped ones turn only if `folded`.
+    """
+    sample, random = tree(skeleton, seed), np.random.default_rng([seed, 1])
+    values = random.uniform(-180, 180, (frames, sample.values.shape[1]))
     values[0, 3:] = 0
-    for joint, name in enumerate(names):
+    for joint, name in enumerate(sample.names):
         if name in FOLDED and not folded:
             values[:, 3 + 3 * joint : 6 + 3 * joint] = 0
-    return Sample(names, parents, offsets, ends, channels, values)
+    return replace(sample, values=values)
 
 
 def mutate(data: bytes, seed: int) -> bytes:
@@ -179,31 +187,117 @@ def refuse(start: Path | str, *said: str) -> Iterator[None]:
         assert part in message
 
 
-def performed(skeleton: str, clip: Clip, seed: int = 3) -> Sample:
-    """Write a clip on the built-in body as a BVH file of a shipped skeleton, behind the zero pose.
-
-    `retarget` returns the same clip, except that body joints without a joint in the file keep to their
-    parents.
-    """
-    sample, chosen, rest = (
-        person(skeleton, len(clip) + 1, seed),
-        load_skeleton(skeleton),
-        builtin_rest_joints(),
-    )
-    fitted, world = fit(sample.hierarchy(), chosen, rest), Z_UP @ chosen.upright
-    body = body_rotations(clip)
-    turned = {}
-    for joint, node in reversed(list(enumerate(fitted.nodes))):  # of joints that share a node the first
-        turned[int(node)] = world.T @ body[:, joint] @ fitted.corrections[joint].T @ chosen.upright
-    hips = clip.trans + rest[0] - body[:, 0] @ fitted.anchor
-    sample.values[1:, :3] = hips @ world / (fitted.scale * chosen.unit)
-    for joint, parent in enumerate(sample.parents):
-        above = turned[parent] if parent >= 0 else np.eye(3)
-        local = np.swapaxes(np.broadcast_to(above, body[:, 0].shape), 1, 2) @ turned.setdefault(joint, above)
-        order = "".join(channel[0] for channel in sample.channels[joint][-3:])
-        angles = Rotation.from_matrix(local).as_euler(order, degrees=True)
-        sample.values[1:, 3 + 3 * joint : 6 + 3 * joint] = angles
+def own_tree(chosen: SkeletonMap) -> Sample:
+    """Make a skeleton of just the nodes that a map names, somewhat unlike the built-in body, in a T-pose."""
+    order = [joint for joint in depth_first() if JOINTS[joint] in chosen.joints]
+    at = (REST * [1.1, 0.9, 1.0] + [0.0, 0.0, 0.01]) @ file_axes(chosen).T / (chosen.unit or 0.01)
+    sample = Sample([], [], [], [], [], np.empty((0, 0)))
+    for joint in order:
+        parent = next((above for above in ancestors(joint) if above in order), None)
+        above = None if parent is None else chosen.joints[JOINTS[parent]]
+        offset = at[joint] - at[parent or 0]
+        if chosen.joints[JOINTS[joint]].endswith(END):
+            sample.ends.append((sample.names.index(str(above)), offset.tolist()))
+            continue
+        sample.names.append(chosen.joints[JOINTS[joint]])
+        sample.parents.append(-1 if above is None else sample.names.index(above))
+        sample.offsets.append(offset.tolist())
+        sample.channels.append((*(POSITIONS if above is None else ()), *ZXY))
     return sample
+
+
+def depth_first(joint: int = 0) -> list[int]:
+    """The body's joints in the order of a file."""
+    below = [depth_first(child) for child, parent in enumerate(PARENTS) if parent == joint]
+    return [joint, *itertools.chain(*below)]
+
+
+def ancestors(joint: int) -> list[int]:
+    line = [PARENTS[joint]]
+    while line[-1] > 0:
+        line.append(PARENTS[line[-1]])
+    return [above for above in line if above >= 0]
+
+
+def file_axes(chosen: SkeletonMap) -> np.ndarray:
+    """The rotation from Y-up axes to those of a map's files."""
+    return Z_UP if chosen.up == "z" else np.eye(3)
+
+
+def performed(
+    chosen: SkeletonMap,
+    clip: Clip,
+    *,
+    sample: Sample | None = None,
+    corrections: np.ndarray | None = None,
+    turns: np.ndarray | None = None,
+) -> Sample:
+    """Write a clip on the built-in body as a BVH file of a map's skeleton.
+
+    Args:
+        chosen: the map; where it has a calibration frame, the zero pose of the unturned file is frame 0.
+        clip: the motion.
+        sample: the skeleton, in a T-pose; by default `own_tree`.
+        corrections: (22, 3, 3); a node's rotation times that is the body joint's.
+        turns: rotations (joints, 3, 3), by which each of the file's joints is turned in the zero pose; the
+            motion is the same.
+    """
+    sample = sample or own_tree(chosen)
+    axes = file_axes(chosen)
+    body = body_rotations(clip)
+    world = axes @ Z_UP.T
+    corrections = np.tile(np.eye(3), (len(JOINTS), 1, 1)) if corrections is None else corrections
+    turned = np.empty((len(clip) + 1, len(sample.names), 3, 3))
+    turned[0] = np.eye(3)
+    counterparts = {
+        node: joint for joint, node in reversed(list(zip(JOINTS, joints_nodes(chosen), strict=True)))
+    }
+    for index, (name, parent) in enumerate(zip(sample.names, sample.parents, strict=True)):
+        joint = counterparts.get(name)
+        if joint is None:
+            turned[1:, index] = turned[1:, parent]
+        else:
+            own = body[:, JOINTS.index(joint)] @ corrections[JOINTS.index(joint)].T
+            turned[1:, index] = world @ own @ axes.T
+    root = (clip.trans + REST[0]) @ world.T / (chosen.unit or 0.01)
+    values = [np.concatenate([np.zeros((1, 3)), root])]
+    turns = np.tile(np.eye(3), (len(sample.names), 1, 1)) if turns is None else turns
+    offsets = np.array(sample.offsets)
+    for joint, parent in enumerate(sample.parents):
+        above, turn = (
+            (turned[:, parent] @ turns[parent], turns[parent])
+            if parent >= 0
+            else (np.eye(3)[None], np.eye(3))
+        )
+        local = np.swapaxes(above, 1, 2) @ turned[:, joint] @ turns[joint]
+        order = "".join(channel[0] for channel in sample.channels[joint][-3:])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # gimbal lock: the rotation is right
+            values.append(Rotation.from_matrix(local).as_euler(order, degrees=True))
+        offsets[joint] = turn.T @ offsets[joint]
+    ends = [(joint, (turns[joint].T @ offset).tolist()) for joint, offset in sample.ends]
+    table = np.concatenate(values, 1)[0 if chosen.calibration_frame else 1 :]
+    return replace(sample, offsets=offsets.tolist(), ends=ends, values=table)
+
+
+def joints_nodes(chosen: SkeletonMap) -> list[str]:
+    """The node of each body joint; "" where it has none."""
+    return [chosen.joints.get(joint, "") for joint in JOINTS]
+
+
+def rest_turns(chosen: SkeletonMap, sample: Sample) -> np.ndarray:
+    """The joints' rotations (joints, 3, 3) in a map's `rest`: turned by these, that pose is a T-pose."""
+    assert isinstance(chosen.rest, dict)
+    turns = np.empty((len(sample.names), 3, 3))
+    for joint, (name, parent) in enumerate(zip(sample.names, sample.parents, strict=True)):
+        order = "".join(channel[0] for channel in sample.channels[joint][-3:])
+        own = Rotation.from_euler(order, chosen.rest.get(name, [0, 0, 0]), degrees=True).as_matrix()
+        turns[joint] = turns[parent] @ own if parent >= 0 else own
+    return turns
+
+
+def random_turns(sample: Sample, seed: int) -> np.ndarray:
+    return Rotation.random(len(sample.names), rng=np.random.default_rng(seed)).as_matrix()
 
 
 def body_rotations(clip: Clip) -> np.ndarray:

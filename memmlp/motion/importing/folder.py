@@ -23,7 +23,7 @@ from memmlp.motion.importing.convert import AUTO, convert, lowered
 from memmlp.motion.importing.rates import folder_key, true_rate
 from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.skeleton import SkeletonMap, find_skeleton, is_number, load_skeleton
-from memmlp.motion.preparing.splits import group_names
+from memmlp.motion.preparing.groups import Grouping
 
 RECORD = "import.json"
 
@@ -115,7 +115,8 @@ def import_folder(source: Path, out: Path, how: How | None = None) -> ImportRepo
     _check_import(files, out, how.fps)
     rest, clips, skipped = load_rest_joints(how.body), [], []
     chosen = None if how.skeleton is None else load_skeleton(how.skeleton)
-    takes = group_names([relative.as_posix() for relative in files], how.takes)
+    sources = [relative.as_posix() for relative in files]
+    takes = Grouping(how.takes).names(dict(zip(sources, sources, strict=True)))
     maps: dict[str, SkeletonMap] = {}
     with _staging(out) as staging:
         for relative, path in progress_bar(files.items(), "import", len(files)):

@@ -66,7 +66,6 @@ def _known() -> dict[str, float]:
     return {digest: float(fps) for digest, fps in yaml.safe_load(path.read_text("utf-8")).items()}
 
 
-@cache
 def _sidecar(path: Path) -> float | None:
     """Return the rate that a folder's `motion.yaml` tells; None where there is none."""
     if not path.is_file():

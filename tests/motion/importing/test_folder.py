@@ -14,10 +14,9 @@ from memmlp.common.errors import InputError
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.npz import read_clip
-from memmlp.motion.importing.folder import import_folder
-from memmlp.motion.importing.retarget import retarget
+from memmlp.motion.importing.convert import convert
+from memmlp.motion.importing.folder import How, import_folder
 from memmlp.motion.importing.skeleton import find_skeleton
-from memmlp.motion.importing.verify import verify_folder
 
 REST = builtin_rest_joints()
 
@@ -32,7 +31,7 @@ def test_damaged_files_are_refused_in_one_line(tmp_path: Path) -> None:
         path = write(tmp_path, mutate(data, seed), f"damaged {seed}.bvh")
         try:
             bvh = read_bvh(path)
-            clip = retarget(bvh, find_skeleton(bvh), REST)
+            clip = convert(bvh, find_skeleton(bvh), REST, name="clip").clip
         except InputError as error:
             refused.append((path, str(error)))
         else:
@@ -50,10 +49,11 @@ def test_damaged_files_are_refused_in_one_line(tmp_path: Path) -> None:
 
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
-    """salsa/01, salsa/02, indian/01 and top.bvh, each of 3 frames at 120 Hz by the header."""
+    """salsa/01, salsa/02, indian/01 and top.bvh, 3 frames at 120 Hz by the header; salsa has 60 Hz."""
     for seed, name in enumerate(["salsa/01", "salsa/02", "indian/01", "top"]):
         write(tmp_path / "source", person("cmu_daz", 3, seed).text("\r\n"), f"{name}.bvh")
     write(tmp_path / "source", "no motion", "readme.txt")
+    write(tmp_path / "source", "fps: 60", "salsa/motion.yaml")
     return tmp_path / "source"
 
 
@@ -72,14 +72,14 @@ def test_import_writes_clips_and_record(source: Path, tmp_path: Path) -> None:
         "salsa/02.bvh",
         "top.bvh",
     ]
-    assert report.notes == ("salsa: 60 Hz, known of salsa in cmu_daz; the header says 120 Hz",)
+    assert report.notes == ("salsa: 60 Hz, in salsa/motion.yaml; the header says 120 Hz",)
     record = json.loads((out / "import.json").read_text())
     assert [clip["clip"] for clip in record["clips"]] == sorted(rates(out))
     assert record["clips"][3]["sha256"] == hashlib.sha256((source / "top.bvh").read_bytes()).hexdigest()
     assert str(tmp_path) not in (out / "import.json").read_text()
     assert not [path for path in tmp_path.iterdir() if path.name not in ("source", "out")]
     bvh = read_bvh(source / "salsa/02.bvh")
-    expected = retarget(bvh, find_skeleton(bvh), REST)
+    expected = convert(bvh, find_skeleton(bvh), REST, name="clip").clip
     clip = read_clip(out / "salsa/02.npz", "salsa/02")
     np.testing.assert_array_equal(clip.poses.astype(np.float32), expected.poses.astype(np.float32))
 
@@ -101,7 +101,7 @@ def test_import_twice_is_the_same(source: Path, tmp_path: Path) -> None:
     ],
 )
 def test_given_rates(source: Path, tmp_path: Path, fps: dict[str, float], expected: list[float]) -> None:
-    report = import_folder(source, tmp_path / "out", fps=fps)
+    report = import_folder(source, tmp_path / "out", How(fps=fps))
     assert list(rates(tmp_path / "out").values()) == expected
     assert [clip.fps for clip in report.clips] == expected
     assert all("given" in clip.fps_reason for clip in report.clips if clip.fps not in (60, 120))
@@ -114,7 +114,7 @@ def test_given_rates(source: Path, tmp_path: Path, fps: dict[str, float], expect
 )
 def test_wrong_rates_are_refused(source: Path, tmp_path: Path, fps: dict[str, float]) -> None:
     with refuse("fps: ", "'indian', 'salsa'"):
-        import_folder(source, tmp_path / "out", fps=fps)
+        import_folder(source, tmp_path / "out", How(fps=fps))
 
 
 def test_known_rate_holds_for_the_folder_or_file_itself(source: Path, tmp_path: Path) -> None:
@@ -124,8 +124,8 @@ def test_known_rate_holds_for_the_folder_or_file_itself(source: Path, tmp_path: 
 
 
 def test_a_header_that_is_right_is_not_corrected(source: Path, tmp_path: Path) -> None:
-    write(source, person("cmu_daz", 3, 0).text(dt="0.0166667"), "salsa/01.bvh")
-    report = import_folder(source / "salsa/01.bvh", tmp_path / "out")
+    write(source, person("cmu_daz", 3, 0).text(dt="0.0166667"), "indian/01.bvh")
+    report = import_folder(source / "indian/01.bvh", tmp_path / "out")
     assert (report.clips[0].fps, report.clips[0].fps_reason) == (60, "the header's")
     assert report.notes == ()
 
@@ -143,7 +143,7 @@ def test_bad_files_are_skipped(source: Path, tmp_path: Path) -> None:
 def test_strict_import_leaves_nothing(source: Path, tmp_path: Path) -> None:
     write(source, "HIERARCHY", "salsa/01.bvh")
     with refuse(source / "salsa/01.bvh", "no MOTION"):
-        import_folder(source, tmp_path / "out", strict=True)
+        import_folder(source, tmp_path / "out", How(strict=True))
     assert [path.name for path in tmp_path.iterdir()] == ["source"]
 
 
@@ -153,7 +153,7 @@ def test_strict_import_leaves_an_earlier_one_alone(source: Path, tmp_path: Path)
     write(source, person("cmu_daz", 9, 9).text(), "indian/01.bvh")
     write(source, "HIERARCHY", "top.bvh")
     with pytest.raises(InputError):
-        import_folder(source, tmp_path / "out", strict=True)
+        import_folder(source, tmp_path / "out", How(strict=True))
     assert {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.*")} == before
 
 
@@ -162,8 +162,6 @@ def test_nothing_to_import_is_refused(tmp_path: Path) -> None:
     for source in (tmp_path / "empty", tmp_path / "missing", write(tmp_path, "", "clip.txt")):
         with refuse(source):
             import_folder(source, tmp_path / "out")
-        with refuse(source):
-            verify_folder(source)
     for name in ("a", "b"):
         write(tmp_path / "bad", "HIERARCHY", f"{name}.bvh")
     with pytest.raises(InputError, match=r"no usable BVH file of 2; the first: a\.bvh"):
@@ -185,17 +183,3 @@ def test_foreign_clips_in_out_are_refused(source: Path, tmp_path: Path) -> None:
         import_folder(source, tmp_path / "out")
     with refuse(source / "top.bvh", "is a file"):
         import_folder(source, source / "top.bvh")
-
-
-def test_verify_folder_names_files(source: Path) -> None:
-    found = verify_folder(source, skeleton="cmu_daz")
-    assert [fidelity.name for fidelity in found] == [
-        "indian/01.bvh",
-        "salsa/01.bvh",
-        "salsa/02.bvh",
-        "top.bvh",
-    ]
-    assert max(fidelity.worst_mm for fidelity in found) < 0.01
-    write(source, "HIERARCHY", "salsa/01.bvh")
-    with refuse(source / "salsa/01.bvh", "no MOTION"):
-        verify_folder(source)

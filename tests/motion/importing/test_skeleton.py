@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,24 +10,21 @@ import yaml
 from bvh_samples import TREES, person, read, refuse, write
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.formats.bvh import read_bvh
-from memmlp.motion.importing.folder import import_folder
-from memmlp.motion.importing.retarget import fit, retarget
+from memmlp.motion.importing.folder import How, import_folder
+from memmlp.motion.importing.recording import perform
 from memmlp.motion.importing.skeleton import SKELETONS, find_skeleton, load_skeleton, shipped_skeletons
-
-REST = builtin_rest_joints()
 
 
 def test_shipped_maps() -> None:
-    assert shipped_skeletons() == ("cmu_daz", "cmu_motionbuilder")
+    assert {"bandai_namco", "cmu_daz", "cmu_motionbuilder"} <= set(shipped_skeletons())
     for name in shipped_skeletons():
         assert load_skeleton(name).name == name
 
 
 @pytest.mark.parametrize("skeleton", TREES)
 def test_units_give_people(tmp_path: Path, skeleton: str) -> None:
-    own = fit(read(tmp_path, skeleton), load_skeleton(skeleton), REST).own_rest
+    own = perform(read(tmp_path, skeleton), load_skeleton(skeleton)).zero
     assert 0.75 < sum(np.linalg.norm(own[child] - own[joint]) for joint, child in ((1, 4), (4, 7))) < 0.9
 
 
@@ -53,30 +49,6 @@ def test_a_file_of_two_skeletons_is_refused(tmp_path: Path, monkeypatch: pytest.
         find_skeleton(read(tmp_path, "cmu_daz"))
 
 
-def test_a_map_of_other_joints_is_refused(tmp_path: Path) -> None:
-    bvh, chosen = read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz")
-    with refuse(bvh.path, "Hips"):
-        fit(bvh, load_skeleton("cmu_motionbuilder"), REST)
-    swapped = chosen.joints | {"left_knee": "lFoot", "left_ankle": "lShin"}
-    with refuse(bvh.path, "lShin is not below lFoot"):
-        fit(bvh, replace(chosen, joints=swapped), REST)
-
-
-def test_a_zero_pose_that_does_not_stand_is_refused(tmp_path: Path) -> None:
-    bvh, chosen = read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz")
-    behind = replace(bvh, offsets=bvh.offsets * [-1, 1, -1])
-    with refuse(bvh.path, "left_shoulder", "T-pose"):
-        fit(behind, chosen, REST)
-    with refuse(bvh.path, "0 m"):
-        fit(replace(bvh, offsets=bvh.offsets * 0), chosen, REST)
-
-
-def test_a_unit_out_of_this_world_is_refused(tmp_path: Path) -> None:
-    bvh = read(tmp_path, "cmu_daz")
-    with refuse(bvh.path, "10000 m"):
-        retarget(replace(bvh, values=bvh.values * 1e4), load_skeleton("cmu_daz"), REST)
-
-
 def user_map(folder: Path, **changes: object) -> Path:
     content = yaml.safe_load((SKELETONS / "cmu_daz.yaml").read_text()) | {"name": "mine"} | changes
     path = folder / "mine.yaml"
@@ -85,11 +57,10 @@ def user_map(folder: Path, **changes: object) -> Path:
 
 
 def test_a_users_map(tmp_path: Path) -> None:
-    path = user_map(tmp_path, unit=0.02, calibration_frame=False, rates=None)
-    assert load_skeleton(str(path)).unit == 0.02
-    report = import_folder(
-        write(tmp_path, person("cmu_daz", 4, 0).text()), tmp_path / "out", skeleton=str(path)
-    )
+    path = user_map(tmp_path, unit=0.011, calibration_frame=False)
+    assert load_skeleton(str(path)).unit == 0.011
+    file = write(tmp_path, person("cmu_daz", 4, 0).text())
+    report = import_folder(file, tmp_path / "out", How(skeleton=str(path)))
     assert [(clip.skeleton, clip.frames) for clip in report.clips] == [("mine", 4)]
 
 
@@ -103,12 +74,17 @@ JOINTS_OF_DAZ = load_skeleton("cmu_daz").joints
         ({"unit": 0}, "unit"),
         ({"unit": float("nan")}, "unit"),
         ({"unit": True}, "unit"),
-        ({"unit": None}, "keys"),
-        ({"up": "x"}, "y or z"),
+        ({"name": None}, "keys"),
+        ({"up": "x"}, "y, z or auto"),
         ({"calibration_frame": 1}, "true or false"),
-        ({"rates": {"salsa": 0}}, "rates.salsa"),
-        ({"rates": {4: 60}}, "rates.4"),
-        ({"rates": [60]}, "rates"),
+        ({"rates": {"salsa": 60}}, "keys"),
+        ({"rest": "standing"}, "rest"),
+        ({"rest": -1}, "rest"),
+        ({"rest": True}, "rest"),
+        ({"rest": {}}, "rest"),
+        ({"rest": {"hip": 90}}, "rest"),
+        ({"rest": {"hip": [90, "a", 0]}}, "rest"),
+        ({"note": 3}, "note"),
         ({"name": 3}, "name"),
         ({"colour": "red"}, "keys"),
         ({"joints": "all"}, "joints"),
@@ -122,6 +98,12 @@ def test_wrong_maps_are_refused(tmp_path: Path, changes: dict[str, object], said
     path = user_map(tmp_path, **changes)
     with refuse(path, said):
         load_skeleton(str(path))
+
+
+def test_what_a_map_leaves_out_is_found(tmp_path: Path) -> None:
+    chosen = load_skeleton(str(user_map(tmp_path, unit=None, up="auto", calibration_frame=None)))
+    told = (chosen.unit, chosen.up, chosen.calibration_frame, chosen.rest, chosen.note)
+    assert told == (None, None, False, "auto", "")
 
 
 @pytest.mark.parametrize(
