@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.data.show import show_manifest, show_rates, show_skipped
+from memmlp.cli.data.show import show_files, show_manifest, show_pairs, show_rates, show_skipped
 from memmlp.cli.options import PATH
 
 
@@ -25,6 +25,8 @@ def inspect(path: Path) -> None:
         return
     found = survey(path)
     show_skipped([f"{file.file}: {file.reason}" for file in found.skipped])
+    show_files(found.ignored, found.found.passed_over, found.found.links, found.unusual)
+    show_pairs("the same frames", found.duplicates)
     show_rates(found.clips)
     frames = sum(clip.length for clip in found.clips)
     click.echo(f"{len(found.clips)} clips, {frames / 216000:.2f} h, {len(found.skipped)} bad files")

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
 from rich.table import Table
+
+from memmlp.common.errors import one_line
 
 if TYPE_CHECKING:
     from memmlp.motion.preparing.manifest import ClipRecord, Manifest
@@ -25,6 +28,8 @@ def show_manifest(manifest: Manifest) -> None:
     Console(highlight=False).print(table)
     show_rates(manifest.clips)
     show_skipped([f"{file.file}: {file.reason}" for file in manifest.skipped])
+    show_files(manifest.ignored, manifest.passed_over, manifest.links, manifest.unusual)
+    show_pairs("left out, since another part has the same frames", manifest.duplicates)
     left_out = sum(manifest.left_out.values())
     click.echo(
         f"{len(manifest.clips)} clips; skipped {len(manifest.skipped)}, left out by the split {left_out}, "
@@ -38,6 +43,26 @@ def show_rates(clips: tuple[ClipRecord, ...]) -> None:
     """Print the frame rates that were found, and how each was brought to 60 Hz."""
     for (fps, how), count in sorted(Counter((clip.fps, clip.resampling) for clip in clips).items()):
         click.echo(f"{count} clips at {fps:g} Hz: {how}")
+
+
+def show_files(
+    ignored: int, passed_over: Mapping[str, int], links: Mapping[str, str], unusual: Mapping[str, str]
+) -> None:
+    """Print what else there was in a folder: files that are no clips, links, and clips to look at."""
+    others = {"npz without poses": ignored, **dict(sorted(passed_over.items()))}
+    counts = [f"{count} {kind}" for kind, count in others.items() if count]
+    if counts:
+        click.echo(f"passed over: {', '.join(counts)}")
+    show_pairs("taken once, since the other path is a link", links)
+    show_pairs("unusual", unusual, ": ")
+
+
+def show_pairs(what: str, pairs: Mapping[str, str], sign: str = " = ") -> None:
+    """Print the first few pairs of names, and the number of the others."""
+    for first, second in list(pairs.items())[:SHOWN]:
+        click.echo(f"{what}: {one_line(first)}{sign}{one_line(second)}")
+    if len(pairs) > SHOWN:
+        click.echo(f"{what}: {len(pairs) - SHOWN} more")
 
 
 def show_skipped(lines: list[str]) -> None:

@@ -26,9 +26,11 @@ from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
 from memmlp.motion.clip import Clip, resample
 from memmlp.motion.formats.npz import read_clip
+from memmlp.motion.preparing.duplicates import assign
+from memmlp.motion.preparing.find import clip_name, find_clips
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest, write_manifest
 from memmlp.motion.preparing.splits import PARTS, Split
-from memmlp.motion.preparing.survey import Survey, sources, survey
+from memmlp.motion.preparing.survey import Survey, survey
 from memmlp.runs.recipes import RECIPES
 
 FRAMES = 1  # number of a frame's content; a new one changes every digest, and so makes every run again
@@ -94,11 +96,11 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
     if not found.clips:
         raise InputError(_no_clips(source.root, found))
     names, split = [clip.name for clip in found.clips], source.split
-    assignment = split.assign(names)
-    every = [*names, *found.short, *found.damaged]
-    split.grouping.check([name for name, part in assignment.parts.items() if part], every)
+    parts, groups, duplicates = assign(split, found.clips)
+    every = [*names, *found.short, *found.damaged, *_other_names(found, parts)]
+    split.grouping.check([name for name, part in parts.items() if part], every)
     missing = split.missing(every)
-    clips = _place(found.clips, assignment.parts, assignment.groups)
+    clips = _place(found.clips, parts, groups)
     if not any(clip.split == "train" for clip in clips):
         raise InputError(f"{source.root}: no clip for training (data.root, data.split); give it other data")
     manifest = Manifest(
@@ -111,11 +113,15 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
         clips=clips,
         skipped=found.skipped,
         ignored=found.ignored,
-        left_out=_left_out(assignment.parts),
+        left_out=_left_out({name: part for name, part in parts.items() if name not in duplicates}),
         listed=dict(split.listed),
         missing=missing,
         damaged=tuple(sorted(set(split.missing([*names, *found.short])) - set(missing))),
         totals={part: _total(clips, part) for part in PARTS},
+        duplicates=duplicates,
+        links=found.found.links,
+        unusual=found.unusual,
+        passed_over=dict(found.found.passed_over),
     )
     _write(source, rest, manifest, out)
     return manifest
@@ -132,7 +138,7 @@ def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) 
             header = {"descr": "<f4", "fortran_order": False, "shape": (frames[part], FRAME_DIM)}
             np.lib.format.write_array_header_1_0(file, header)
         for record in progress_bar(manifest.clips, "writing"):
-            clip, _ = resample(read_clip(source.root / f"{record.name}.npz", record.name))
+            clip, _ = resample(read_clip(source.root / record.file, record.name))
             for block in _frames(clip, rest):
                 files[record.split].write(block.tobytes())
         for file in files.values():
@@ -180,6 +186,11 @@ def _place(
     return tuple(placed)
 
 
+def _other_names(found: Survey, parts: Mapping[str, str | None]) -> list[str]:
+    """Return the names that links give to clips that have a part."""
+    return [clip_name(path) for path, file in found.found.links.items() if parts.get(clip_name(file))]
+
+
 def _left_out(parts: Mapping[str, str | None]) -> dict[str, int]:
     """Count the clips without a part by top-level folder."""
     return dict(Counter(name.split("/")[0] for name, part in sorted(parts.items()) if part is None))
@@ -197,7 +208,7 @@ def _digest(clips: Sequence[ClipRecord], rest: np.ndarray, min_frames: int) -> s
 
 def _request(source: ClipFolder, rest: np.ndarray) -> str:
     """Return a digest of the settings and of each source's path, size and time, without opening any."""
-    files = [(file, *_stamp(source.root / file)) for file in sources(source.root)]
+    files = [(file, *_stamp(source.root / file)) for file in find_clips(source.root).files]
     code = [FORMAT, FRAMES, RECIPES["features"]]
     return _hash([*code, source.min_frames, rest.tolist(), source.split.describe(), files])
 

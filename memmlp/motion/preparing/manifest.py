@@ -15,8 +15,9 @@ from memmlp.common.files import atomic_write
 from memmlp.motion.clip import Skipped
 from memmlp.motion.preparing.coverage import Coverage
 
-FORMAT = 3  # number of the cache's format; a new one makes every cache again
+FORMAT = 4  # number of the cache's format; a new one makes every cache again
 MANIFEST = "manifest.json"
+STILL = "still"  # the content of every clip without motion
 
 
 @dataclass(frozen=True)
@@ -25,21 +26,26 @@ class ClipRecord:
 
     Attributes:
         name: path below the data root without suffix.
+        file: path below the data root.
         split: "train", "val" or "test".
         group: name of the clip's group (`Grouping.names`); its own name where nothing ties it to another.
         start: its first frame in that split's array.
         length: its number of frames there.
         sha256: digest of the source file.
+        content: digest of its frames in single precision, the same for every copy of them; `STILL`
+            without motion.
         fps: frame rate of the source, Hz.
         resampling: how it was brought to 60 Hz.
     """
 
     name: str
+    file: str
     split: str
     group: str
     start: int
     length: int
     sha256: str
+    content: str
     fps: float
     resampling: str
 
@@ -65,6 +71,10 @@ class Manifest:
         missing: entries of the split for which there is no file.
         damaged: entries of the split whose file is no sound clip; a clip that is too short is not among them.
         totals: part -> clips, frames, hours.
+        duplicates: clip that was left out -> the clip of the same frames in another part, which was kept.
+        links: other path of a file or folder -> the path by which it was read.
+        unusual: clip -> what is odd about it, though it may be sound.
+        passed_over: number of files that are no npz, by suffix.
         format: format number of the cache.
     """
 
@@ -82,6 +92,10 @@ class Manifest:
     missing: tuple[str, ...]
     damaged: tuple[str, ...]
     totals: dict[str, dict[str, float]]
+    duplicates: dict[str, str]
+    links: dict[str, str]
+    unusual: dict[str, str]
+    passed_over: dict[str, int]
     format: int = FORMAT
 
     @classmethod

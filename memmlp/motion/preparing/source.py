@@ -12,8 +12,8 @@ from filelock import FileLock
 
 from memmlp.motion.preparing.cache import ClipFolder, finished, prepare
 from memmlp.motion.preparing.coverage import Coverage
+from memmlp.motion.preparing.find import Found, clip_name, find_clips
 from memmlp.motion.preparing.manifest import Manifest
-from memmlp.motion.preparing.survey import clip_name, sources
 
 if TYPE_CHECKING:
     from memmlp.motion.dataset import MotionDataset
@@ -92,7 +92,8 @@ class MotionSource:
     def _listed(self) -> Coverage:
         """Return how many entries of the split have a file, whatever is in it."""
         split = self.source.split
-        names = [clip_name(file) for file in sources(self.source.root)] if split.listed else []
+        found = find_clips(self.source.root) if split.listed else Found()
+        names = [clip_name(file) for file in (*found.files, *found.links)]
         return Coverage.of(split.listed, split.missing(names))
 
     def digest(self) -> str | None:

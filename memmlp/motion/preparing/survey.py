@@ -1,19 +1,22 @@
-"""Finds the npz clips of a folder and reads each of them once, so that what is bad is known and said."""
+"""Reads every npz of a folder once, so that what is bad, odd or there twice is known and said."""
 
 from __future__ import annotations
 
 import hashlib
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from memmlp.common.errors import InputError, one_line
+from memmlp.common.files import file_digest
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS
-from memmlp.motion.clip import Skipped, resample
+from memmlp.motion.clip import Clip, Skipped, resample
 from memmlp.motion.formats.npz import NoMotion, read_clip
-from memmlp.motion.plausible import check_plausible
-from memmlp.motion.preparing.manifest import ClipRecord
+from memmlp.motion.plausible import check_plausible, unusual
+from memmlp.motion.preparing.find import Found, clip_name, find_clips
+from memmlp.motion.preparing.manifest import STILL, ClipRecord
 
 
 @dataclass(frozen=True)
@@ -25,17 +28,29 @@ class Survey:
         skipped: bad files.
         ignored: number of npz files without motion.
         short: names of those of the bad files that are sound clips of too few frames.
+        unusual: clip -> what is odd about it, though it may be sound.
+        found: the files, and other paths of them.
     """
 
     clips: tuple[ClipRecord, ...]
     skipped: tuple[Skipped, ...]
     ignored: int
-    short: tuple[str, ...] = ()
+    short: tuple[str, ...]
+    unusual: dict[str, str]
+    found: Found
 
     @property
     def damaged(self) -> tuple[str, ...]:
         """Names of the bad files that are no sound clips."""
         return tuple(name for file in self.skipped if (name := clip_name(file.file)) not in self.short)
+
+    @property
+    def duplicates(self) -> dict[str, str]:
+        """Clip -> the first clip of the same frames."""
+        firsts: dict[str, str] = {}
+        moving = [clip for clip in self.clips if clip.content != STILL]
+        pairs = {clip.name: firsts.setdefault(clip.content, clip.name) for clip in moving}
+        return {name: first for name, first in pairs.items() if name != first}
 
 
 class TooShort(InputError):
@@ -48,46 +63,54 @@ def survey(root: Path, min_frames: int = 2, strict: bool = False) -> Survey:
     Raises:
         InputError: if there are none, or at the first bad one if `strict`.
     """
-    clips, skipped, short, ignored = [], [], [], 0
-    for file in progress_bar(sources(root), "reading"):
-        path = root / file
+    clips: dict[str, ClipRecord] = {}
+    odd: dict[str, str] = {}
+    short, ignored, found = [], 0, find_clips(root)
+    skipped = [Skipped(folder, reason) for folder, reason in found.unreadable.items()]
+    for file in progress_bar(found.files, "reading"):
+        name = clip_name(file)
         try:
-            clips.append(_inspect(path, file, min_frames))
+            _check_name(root / file, file, clips)
+            clip = read_clip(root / file, name)
+            clips[name] = _inspect(root / file, file, clip, min_frames)
         except NoMotion:
             ignored += 1
         except InputError as error:
             if strict:
                 raise
-            skipped.append(Skipped(file, str(error).removeprefix(one_line(f"{path}: "))))
-            short += [clip_name(file)] if isinstance(error, TooShort) else []
-    return Survey(tuple(clips), tuple(skipped), ignored, tuple(short))
+            skipped.append(Skipped(one_line(file), str(error).removeprefix(one_line(f"{root / file}: "))))
+            short += [name] if isinstance(error, TooShort) else []
+        else:
+            odd |= {name: reason} if (reason := unusual(clip)) else {}
+    return Survey(tuple(clips.values()), tuple(skipped), ignored, tuple(short), odd, found)
 
 
-def sources(root: Path) -> list[str]:
-    """Return the npz files below a folder, also through links: sorted paths relative to it."""
-    if not root.is_dir():
-        raise InputError(f"data.root: {root} is no folder; give it the folder with your npz clips")
-    walk = os.walk(root, followlinks=True)
-    files = (Path(folder, file) for folder, _, names in walk for file in names if file.endswith(".npz"))
-    found = sorted(path.relative_to(root).as_posix() for path in files)
-    if not found:
-        raise InputError(f"data.root: no npz below {root}; make some with memmlp data synth or data import")
-    return found
+def _check_name(path: Path, file: str, clips: dict[str, ClipRecord]) -> None:
+    """Raise InputError for what is no regular file, or whose name cannot be a clip's."""
+    if one_line(file) != file:
+        raise InputError(f"{path}: line feeds or other control characters in its name; rename it")
+    if clip_name(file) in clips:
+        raise InputError(f"{path}: {clips[clip_name(file)].file} has the same name; rename one of them")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: no regular file")
 
 
-def _inspect(path: Path, file: str, min_frames: int) -> ClipRecord:
-    """Return the record of a sound clip, without split and start; raise InputError for any other file."""
-    name = clip_name(file)
-    clip = read_clip(path, name)
+def _inspect(path: Path, file: str, clip: Clip, min_frames: int) -> ClipRecord:
+    """Return the record of a sound clip, without split and start; raise InputError for any other."""
     check_plausible(path, clip)
     resampled, how = resample(clip)
     if len(resampled) < min_frames:
         few = f"{len(resampled)} frames at {FPS} Hz"
         raise TooShort(f"{path}: {few}, fewer than {min_frames} (data.min_frames)")
-    with open(path, "rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    return ClipRecord(name, "", "", 0, len(resampled) - 1, digest, clip.fps, how)
+    length, digests = len(resampled) - 1, (file_digest(path), _content(clip))
+    return ClipRecord(clip.name, file, "", "", 0, length, *digests, clip.fps, how)
 
 
-def clip_name(file: str) -> str:
-    return file.removesuffix(".npz")
+def _content(clip: Clip) -> str:
+    """Return a digest of the frames in single precision, however and at whatever rate they were saved."""
+    numbers = np.concatenate(
+        [clip.poses.reshape(len(clip), -1), clip.trans], 1, dtype="<f4", casting="same_kind"
+    )
+    if (numbers == numbers[0]).all():
+        return STILL
+    return hashlib.sha256((numbers + np.float32(0)).tobytes()).hexdigest()  # + 0, for -0 is 0

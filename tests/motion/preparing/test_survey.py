@@ -1,0 +1,116 @@
+"""Surveys: one bad file never stops a folder, and all that is odd is said."""
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from memmlp.motion.formats.npz import read_clip, write_clip
+from memmlp.motion.preparing.cache import ClipFolder, prepare
+from memmlp.motion.preparing.manifest import Manifest
+from memmlp.motion.preparing.splits import ListSplit, SeededSplit
+from memmlp.motion.preparing.survey import survey
+from memmlp.motion.synthetic import synthesize_clip
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    for seed in range(4):
+        write_clip(tmp_path / "clips" / "a" / f"{seed}.npz", synthesize_clip("idling", seed, seconds=1))
+    return tmp_path / "clips"
+
+
+def again(source: Path, target: Path) -> None:
+    """Save the same frames in double precision, compressed, at another rate, in parts."""
+    with np.load(source) as old:
+        poses, trans = old["poses"].astype(float), old["trans"].astype(float)
+    np.savez_compressed(
+        target, root_orient=poses[:, :3], pose_body=poses[:, 3:66], trans=trans, mocap_frame_rate=120.0
+    )
+
+
+def test_one_bad_file_never_stops_a_folder(root):
+    (root / "text.npz").write_text("no zip")
+    (root / "dangling.npz").symlink_to("nowhere")
+    os.mkfifo(root / "pipe.npz")
+    shutil.copy(root / "a" / "0.npz", root / "line\nfeed.npz")
+    shutil.copy(root / "a" / "0.npz", root / "a" / "1.NPZ")
+    (root / "directory.npz").mkdir()
+    found = survey(root)
+    assert {file.file: file.reason.split(";")[0] for file in found.skipped} == {
+        "text.npz": "no zip, so no npz",
+        "dangling.npz": "cannot be read (No such file or directory)",
+        "pipe.npz": "no regular file",
+        r"line\nfeed.npz": "line feeds or other control characters in its name",
+        "a/1.npz": "a/1.NPZ has the same name",
+    }
+    assert len(found.clips) == 4
+    assert all(file.reason.isprintable() for file in found.skipped)
+
+
+def test_capitals_are_found_and_prepared(root, tmp_path):
+    (root / "a" / "0.npz").rename(root / "a" / "UP.NPZ")
+    manifest = prepare(ClipFolder(root, SeededSplit(), min_frames=20), tmp_path / "cache")
+    assert [clip.file for clip in manifest.clips] == ["a/1.npz", "a/2.npz", "a/3.npz", "a/UP.NPZ"]
+
+
+@pytest.mark.parametrize("change", ["degrees", "centimetres"])
+def test_other_units_are_skipped_with_a_reason(change, root):
+    clip = read_clip(root / "a" / "0.npz", "")
+    scale = {"degrees": (180 / np.pi, 1.0), "centimetres": (1.0, 100.0)}[change]
+    write_clip(root / "x.npz", type(clip)("x", clip.poses * scale[0], clip.trans * scale[1], 60.0))
+    assert [file.file for file in survey(root).skipped] == ["x.npz"]
+
+
+def test_what_is_unusual_is_said(root):
+    clip = read_clip(root / "a" / "0.npz", "")
+    poses = clip.poses.copy()
+    poses[:, 0] = [0.0, 0.1, 0.0]
+    write_clip(root / "x.npz", type(clip)("x", poses, 0.1 * clip.trans + [0, 5, 0], 60.0))
+    assert set(survey(root).unusual) == {"x"}
+
+
+def contents(manifest: Manifest) -> dict[str, set[str]]:
+    """content -> the parts that have it."""
+    parts: dict[str, set[str]] = {}
+    for clip in manifest.clips:
+        parts.setdefault(clip.content, set()).add(clip.split)
+    return parts
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_frames_are_in_two_parts_however_they_were_copied(seed, root, tmp_path):
+    (root / "loop").symlink_to(".")
+    os.link(root / "a" / "0.npz", root / "hard.npz")
+    (root / "soft.npz").symlink_to("a/1.npz")
+    for name in range(4):
+        (root / "b").mkdir(exist_ok=True)
+        shutil.copy(root / "a" / f"{name}.npz", root / "b" / f"{name}.npz")
+        again(root / "a" / f"{name}.npz", root / "b" / f"again{name}.npz")
+    manifest = prepare(ClipFolder(root, SeededSplit(0.3, 0.3, seed=seed), min_frames=20), tmp_path / "cache")
+    assert manifest == Manifest.load(tmp_path / "cache")
+    parts = contents(manifest)
+    assert len(parts) == 4
+    assert all(len(several) == 1 for several in parts.values())
+    assert {"loop", "a/0.npz", "a/1.npz"} == set(manifest.links)
+    assert len(manifest.clips) == 12
+    assert manifest.duplicates == {}
+    assert all(total["clips"] for total in manifest.totals.values())
+    assert len({clip.group for clip in manifest.clips}) == 4
+
+
+def test_a_list_with_the_same_frames_in_two_parts_keeps_those_of_its_test(root, tmp_path):
+    (root / "b").mkdir()
+    shutil.copy(root / "a" / "1.npz", root / "b" / "copy.npz")
+    folder = tmp_path / "lists" / "a"
+    folder.mkdir(parents=True)
+    (folder / "train_split.txt").write_text("".join(f"a/{n}.npz\n" for n in range(4)))
+    (folder.parent / "b").mkdir()
+    (folder.parent / "b" / "test_split.txt").write_text("b/copy.npz\n")
+    manifest = prepare(ClipFolder(root, ListSplit(tmp_path / "lists"), min_frames=20), tmp_path / "cache")
+    assert manifest.duplicates == {"a/1": "b/copy"}
+    assert {clip.name for clip in manifest.clips} == {"a/0", "a/2", "a/3", "b/copy"}
+    assert manifest.left_out == {}
+    assert manifest.coverage.whole
