@@ -1,4 +1,4 @@
-"""Effects of paired differences: intervals, p-values, what may be claimed of many, and what could be seen."""
+"""Effects of paired differences: intervals and p-values, and what they promise."""
 
 from __future__ import annotations
 
@@ -6,63 +6,19 @@ import itertools
 
 import numpy as np
 import pytest
+from drawn import GRID, SHARES, TABLE, differences, groups, starred
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
 from memmlp.statistics import (
     Effects,
-    Verdict,
     detectable,
     equivalence_p,
-    holm,
-    interquartile_mean,
-    looks,
     paired_effects,
-    performance_profile,
-    probability_of_improvement,
     seeds_needed,
-    sequential,
-    spending,
-    verdict,
 )
-from memmlp.statistics.crossed import error, skewed
-
-TABLE = 24  # comparisons of a table
-SHARES = {  # of seeds, clips' groups, clips, exponential clips and noise in the mean's variance
-    "equal": (1, 0, 1, 0, 1),
-    "values": (40 / 3, 0, 1, 0, 1 / 3),  # equal variances in a single value, for 3 seeds and 40 clips
-    "seeds": (1, 0, 0, 0, 0),
-    "groups": (0, 1, 0, 0, 0),
-    "noise": (0, 0, 0, 0, 1),
-    "skewed": (0, 0, 0, 1, 0),
-    "skewed, little noise": (0, 0, 0, 20, 1),
-    "seeds, skewed": (1, 0, 0, 1, 0),
-}
-GRID = [(3, 4, 1), (3, 40, 1), (5, 10, 2), (10, 4, 1), (5, 40, 10)]
-
-
-def differences(seeds: int, clips: int, size: int, shares: tuple[float, ...], tables: int) -> np.ndarray:
-    """Draw differences (tables * TABLE, S, C) whose true means are 0; the means have a variance of 1."""
-    rng = np.random.default_rng([seeds, clips, size])
-    group = np.arange(clips) // size
-    weights = np.bincount(group) / clips
-    a, g, b, x, e = np.sqrt(np.array(shares) / sum(shares))
-    k = tables * TABLE
-    by_clip = b * rng.normal(size=(k, 1, clips)) + x * (rng.exponential(size=(k, 1, clips)) - 1)
-    by_group = rng.normal(size=(k, 1, len(weights)))[:, :, group] / np.sqrt(weights @ weights)
-    by_seed = np.sqrt(seeds) * rng.normal(size=(k, seeds, 1))
-    noise = np.sqrt(seeds * clips) * rng.normal(size=(k, seeds, clips))
-    return a * by_seed + g * by_group + np.sqrt(clips) * by_clip + e * noise
-
-
-def groups(clips: int, size: int) -> np.ndarray:
-    return np.arange(clips) // size
-
-
-def starred(p: np.ndarray) -> float:
-    """Return the share of tables with a star, where all true differences are 0."""
-    return float(np.mean([(holm(row) <= 0.05).any() for row in p.reshape(-1, TABLE)]))
+from memmlp.statistics.crossed import error
 
 
 def satterthwaite(d: np.ndarray) -> np.ndarray:
@@ -70,9 +26,6 @@ def satterthwaite(d: np.ndarray) -> np.ndarray:
     a, b = (side.var(1, ddof=1) / side.shape[1] for side in (d.mean(2), d.mean(1)))
     freedom = (a + b) ** 2 / (a**2 / (d.shape[1] - 1) + b**2 / (d.shape[2] - 1))
     return 2 * stats.t.sf(np.abs(d.mean((1, 2))) / np.sqrt(a + b), freedom)
-
-
-# By hand
 
 
 def test_two_by_two_by_hand():
@@ -85,12 +38,6 @@ def test_two_by_two_by_hand():
     assert effects.mean[0] == 3
     assert effects.high[0] == pytest.approx(3 + half)
     assert effects.low[0] == pytest.approx(3 - half)
-
-
-def test_noise_by_hand():
-    # No seed and no clip differs from another: all is noise, of squares 4 with one degree of freedom.
-    known = error(np.array([[[1.0, -1.0], [-1.0, 1.0]]]))
-    np.testing.assert_allclose(known.variances[:, 0], [0, 0, 1])
 
 
 def test_clips_that_do_not_differ_leave_students_test_of_the_seeds():
@@ -108,13 +55,6 @@ def test_seeds_that_do_not_differ_leave_students_test_of_clips_with_fewer_degree
     assert effects.p[0] == pytest.approx(2 * stats.t.sf(t, 0.9 * 11**0.6), rel=1e-6)
 
 
-def test_noise_is_counted_once():
-    # A = B = E, as of noise alone: no wider than the wider of the two sides alone
-    known = error(np.random.default_rng(0).normal(size=(1, 8, 8)))
-    known.variances[:] = 1.0
-    assert known.half(0.001)[0] == pytest.approx(stats.t.isf(0.0005, 0.9 * 7**0.6), rel=0.01)
-
-
 def test_equal_groups_are_the_analysis_of_their_means():
     d = np.random.default_rng(3).normal(size=(5, 3, 12))
     labels = np.array(list("aabbccddeeff"))
@@ -130,9 +70,6 @@ def test_unequal_groups_weigh_as_their_clips():
     assert paired_effects(d, [7, 1, 1, 1]).mean[0] == 3.25
     # 0.125 / 2; 4.5 x 10/16; what is left is -1, 0 and 1, 0: (0.5 + 0.5) x 10/16 / 2
     np.testing.assert_allclose(error(d, [7, 1, 1, 1]).variances[:, 0], [0.0625, 2.8125, 0.3125])
-
-
-# One of a kind, none that differ
 
 
 @pytest.mark.parametrize(
@@ -169,9 +106,6 @@ def test_differences_that_are_all_the_same():
     np.testing.assert_array_equal(equivalence_p(np.full((1, 3, 4), 2.0), 3), [0])
 
 
-# Interval and p-value are one thing
-
-
 @pytest.mark.parametrize("shares", SHARES.values())
 def test_zero_is_outside_exactly_where_p_is_small(shares: tuple[float, ...]):
     d = differences(4, 6, 1, shares, tables=40) + np.linspace(-8, 8, 40 * TABLE)[:, None, None]
@@ -190,19 +124,6 @@ def test_equivalence_is_the_interval_within_the_margin():
     assert 0.1 < within.mean() < 0.9
     assert equivalence_p(d + 10, 4.0).min() == 1
     np.testing.assert_array_equal(equivalence_p(d, np.full(len(d), 4.0)), p)
-
-
-@pytest.mark.parametrize("count", [2, 3, 5, 10, 40])
-def test_means_of_few_skewed_values_have_the_tails_they_are_given(count: int):
-    x = np.random.default_rng(count).exponential(size=(200_000, count)) - 1
-    t = np.abs(x.mean(1)) / (x.std(1, ddof=1) / np.sqrt(count))
-    for level in (0.05, 0.05 / TABLE):
-        missed = np.mean(t > stats.t.isf(level / 2, skewed(count - 1)))
-        assert 0.45 * level < missed < 1.45 * level
-        assert np.mean(t > stats.t.isf(level / 2, count - 1)) > 1.3 * level
-
-
-# The promises, on a part of `memmlp bench calibration`'s grid
 
 
 @pytest.mark.parametrize(("shape", "name"), [*itertools.product(GRID, SHARES)])
@@ -245,9 +166,6 @@ def test_unequal_groups_keep_the_promises():
         assert starred(effects.p) <= 0.05
 
 
-# What must not matter
-
-
 sizes = st.tuples(st.integers(2, 4), st.integers(2, 6), st.integers(0, 1000))
 
 
@@ -280,139 +198,6 @@ def test_units_and_signs_do_not_matter(size: tuple[int, int, int], scale: float)
     assert_same(scaled, Effects(scale * e.mean, scale * e.low, scale * e.high, e.p, ""))
     assert_same(turned, Effects(-e.mean, -e.high, -e.low, e.p, ""))
     np.testing.assert_allclose(detectable(scale * d, 5), scale * detectable(d, 5))
-
-
-# What could have been seen
-
-
-@pytest.mark.parametrize("comparisons", [1, 24])
-@pytest.mark.parametrize("shape", [(5, 12), (12, 40)])
-def test_detectable_is_found_with_its_power(shape: tuple[int, int], comparisons: int):
-    # Differences whose measured shares are what the repetitions are drawn from; these have normal effects.
-    d = differences(*shape, 1, SHARES["equal"], tables=1)[:1]
-    a, b, e = error(d).variances[:, 0]
-    rng = np.random.default_rng(5)
-    again = (
-        np.sqrt(shape[0] * max(a - e, 0)) * rng.normal(size=(4000, shape[0], 1))
-        + np.sqrt(shape[1] * max(b - e, 0)) * rng.normal(size=(4000, 1, shape[1]))
-        + np.sqrt(shape[0] * shape[1] * e) * rng.normal(size=(4000, *shape))
-    )
-    for power in (0.5, 0.8):
-        effect = detectable(d, comparisons, power=power)[0]
-        found = np.mean(paired_effects(again + effect).p <= 0.05 / comparisons)
-        assert found == pytest.approx(power, abs=0.03)
-
-
-def test_seeds_needed_are_the_first_that_suffice():
-    d = differences(4, 20, 1, (1, 0, 0.02, 0, 1), tables=1)[0]
-    few, many = seeds_needed(d, 12.0, TABLE), seeds_needed(d, 6.0, TABLE)
-    assert few is not None
-    assert many is not None
-    assert 2 <= few < many
-    assert seeds_needed(d[None], -6.0, TABLE) == many
-    assert seeds_needed(d, 6.0, TABLE, most=many) == many
-    assert seeds_needed(d, 6.0, TABLE, most=many - 1) is None
-    measured = detectable(d[None], TABLE)[0]
-    assert seeds_needed(d, 1.0001 * measured, TABLE) == 4
-    assert seeds_needed(d, 0.9999 * measured, TABLE) == 5
-
-
-def test_noise_goes_away_with_seeds():
-    noise = np.outer([1.0, -1.0, 1.0, -1.0], [1.0, -1.0] * 10)
-    half = detectable(noise[None], TABLE)[0] / 2
-    assert error(noise[None]).variances[:2].max() < 1e-12
-    needed = seeds_needed(noise, half, TABLE)
-    assert needed is not None
-    assert 4 < needed <= 16
-
-
-def test_no_number_of_seeds_makes_up_for_few_clips():
-    d = differences(4, 4, 1, (1, 0, 10, 0, 0.1), tables=1)[0]
-    assert seeds_needed(d, 3.0, TABLE) is None
-
-
-# Many comparisons
-
-
-def test_holm_known_examples():
-    # Wikipedia, "Holm-Bonferroni method"; R: p.adjust(c(0.01, 0.02, 0.03, 0.04, 0.05), "holm")
-    np.testing.assert_allclose(holm(np.array([0.01, 0.04, 0.03, 0.005])), [0.03, 0.06, 0.06, 0.02])
-    np.testing.assert_allclose(holm(np.array([0.01, 0.02, 0.03, 0.04, 0.05])), [0.05, 0.08, 0.09, 0.09, 0.09])
-
-
-def test_holm_stays_below_one_and_leaves_nan_out():
-    np.testing.assert_allclose(holm(np.array([0.7, np.nan, 0.02, 0.6])), [1, np.nan, 0.06, 1])
-    assert holm(np.array([])).shape == (0,)
-
-
-@pytest.mark.parametrize(
-    ("difference", "equivalence", "mean", "paper", "expected"),
-    [
-        (0.01, 1.0, -0.3, -2.0, Verdict.HOLDS),
-        (0.01, 1.0, 0.3, -2.0, Verdict.OPPOSITE),
-        (0.01, 1.0, 0.3, None, Verdict.HIGHER),
-        (0.01, 1.0, -0.3, 0.0, Verdict.LOWER),
-        (0.05, 0.06, 0.3, 2.0, Verdict.HOLDS),
-        (0.01, 0.05, 0.3, 2.0, Verdict.EQUIVALENT),
-        (0.06, 0.06, 0.3, 2.0, Verdict.OPEN),
-        (np.nan, np.nan, 0.3, 2.0, Verdict.OPEN),
-    ],
-)
-def test_verdicts(difference: float, equivalence: float, mean: float, paper: float | None, expected: Verdict):
-    assert verdict(difference, equivalence, mean, paper) is expected
-
-
-def test_a_look_has_its_own_level():
-    assert verdict(0.03, 1.0, 1.0, 1.0, level=0.02) is Verdict.OPEN
-    assert verdict(0.03, 1.0, 1.0, 1.0, level=0.03) is Verdict.HOLDS
-
-
-def test_looks_and_what_they_spend():
-    assert looks(13) == (3, 5, 8, 13)
-    assert looks(10) == (3, 5, 8, 10)
-    assert looks(2) == (2,)
-    assert spending(1) == (0.05,)
-    assert spending(2) == pytest.approx((0.05 / 3, 0.1 / 3))
-    assert sum(spending(5)) == pytest.approx(0.05)
-
-
-def test_claims_leave_the_correction_and_other_decisions_stay_in_it():
-    p = np.array([0.5, 0.01, 0.001, 0.02, np.nan])
-    claimed = np.array([True, False, False, False, False])
-    closed = np.array([False, False, True, False, False])
-    # of four, one is claimed and one can't be: 0.01 is corrected for the three that are left
-    np.testing.assert_allclose(sequential(p, claimed, closed), [0, 0.03, 1, 0.04, np.nan])
-
-
-def test_looks_keep_the_error_where_one_level_for_all_would_not():
-    d = differences(13, 8, 1, SHARES["seeds"], tables=600)
-    rounds = looks(13)
-    kept, wasted = np.zeros((2, 600), bool)
-    for seeds, level in zip(rounds, spending(len(rounds)), strict=True):
-        p = paired_effects(d[:, :seeds]).p.reshape(600, TABLE)
-        least = np.array([holm(row).min() for row in p])
-        kept |= least <= level
-        wasted |= least <= 0.05
-    assert kept.mean() <= 0.06 < 0.09 < wasted.mean()
-
-
-# Descriptions
-
-
-def test_probability_of_improvement_by_hand():
-    ours, theirs = np.array([[1.0, 5.0], [2.0, 5.0]]), np.array([[2.0, 4.0]])
-    # clip 1: smaller, equal; clip 2: never
-    assert probability_of_improvement(ours, theirs) == pytest.approx((0.75 + 0) / 2)
-    assert probability_of_improvement(theirs, ours) == pytest.approx(1 - 0.375)
-
-
-def test_interquartile_mean_by_hand():
-    assert interquartile_mean(np.array([[0.0, 1.0, 2.0, 3.0], [4.0, 5.0, 6.0, 1000.0]])) == 3.5
-
-
-def test_performance_profile_by_hand():
-    errors = np.array([[1.0, 2.0], [3.0, 4.0]])
-    np.testing.assert_array_equal(performance_profile(errors, np.array([0.5, 2.0, 3.5])), [0, 0.5, 0.75])
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
