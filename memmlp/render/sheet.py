@@ -81,5 +81,5 @@ def indexed(picture: np.ndarray) -> Image.Image:
 def png(picture: np.ndarray) -> bytes:
     """Encode a picture (H, W, 3), uint8, as PNG."""
     buffer = BytesIO()
-    Image.fromarray(picture).save(buffer, "PNG", optimize=True)
+    Image.fromarray(picture).save(buffer, "PNG")
     return buffer.getvalue()

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from command_line import run
+from command_line import SMALL, run
 
 
 @pytest.mark.slow
 def test_every_trial_is_there_once(tmp_path: Path):
     """With two seeds a trial, so that some kills come between a trial's runs."""
-    words = ["--trials", "2", "--kills", "3", "data.synth.minutes=0.2", "search.seeds=2"]
+    words = ["--trials", "2", "--kills", "3", *SMALL, "search.seeds=2"]
     said = run(tmp_path, "bench", "chaos-tune", *words)
     assert "2 trials with 3 kills" in said
     assert "all trials as they should be: 0 differences" in said
