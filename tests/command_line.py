@@ -16,7 +16,11 @@ from memmlp.cli.main import main
 # For a process of its own. Ctrl-C reaches it where the tests were started with SIGINT ignored (nohup, &).
 INTERRUPTIBLE = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
 MAIN = [sys.executable, "-c", f"{INTERRUPTIBLE}; from memmlp.cli.main import main; main()"]
-SMALL = ["profile.depth=2", "profile.memory_layers=[2]", "data.synth.minutes=0.2"]  # smaller than profile=tiny
+SMALL = [
+    "profile.depth=2",
+    "profile.memory_layers=[2]",
+    "data.synth.minutes=0.2",
+]  # smaller than profile=tiny
 TINY = ["profile=tiny", *SMALL, "tracking=none", "threads=1", "optim.steps=6", "vqvae.steps=6"]
 
 

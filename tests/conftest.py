@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import os
 import re
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +13,7 @@ import command_line
 import processes
 import pytest
 from filelock import FileLock
+from remembered import remember
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -74,22 +73,10 @@ def clean(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
 
 
-def remember_exporter() -> None:
-    """From a process' second export on, torch's exporter keeps the 500 functions that it would read each time.
-
-    That is half a second of each export.
-    """
-    module = sys.modules.get("torch.onnx._internal.exporter._registration")
-    library = getattr(module, "onnxscript_apis", None)
-    read = getattr(library, "get_torchlib_ops", None)
-    if read is not None and not hasattr(read, "cache_info"):
-        library.get_torchlib_ops = functools.cache(read)
-
-
 @pytest.fixture(autouse=True)
 def _own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     clean(monkeypatch)
-    remember_exporter()
+    remember()
 
 
 @pytest.fixture(autouse=True)

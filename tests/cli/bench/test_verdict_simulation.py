@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
 
 import pytest
 
+from memmlp.cli.bench import verdict_simulation
 from memmlp.common.files import read_json
 from memmlp.statistics.simulation import GridRow
 
-MODULE = importlib.import_module("memmlp.cli.bench.verdict_simulation")  # in the package this name is the command's
-
 
 def test_the_command(memmlp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(MODULE, "grid", lambda: [GridRow(3, 10, 2), GridRow(5, 536, 10)])
+    monkeypatch.setattr(verdict_simulation, "grid", lambda: [GridRow(3, 10, 2), GridRow(5, 536, 10)])
     file = tmp_path / "rates.json"
     ran = memmlp("bench", "calibration", "--quick", "--tables", "30", "--json", str(file), "--markdown")
     assert ran.code == 0, ran.err
