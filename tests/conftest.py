@@ -49,9 +49,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # Begun first, so that no process is left alone with one of them at the end.
 LONGEST = (
-    "test_axes", "networks/test_baselines", "cli/test_tune", "kills/test_search", "kills/test_sweep",
-    "cli/test_sweep", "live/test_full_graph", "pipeline/test_pipeline", "deploy/test_deployment",
-    "live/test_stream", "kills/test_command", "kills/test_training",
+    "kills/test_rounds", "kills/test_search", "kills/test_sweep", "cli/test_tune", "config/test_build",
+    "pipeline/test_run_stages", "cli/test_sweep", "live/test_full_graph", "deploy/test_deployment",
+    "pipeline/test_experiment", "kills/test_command", "pipeline/test_baselines", "live/test_stream",
+    "networks/test_streaming", "kills/test_training", "config/test_compose",
 )  # fmt: skip
 
 SLOW_TIMEOUT = 3600  # seconds: ends what hangs, but not what is slow on a machine with much other work

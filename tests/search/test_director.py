@@ -1,84 +1,34 @@
-"""The study and its director: trials counted, pruned, failed and resumed, with runs written by the tests."""
+"""The director: trials counted, pruned, failed and resumed, with runs written by the tests."""
 
 from __future__ import annotations
 
-import csv
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
+from fake_search import (
+    STEPS,
+    begun,
+    compose,
+    director,
+    error,
+    finish,
+    log,
+    open_study,
+    search,
+    seeded,
+    to_the_end,
+)
 from optuna.trial import TrialState
 
 from memmlp.common.errors import InputError
-from memmlp.runs.identity import run_id
-from memmlp.runs.run import Run
-from memmlp.search import results
 from memmlp.search import study as study_module
 from memmlp.search.board import figures
-from memmlp.search.director import Director
-from memmlp.search.spec import Search, Value, parse_search
-from memmlp.search.study import Study, journal, mend
-from memmlp.sweep.plan import Plan, RunTask
-
-STEPS = 30
-SPACE = {
-    "rotation": {"low": 0.1, "high": 10.0, "log": True, "first": 1.0},
-    "hand": {"low": 0.01, "high": 1.0, "log": True, "first": 0.1},
-}
-
-
-def search(**changes: Any) -> Search:
-    content: dict[str, Any] = {
-        "name": "mine", "base": ["loss=manual"], "space": {"loss": SPACE}, "objectives": ["MPJPE"],
-        "n_trials": 6, "seeds": 1, "sampler": "tpe", "startup": 3, "seed": 0, "pruner": "none",
-        "prune_after": 2, "storage": None,
-    }  # fmt: skip
-    return parse_search({**content, **changes})
-
-
-def open_study(folder: Path, **changes: Any) -> Study:
-    return Study.own(search(**changes), "mine", folder)
-
-
-def compose(values: Mapping[str, Value], seeds: int = 1) -> list[list[RunTask]]:
-    configs = [{"optim": {"steps": STEPS}, "values": dict(values), "seed": seed} for seed in range(seeds)]
-    return [
-        [RunTask(run_id("memmlp", config, data="d", upstream=None), "memmlp", config)] for config in configs
-    ]
-
-
-def director(study: Study, folder: Path, composed: Callable = compose) -> Director:
-    return Director(study, composed, Plan("mine", folder, (), (), open=True))
-
-
-def error(config: Mapping[str, Any]) -> float:
-    """Return a trial's error: lowest at weights of 2 and 0.2, and 0.3 higher with each further seed."""
-    values = config["values"]
-    return 5 + abs(values["loss.rotation"] - 2) + abs(values["loss.hand"] - 0.2) + 0.3 * config["seed"]
-
-
-def log(run: Run, step: int, value: float) -> None:
-    run.log(step, {"rotation MPJPE": value, "rotation Jitter": 20 - value}, "val")
-
-
-def finish(plan: Plan) -> None:
-    """Bring the runs of a plan to their end."""
-    for task in plan.left():
-        run = plan.run_of(task)
-        run.begin("memmlp", task.config, data="d", upstream=None)
-        log(run, STEPS, error(task.config))
-        run.finish([])
-
-
-def to_the_end(study: Study, folder: Path, capacity: int = 2) -> None:
-    one = director(study, folder)
-    while (plan := one.look(capacity)).tasks:
-        finish(plan)
+from memmlp.search.spec import Value
+from memmlp.search.study import Study
+from memmlp.sweep.plan import RunTask
 
 
 def test_a_search_has_the_trials_it_wants_and_the_papers_first(tmp_path: Path):
@@ -151,66 +101,6 @@ def test_a_director_killed_while_it_asks_loses_and_repeats_nothing(
     assert all(trial.state == TrialState.COMPLETE for trial in study.trials)
     assert all(set(trial.params) == {"loss.rotation", "loss.hand"} for trial in study.trials)
     assert len({tuple(trial.params.values()) for trial in study.trials}) == 6
-
-
-def test_a_resumed_search_proposes_what_the_undisturbed_one_does(tmp_path: Path):
-    calm = open_study(tmp_path / "calm" if (tmp_path / "calm").mkdir() is None else tmp_path)
-    to_the_end(calm, tmp_path / "calm", capacity=1)
-    (tmp_path / "stopped").mkdir()
-    for _ in range(6):
-        one = director(open_study(tmp_path / "stopped"), tmp_path / "stopped")
-        finish(one.look(1))
-    last = open_study(tmp_path / "stopped")
-    to_the_end(last, tmp_path / "stopped", capacity=1)
-    assert [trial.params for trial in last.trials] == [trial.params for trial in calm.trials]
-
-
-def test_the_seed_changes_what_is_proposed_and_the_sampler_too(tmp_path: Path):
-    proposed = []
-    for name, changes in {"a": {}, "b": {"seed": 1}, "c": {"sampler": "random"}}.items():
-        (tmp_path / name).mkdir()
-        study = open_study(tmp_path / name, **changes)
-        to_the_end(study, tmp_path / name, capacity=1)
-        proposed.append([tuple(trial.params.values()) for trial in study.trials])
-    assert proposed[0] != proposed[1]
-    assert proposed[0] != proposed[2]
-
-
-def test_a_torn_line_and_a_dead_owners_lock_are_mended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """At once: Optuna alone sleeps until the lock is half a minute old."""
-
-    def sleep(seconds: float) -> None:
-        raise AssertionError("it waits for the lock")
-
-    study = open_study(tmp_path)
-    one = director(study, tmp_path)
-    finish(one.look(2))
-    one.look(2)
-    with open(journal(tmp_path), "ab") as file:
-        file.write(b'{"op_code":4,"worker_id":"x"')
-    Path(f"{journal(tmp_path)}.lock").symlink_to(journal(tmp_path))
-    monkeypatch.setattr("memmlp.runs.run.changes", str)  # git, in a changed checkout, is waited for in sleeps
-    monkeypatch.setattr(time, "sleep", sleep)
-    to_the_end(open_study(tmp_path), tmp_path)
-    again = open_study(tmp_path)
-    assert [trial.number for trial in again.trials] == list(range(6))
-
-
-def test_mending_leaves_a_whole_journal_alone(tmp_path: Path):
-    open_study(tmp_path)
-    content = journal(tmp_path).read_bytes()
-    mend(journal(tmp_path))
-    assert journal(tmp_path).read_bytes() == content
-    mend(tmp_path / "none.journal")
-    assert not (tmp_path / "none.journal").exists()
-
-
-def begun(plan: Plan) -> Run:
-    """Begin the run of a plan's only task, and return it."""
-    (task,) = plan.tasks
-    run = plan.run_of(task)
-    run.begin("memmlp", task.config, data="d", upstream=None)
-    return run
 
 
 def test_a_trial_worse_than_the_median_is_pruned_and_its_run_cancelled(tmp_path: Path):
@@ -309,10 +199,6 @@ def test_a_pruned_trials_run_is_wanted_again_by_one_with_its_values(tmp_path: Pa
     assert all(trial.state.is_finished() for trial in study.trials[:-1])
 
 
-def seeded(study: Study, folder: Path) -> Director:
-    return director(study, folder, partial(compose, seeds=study.search.seeds))
-
-
 def test_a_trials_value_is_the_mean_of_its_seeds(tmp_path: Path):
     study = open_study(tmp_path, seeds=3, n_trials=2)
     one = seeded(study, tmp_path)
@@ -399,126 +285,6 @@ def test_a_director_killed_between_seeds_repeats_and_loses_none(tmp_path: Path):
     assert [trial.user_attrs["runs"] for trial in stopped.trials] == [
         trial.user_attrs["runs"] for trial in calm.trials
     ]
-
-
-def test_trials_of_several_seeds_as_csv(tmp_path: Path):
-    study = open_study(tmp_path, seeds=2, n_trials=2, objectives=["MPJPE", "Jitter"])
-    one = seeded(study, tmp_path)
-    finish(one.look(1))
-    finish(one.look(1))
-    begun(one.look(1)).fail("the loss is nan")
-    one.look(1)
-    results.write_trials(study, tmp_path / "trials.csv")
-    with open(tmp_path / "trials.csv", newline="") as file:
-        row, failed = csv.DictReader(file)
-    first = error({"values": study.trials[0].params, "seed": 0})
-    assert float(row["MPJPE"]) == pytest.approx(first + 0.15)
-    assert float(row["MPJPE sd"]) == pytest.approx(0.3 / 2**0.5)
-    assert float(row["MPJPE, run 1"]) == pytest.approx(first)
-    assert float(row["Jitter, run 2"]) == pytest.approx(20 - first - 0.3)
-    assert len(row["run"].split()) == 2
-    assert (failed["state"], failed["MPJPE sd"], failed["reason"]) == ("fail", "", "the loss is nan")
-    (path,) = results.write_experiments(study, tmp_path, ["loss"])
-    assert row["run"] in path.read_text()
-
-
-def test_two_objectives_give_a_front(tmp_path: Path):
-    study = open_study(tmp_path, objectives=["MPJPE", "Jitter"])
-    to_the_end(study, tmp_path)
-    front = study.best()
-    assert len(front) == 6  # Jitter is 20 less MPJPE here, so that none is better in both
-    assert [trial.values[0] for trial in front] == sorted(trial.values[0] for trial in front)
-    files = results.write_experiments(study, tmp_path, ["loss"])
-    assert [file.name for file in files] == ["best.yaml", *(f"trial-{t.number}.yaml" for t in front[1:])]
-    names = {path.name for path in results.write_plots(study, tmp_path)}
-    assert names == {"pareto_front.png", "parallel_coordinate.png", "slice.png", "study.html"}
-
-
-@pytest.mark.slow
-def test_what_a_search_leaves(tmp_path: Path):
-    study = open_study(tmp_path)
-    to_the_end(study, tmp_path)
-    results.write_trials(study, tmp_path / "trials.csv")
-    with open(tmp_path / "trials.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["trial"] for row in rows] == list("012345")
-    assert [float(row["MPJPE"]) for row in rows] == [trial.value for trial in study.trials]
-    (path,) = results.write_experiments(study, tmp_path, ["loss"])
-    best = study.best()[0]
-    content = yaml.safe_load(path.read_text())
-    assert content["defaults"] == [{"override /loss": "manual"}, "_self_"]
-    assert {f"loss.{key}": value for key, value in content["loss"].items()} == best.params
-    assert path.read_text().startswith("# @package _global_\n")
-    shipped = tmp_path / "shipped.yaml"
-    shipped.write_text("control: b\narms: {a: {overrides: [loss=manual]}, b: []}\n")
-    assert results.write_table(study, shipped, tmp_path / "table05.yaml")
-    arms = yaml.safe_load((tmp_path / "table05.yaml").read_text())["arms"]
-    assert list(arms) == ["manual, searched", "a", "b"]
-    assert f"loss.hand={best.params['loss.hand']}" in arms["manual, searched"]["overrides"]
-    written = results.write_plots(study, tmp_path)
-    assert {path.name for path in written} == {
-        "optimization_history.png", "parallel_coordinate.png", "slice.png", "param_importances.png",
-        "study.html",
-    }  # fmt: skip
-    assert all(path.stat().st_size > 5000 for path in written)
-    page = (tmp_path / "study.html").read_text()
-    assert "<script src=" not in page
-
-
-def test_table_5_takes_only_loss_weights(tmp_path: Path):
-    study = open_study(tmp_path, space={"optim": {"lr": {"low": 0.1, "high": 1.0}}}, n_trials=1)
-    one = director(study, tmp_path)
-    run = begun(one.look(1))
-    log(run, STEPS, 1.0)
-    run.finish([])
-    one.look(1)
-    assert not results.write_table(study, tmp_path / "none", tmp_path / "table05.yaml")
-
-
-def test_a_study_is_looked_at_while_its_owner_works(tmp_path: Path):
-    assert Study.view(search(), "mine", tmp_path) is None
-    study = open_study(tmp_path)
-    director(study, tmp_path).look(2)
-    seen = Study.view(search(), "mine", tmp_path)
-    assert seen is not None
-    assert len(seen.trials) == 2
-    assert Study.view(search(), "other", tmp_path) is None
-
-
-def test_a_team_storage_and_a_bad_one(tmp_path: Path):
-    study = open_study(tmp_path, storage=f"sqlite:///{tmp_path}/team.db")
-    to_the_end(study, tmp_path)
-    assert len(study.trials) == 6
-    assert not journal(tmp_path).exists()
-    with pytest.raises(InputError, match=r"search\.storage=nonsense:"):
-        open_study(tmp_path, storage="nonsense://x")
-
-
-def test_a_best_trial_of_groups_lists_and_plain_keys_is_a_config(tmp_path: Path):
-    space = {"hand": {"choices": ["off", "fk"]}, "memory": {"layers": {"choices": [[2], [2, 4]]}}}
-    space |= {"seed": {"low": 3, "high": 9}}
-    study = open_study(tmp_path, space=space, n_trials=1, base=[])
-    one = director(study, tmp_path)
-    run = begun(one.look(1))
-    log(run, STEPS, 1.0)
-    run.finish([])
-    one.look(1)
-    (path,) = results.write_experiments(study, tmp_path, ["hand", "memory"])
-    content = yaml.safe_load(path.read_text())
-    assert content["defaults"][0]["override /hand"] in ("off", "fk")
-    assert content["memory"]["layers"] in ([2], [2, 4])
-    assert content["seed"] in range(3, 10)
-
-
-@pytest.mark.parametrize(
-    "content", [b"x" * 5000, b"hello\nthis is no journal\n", b'{"op_code":0,"x":1}\ngarbage\n{}\n']
-)
-def test_what_is_no_journal_is_left_alone_and_named(tmp_path: Path, content: bytes):
-    journal(tmp_path).write_bytes(content)
-    for look in (open_study, lambda folder: Study.view(search(), "mine", folder)):
-        with pytest.raises(InputError, match=r"study.journal: not a journal of Optuna's"):
-            look(tmp_path)
-    assert journal(tmp_path).read_bytes() == content
 
 
 def test_validations_of_a_network_used_otherwise_are_no_trials(tmp_path: Path):

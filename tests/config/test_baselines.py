@@ -1,0 +1,123 @@
+"""Baselines by configs: published sizes, identities, refusals."""
+
+import pytest
+import tiny
+
+from memmlp.common.errors import InputError
+from memmlp.config.build import build_experiment
+from memmlp.config.compose import composed
+from memmlp.deploy import latency
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.window_model import WindowModel
+
+NAMES = list(tiny.BASELINES)
+
+
+def built(*overrides: str) -> WindowModel:
+    """The network of a command line, with random weights."""
+    architecture = build_experiment(composed(list(overrides))).architecture
+    return architecture.build(Normalizer.raw(architecture.coordinates, tiny.REST), None).eval()
+
+
+# Parameters: as counted by hand in the docstrings, and as Table 16 prints them. MACs of a streaming step:
+# 12 blocks of T T d + T d d, stem and head for AGRoL; its denoiser five times, with a linear a block and the
+# embedding's two for one row. For AvatarPoser 4 d d + 2 d f a layer and frame, and the products of attention.
+PUBLISHED = {
+    "agrol_mlp": (3_735_668, 3.74, 12 * (196**2 * 512 + 196 * 512**2) + 196 * 512 * (54 + 132)),
+    "agrol_diffusion": (
+        7_480_436,
+        7.48,
+        5 * (12 * (196**2 * 512 + 197 * 512**2) + 196 * 512 * (186 + 132) + 2 * 512**2),
+    ),
+    "avatar_poser": (
+        4_124_804,
+        4.12,
+        3 * 40 * (4 * 256**2 + 2 * 256 * 2048 + 2 * 40 * 256) + 40 * 54 * 256 + 2 * 256**2 + 256 * 132,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_paper_profile_has_the_published_size(name):
+    count, millions, macs = PUBLISHED[name]
+    model = built(f"model={name}", "profile=paper")
+    assert model.count_parameters() == count
+    assert round(model.count_parameters() / 1e6, 2) == millions
+    kinematics = 22 * 3**3  # the rotations of the newest frame along the tree
+    assert latency.macs(model) == macs + kinematics
+
+
+def test_published_work():
+    """Table 16 has the MACs of AGRoL-MLP, 0.88 G, and twice those of AvatarPoser, 0.33 G, as FLOPs."""
+    assert PUBLISHED["agrol_mlp"][2] / 1e9 == pytest.approx(0.88, abs=0.015)
+    assert 2 * PUBLISHED["avatar_poser"][2] / 1e9 == pytest.approx(0.33, abs=0.015)
+
+
+def test_baselines_see_what_their_authors_give_them():
+    """World coordinates, and z-scores of the diffusion model alone; what is asked for wins."""
+    features = {name: tuple(composed([f"model={name}"]).frame.values()) for name in NAMES}
+    raw = ("world", False)
+    assert features == {"agrol_mlp": raw, "avatar_poser": raw, "agrol_diffusion": ("world", True)}
+    asked = composed(["model=agrol_mlp", "frame.coordinates=heading", "frame.normalize=true"]).frame
+    assert tuple(asked.values()) == ("heading", True)
+    assert tuple(composed([]).frame.values()) == ("heading", True)
+
+
+def identity(*overrides: str) -> str:
+    return build_experiment(composed(list(overrides))).identity("d").id
+
+
+@pytest.mark.slow
+def test_networks_have_identities_of_their_own_that_stay_what_they_are():
+    """Moving code, renaming classes and new keys that stand at their default change none of them."""
+    assert len({identity(), *(identity(f"model={name}") for name in NAMES)}) == 4
+    assert identity("model=agrol_mlp", "vqvae.codes=3") == identity("model=agrol_mlp")
+    assert identity() == "fb6eb5c146b3c909"
+    assert identity("profile=tiny") == "2dba0fa264a59214"
+    assert identity("memory=none") == "8027b7f0e25d0134"
+    assert identity("memory=lstm") == "4bcad95949d5dae3"
+    assert identity("experiment=paper") == "b3be0d19ac52afce"
+    assert identity("experiment=rotation_only") == "8449a2994b18839f"
+
+
+REFUSED = [
+    (["model=agrol_mlp", "memory=vq"], "memory"),
+    (["model=avatar_poser", "memory=none"], "memory"),
+    (["model=avatar_poser", "predictor=rotation_only"], "predictor"),
+    (["model=agrol_mlp", "hand=fk"], "hand"),
+    (["model=agrol_diffusion", "rollout=streams"], "rollout"),
+    (["model=agrol_mlp", "rollout=own_predictions"], "rollout"),
+    (["model=agrol_mlp", "loss=uncertainty"], "loss"),
+    (["model=agrol_mlp", "experiment=manual_weights"], "loss"),
+    (["model=agrol_mlp", "evaluation.ik=lbfgs"], "evaluation.ik"),
+    (["model=agrol_mlp", "memory.width=4"], "memory.width"),
+    (["model=agrol_mlp", "model.heads=4"], "model.heads"),
+    (["model=avatar_poser", "model.heads=7"], "model.heads"),
+    (["model=agrol_diffusion", "model.sampling_steps=2000"], "model.sampling_steps"),
+    (["model=agrol_diffusion", "model.diffusion_steps=0"], "model.diffusion_steps"),
+    (["loss=agrol"], "predictor=rotation_only with hand=off"),
+    (["loss=agrol", "predictor=rotation_only", "hand=fk"], "predictor=rotation_only with hand=off"),
+    (
+        ["loss=avatar_poser", "predictor=rotation_only", "hand=off"],
+        "allowed is loss=uncertainty or loss=manual",
+    ),
+    (["model=agrol_mlp", "loss.error=cube"], "loss.error=cube"),
+    (["model=avatar_poser", "loss.anchor=foot"], "loss.anchor=foot"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "word"), REFUSED, ids=[" ".join(options) for options, _ in REFUSED])
+def test_what_makes_no_sense_is_refused_in_one_line(overrides, word):
+    with pytest.raises(InputError) as refusal:
+        composed(overrides)
+    assert word in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("profile", ["tiny", "small", "paper"])
+def test_profiles_and_the_papers_experiment_fit(name, profile):
+    cfg = composed([f"model={name}", "experiment=paper", f"profile={profile}", "model.frames=9"])
+    assert cfg.model.frames == 9
+    assert (cfg.memory, cfg.predictor, cfg.hand) == (None, None, None)
+    assert build_experiment(cfg).config["model"]["_target_"].startswith("memmlp.networks.baselines.")

@@ -1,0 +1,82 @@
+"""Searches whose runs are written by the tests: a trial's error is known from its values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from memmlp.runs.identity import run_id
+from memmlp.runs.run import Run
+from memmlp.search.director import Director
+from memmlp.search.spec import Search, Value, parse_search
+from memmlp.search.study import Study
+from memmlp.sweep.plan import Plan, RunTask
+
+STEPS = 30
+SPACE = {
+    "rotation": {"low": 0.1, "high": 10.0, "log": True, "first": 1.0},
+    "hand": {"low": 0.01, "high": 1.0, "log": True, "first": 0.1},
+}
+
+
+def search(**changes: Any) -> Search:
+    content: dict[str, Any] = {
+        "name": "mine", "base": ["loss=manual"], "space": {"loss": SPACE}, "objectives": ["MPJPE"],
+        "n_trials": 6, "seeds": 1, "sampler": "tpe", "startup": 3, "seed": 0, "pruner": "none",
+        "prune_after": 2, "storage": None,
+    }  # fmt: skip
+    return parse_search({**content, **changes})
+
+
+def open_study(folder: Path, **changes: Any) -> Study:
+    return Study.own(search(**changes), "mine", folder)
+
+
+def compose(values: Mapping[str, Value], seeds: int = 1) -> list[list[RunTask]]:
+    configs = [{"optim": {"steps": STEPS}, "values": dict(values), "seed": seed} for seed in range(seeds)]
+    return [
+        [RunTask(run_id("memmlp", config, data="d", upstream=None), "memmlp", config)] for config in configs
+    ]
+
+
+def director(study: Study, folder: Path, composed: Callable = compose) -> Director:
+    return Director(study, composed, Plan("mine", folder, (), (), open=True))
+
+
+def error(config: Mapping[str, Any]) -> float:
+    """Return a trial's error: lowest at weights of 2 and 0.2, and 0.3 higher with each further seed."""
+    values = config["values"]
+    return 5 + abs(values["loss.rotation"] - 2) + abs(values["loss.hand"] - 0.2) + 0.3 * config["seed"]
+
+
+def log(run: Run, step: int, value: float) -> None:
+    run.log(step, {"rotation MPJPE": value, "rotation Jitter": 20 - value}, "val")
+
+
+def finish(plan: Plan) -> None:
+    """Bring the runs of a plan to their end."""
+    for task in plan.left():
+        run = plan.run_of(task)
+        run.begin("memmlp", task.config, data="d", upstream=None)
+        log(run, STEPS, error(task.config))
+        run.finish([])
+
+
+def to_the_end(study: Study, folder: Path, capacity: int = 2) -> None:
+    one = director(study, folder)
+    while (plan := one.look(capacity)).tasks:
+        finish(plan)
+
+
+def begun(plan: Plan) -> Run:
+    """Begin the run of a plan's only task, and return it."""
+    (task,) = plan.tasks
+    run = plan.run_of(task)
+    run.begin("memmlp", task.config, data="d", upstream=None)
+    return run
+
+
+def seeded(study: Study, folder: Path) -> Director:
+    return director(study, folder, partial(compose, seeds=study.search.seeds))

@@ -1,0 +1,81 @@
+"""What every baseline keeps to: streams, windows, joints, export."""
+
+import pytest
+import tiny
+import torch
+
+from memmlp.deploy.export import export
+from memmlp.deploy.parity import TOLERANCE, parity
+from memmlp.evaluation import modes as evaluation
+from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM
+from memmlp.motion.coordinates import Heading
+
+NAMES = list(tiny.BASELINES)
+CLIP = tiny.clip(40)
+SPARSE = CLIP[None, :, :SPARSE_DIM]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@torch.no_grad()
+def test_a_stream_is_the_last_frame_of_windows_with_full_history(name):
+    model = tiny.baseline(name, Heading())
+    size = model.frames
+    stream = evaluation.stream(model, [CLIP])[0]
+    for end in (size, 20, 40):
+        window = model.advance(SPARSE[:, end - size : end], model.initial_state(1))[0]
+        torch.testing.assert_close(window[0, -1], stream[end - 1], atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@torch.no_grad()
+def test_a_fresh_start_is_the_first_frame_for_a_window(name):
+    model = tiny.baseline(name)
+    first = model.advance(SPARSE[:, :1], model.initial_state(1), 1)[0]
+    still = model.advance(SPARSE[:, :1].expand(-1, model.frames, -1), model.initial_state(1), 1)[0]
+    torch.testing.assert_close(first, still)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("mode", ["stream", "window"])
+@torch.no_grad()
+def test_side_by_side_is_one_by_one_and_short_clips_count(name, mode):
+    model = tiny.baseline(name)
+    clips = [tiny.clip(n, seed=n) for n in (4, 25, 14)]
+    for together, clip in zip(evaluation.predict(model, clips, mode, 8), clips, strict=True):
+        assert together.shape == (len(clip), MOTION_DIM)
+        alone = evaluation.predict(model, [clip], mode, 8)[0]
+        torch.testing.assert_close(together, alone, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@torch.no_grad()
+def test_positions_are_forward_kinematics_of_the_rotations(name):
+    model = tiny.baseline(name, Heading())
+    motion = evaluation.stream(model, [CLIP])[0]
+    expected = model.normalizer.pose(motion, CLIP[:, :SPARSE_DIM]).flatten(1)
+    torch.testing.assert_close(motion[:, ROTATION.stop :], expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_torch_and_onnx_agree_on_a_whole_clip(name, tmp_path):
+    """Relative to the heading, which makes the larger graph; in the world in the command below."""
+    model = tiny.baseline(name, Heading())
+    export(model, tmp_path / "step.onnx", "0" * 16)
+    assert parity(model, tmp_path / "step.onnx", CLIP) <= TOLERANCE
+
+
+KNOBS = [
+    ("agrol_mlp", {"frames": 6}), ("agrol_mlp", {"depth": 3}), ("agrol_mlp", {"width": 12}),
+    ("agrol_diffusion", {"diffusion_steps": 60}), ("agrol_diffusion", {"sampling_steps": 2}),
+    ("agrol_diffusion", {"noise_seed": 1}), ("agrol_diffusion", {"depth": 3}),
+    ("avatar_poser", {"frames": 6}), ("avatar_poser", {"heads": 2}), ("avatar_poser", {"feedforward": 16}),
+    ("avatar_poser", {"depth": 3}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "change"), KNOBS, ids=str)
+@torch.no_grad()
+def test_every_knob_changes_the_motion(name, change):
+    base, other = (evaluation.stream(tiny.baseline(name, **c), [CLIP])[0] for c in ({}, change))
+    assert not torch.allclose(base, other, atol=1e-4)

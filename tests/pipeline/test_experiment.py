@@ -1,0 +1,240 @@
+"""Every key of the config is changed once: an identity changes exactly where a stage's result does."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from memmlp.config.build import build_experiment
+from memmlp.config.compose import composed
+from memmlp.config.schema import restored
+from memmlp.deploy.deployment import GRAPHS
+from memmlp.evaluation import modes as evaluation
+from memmlp.motion.dataset import MotionDataset
+from memmlp.pipeline.experiment import Experiment
+from memmlp.pipeline.run_stages import vqvae_run
+from memmlp.runs.identity import NEUTRAL, Identity, deployment_id, evaluation_id, flatten
+from memmlp.runs.run import Run
+
+BASE = [
+    "profile=tiny", "data=mocap", "data.root=clips", "data.split.groups=[]", "memory.shift=frame",
+    "tracking=mlflow", "threads=1", "optim.steps=4", "vqvae.steps=3",
+    "optim.batch=4", "model.width=8", "model.frames=5", "model.depth=4", "memory.layers=[2]", "vqvae.width=8",
+    "memory.width=4", "predictor.depth=1", "optim.checkpoint_every=9", "optim.validate_every=9",
+    "evaluation.ik=lbfgs", "evaluation.ik_iterations=2", "optim.schedule=step", "optim.drop_at=0.5",
+]  # fmt: skip
+
+CHANGES: dict[str, str] = {
+    "seed": "1", "device": "cpu", "threads": "2", "force": "true", "save_predictions": "elsewhere",
+    "data.name": "other", "data.min_frames": "43", "data.strict": "true", "data.weighting": "clips",
+    "data.split.test": "0.3", "data.split.val": "0.3",
+    "data.split.seed": "1", "data.split.groups": "['[a-d]1']",
+    "frame.coordinates": "world", "frame.normalize": "false",
+    "model.frames": "6", "model.width": "12", "model.depth": "3",
+    "memory.layers": "[2,4]", "memory.width": "5", "memory.shift": "window", "memory.history": "latest",
+    "memory.fusion": "plain", "memory.blend": "1",
+    "predictor.depth": "2",
+    "vqvae.codes": "9", "vqvae.width": "9", "vqvae.encoder_depth": "1", "vqvae.decoder_depth": "2",
+    "vqvae.commitment": "0.5", "vqvae.decay": "0.5", "vqvae.codebook": "gradient", "vqvae.steps": "4",
+    "vqvae.batch": "16", "vqvae.lr": "1e-2", "vqvae.weight_decay": "0.1", "vqvae.seed": "5",
+    "loss.lr": "1e-3",
+    "optim.steps": "5", "optim.batch": "5", "optim.lr": "1e-2", "optim.final_lr": "1e-6",
+    "optim.schedule": "cosine", "optim.drop_at": "0.9", "optim.weight_decay": "0.1",
+    "optim.clip_norm": "1e-3",
+    "optim.precision": "bf16", "optim.compile": "true", "optim.checkpoint_every": "1",
+    "optim.validate_every": "1", "optim.log_every": "1",
+    "evaluation.modes": "[stream]", "evaluation.batch": "1", "evaluation.ik": "off",
+    "evaluation.ik_iterations": "3",
+    "export.graph": "naive", "export.precision": "int8", "export.latency_steps": "250",
+    "tracking.uri": "sqlite:///other.db",
+}  # fmt: skip
+
+UNTRIED = {
+    "paths.outputs": "where results lie",
+    "data.root": "where the same clips lie; another folder's are another digest",
+    "data.synth": "makes other clips, and so another digest: see the test below",
+    "data.body": "a file of the user's; its rest pose is in the data's digest",
+    "vqvae.epochs": "steps by another name: the two exclude each other (tests/config/test_compose.py)",
+}
+LAST_DIGITS = {
+    "threads": "recorded, and flagged in tables",
+    "device": "recorded, and flagged in tables",
+    "optim.compile": "counts though a compiler may leave every digit as it was",
+    "data.min_frames": "counts by the data's digest though here no clip is that short",
+}
+"""Keys that are asked for less than exactness, and why."""
+
+
+class Outcome(NamedTuple):
+    """Identities and digests of the results of the training, each mode's evaluation and the deployment."""
+
+    identities: dict[str, str]
+    results: dict[str, str]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder with the prepared data."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("identity"))
+        clips(Path.cwd() / "clips")
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        yield Path.cwd()
+        torch.set_num_threads(threads)
+
+
+def clips(folder: Path) -> None:
+    """Eight short clips of an upright person who moves."""
+    folder.mkdir()
+    for number, name in enumerate(("a1", "a2", "b1", "b2", "c1", "c2", "d1", "d2")):
+        rng = np.random.default_rng(number)
+        phase = np.linspace(0, 6, 60 + 8 * number)[:, None] + rng.uniform(0, 6, 156)
+        poses = 0.2 * np.sin(phase) * rng.normal(size=156)
+        poses[:, :3] = [np.pi / 2, 0, 0]
+        trans = np.array([0, 0, 0.95]) + 0.1 * np.sin(phase[:, :3])
+        np.savez(folder / f"{name}.npz", poses=poses, trans=trans, mocap_framerate=60.0)
+
+
+@pytest.fixture(scope="module")
+def base(home: Path) -> Outcome:
+    """The outcome of no change."""
+    return outcome(home / "base", [])
+
+
+def outcome(folder: Path, overrides: list[str]) -> Outcome:
+    """Make everything but the data in an empty folder, so that no run can be found by a wrong identity."""
+    experiment = replace(build_experiment(composed([*BASE, *overrides])), outputs=folder)
+    data = experiment.data.prepare()
+    identity = experiment.identity(data.digest)
+    codes = vqvae_run(replace(experiment, tracking=Silent()), data).model
+    run = Run(folder / "run")
+    run.folder.mkdir(parents=True)
+    model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)
+    found = data.open("test")
+    short = MotionDataset(
+        found.frames[:30], torch.tensor([0]), torch.tensor([30]), found.names[:1], found.groups[:1]
+    )
+    settings = experiment.evaluation
+    reports = {
+        mode: evaluation.evaluate(model, short, [mode], settings.batch, settings.ik)["clips"]
+        for mode in settings.modes
+    }
+    return Outcome(
+        {"training": identity.id, **experiment.evaluations, "deployment": experiment.deployment_id},
+        {
+            "training": digest([t.tolist() for t in model.state_dict().values()]),
+            **{mode: digest(rows) for mode, rows in reports.items()},
+            "deployment": digest(deployed(experiment, model, short)),
+        },
+    )
+
+
+class Silent:
+    """Tracking that shows nothing."""
+
+    def project(self, run: Run) -> None:
+        """Nothing."""
+
+
+def deployed(experiment: Experiment, model: Any, clip: MotionDataset) -> list[Any]:
+    """Return what a deployment has: the graph's kind and numbers, its files, how often it is timed."""
+    network = GRAPHS[experiment.deployment.graph](model)
+    state, motions = network.initial_state(1), []
+    with torch.no_grad():
+        for t in range(8):
+            motion, state = network.advance(clip.frames[None, t : t + 1, :54], state, 1)
+            motions.append(motion.tolist())
+    settings = experiment.deployment
+    return [type(network).__name__, settings.precision, max(settings.latency_steps, 200), motions]
+
+
+def digest(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value).encode()).hexdigest()[:16]
+
+
+def test_every_key_is_changed_or_said_not_to_be():
+    """The profile's sizes are not changed here, since they act through the groups' keys, which are."""
+    config = flatten(OmegaConf.to_container(composed(BASE), resolve=True))  # type: ignore[arg-type]
+    own = {key for key in config if key.rsplit(".", 1)[-1] not in ("name", "_target_", "_partial_")}
+    own |= {"data.name"}  # a slot's own name is fixed
+    assert {key for key in own if not key.startswith("profile.")} == CHANGES.keys() | UNTRIED.keys()
+
+
+@pytest.mark.parametrize("key", [key for key in CHANGES if key != "optim.compile"])
+def test_identity_moves_exactly_where_a_result_moves(base: Outcome, home: Path, key: str):
+    other = outcome(home / key, [f"{key}={CHANGES[key]}"])
+    stages = [
+        name for name in base.results if name in other.results
+    ]  # a mode that is not asked for is left out
+    trained = other.identities["training"] != base.identities["training"]
+    moved = {
+        name: trained or (name != "training" and other.identities[name] != base.identities[name])
+        for name in stages
+    }
+    changed = {name: other.results[name] != base.results[name] for name in stages}
+    if key in LAST_DIGITS:
+        assert not any(changed.values()) or not any(moved.values())
+    else:
+        assert moved == changed
+        assert any(moved.values()) == (key not in NOWHERE)
+
+
+NOWHERE = {
+    "force", "save_predictions", "data.name", "data.strict", "optim.checkpoint_every", "optim.log_every",
+    "optim.validate_every", "evaluation.modes", "evaluation.batch", "tracking.uri",
+}  # fmt: skip
+"""Keys that change no result; what they do has tests of its own."""
+
+
+def test_neutral_keys_are_those_that_move_nothing():
+    own = {key for key in CHANGES if not key.startswith(("data.", "evaluation."))}
+    neutral = {key for key in own if any(key == name or key.startswith(f"{name}.") for name in NEUTRAL)}
+    assert neutral == own & (NOWHERE | {"threads", "device"})
+
+
+def test_other_synthetic_motion_is_another_identity():
+    def identity(*overrides: str) -> str:
+        synthetic = [word for word in BASE if not word.startswith("data")]
+        experiment = build_experiment(composed([*synthetic, "data.synth.minutes=0.1", *overrides]))
+        return experiment.identity(experiment.data.prepare().digest).id
+
+    assert len({identity(), identity("data.synth.seed=1"), identity("data.synth.minutes=0.25")}) == 3
+
+
+def test_a_compiled_training_is_another():
+    """No result is made here, since compiling takes half a minute."""
+
+    def identity(*overrides: str) -> str:
+        return build_experiment(composed([*BASE, *overrides])).identity("data").id
+
+    assert identity("optim.compile=true") != identity()
+
+
+def test_a_class_that_moves_changes_no_identity_and_is_found_where_it_is_now():
+    """For every slot, the run's record names the class where it lay when the run was made."""
+
+    def moved(tree: dict[str, Any]) -> dict[str, Any]:
+        found = {key: moved(value) if isinstance(value, dict) else value for key, value in tree.items()}
+        return {
+            key: f"memmlp.elsewhere.{key}" if key == "_target_" else value for key, value in found.items()
+        }
+
+    cfg = composed(BASE)
+    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    before = moved(config)
+    assert before != config
+    assert Identity("memmlp", before, "d").id == Identity("memmlp", config, "d").id
+    assert (evaluation_id(before, "stream"), deployment_id(before)) == (
+        evaluation_id(config, "stream"), deployment_id(config)
+    )  # fmt: skip
+    assert OmegaConf.to_container(restored(before)) == config

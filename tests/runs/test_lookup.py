@@ -1,0 +1,58 @@
+"""Runs are found by their ids and compared."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from begun_runs import CONFIG, begun
+
+from memmlp.common.errors import InputError
+from memmlp.common.files import write_json
+from memmlp.runs.lookup import diff, find_run, list_runs
+from memmlp.runs.run import Run
+
+
+def test_runs_are_found_by_the_beginning_of_their_id(tmp_path: Path):
+    runs = [begun(tmp_path, CONFIG | {"seed": seed}) for seed in range(20)]
+    (tmp_path / "runs" / "notes").mkdir()
+    assert {run.id for run in list_runs(tmp_path)} == {run.id for run in runs}
+    assert find_run(tmp_path, runs[3].id).folder == runs[3].folder
+    assert find_run(tmp_path, runs[3].id[:12]).id == runs[3].id
+    assert find_run("elsewhere", str(runs[3].folder)).id == runs[3].id
+
+
+def test_the_newest_run_is_first(tmp_path: Path):
+    for seed in range(3):
+        begun(tmp_path, CONFIG | {"seed": seed}).write_manifest({"started": f"202{seed}"})
+    assert [run.manifest["started"] for run in list_runs(tmp_path)] == ["2022", "2021", "2020"]
+
+
+@pytest.mark.parametrize("name", ["zz", "", "no/such"])
+def test_no_such_run_is_one_line(tmp_path: Path, name: str):
+    begun(tmp_path)
+    with pytest.raises(InputError, match="no such folder"):
+        find_run(tmp_path, name)
+
+
+def test_a_run_by_the_bare_name_of_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made = Run.of(tmp_path, "ab" + "0" * 14)
+    made.begin("memmlp", {}, data="d", upstream=None)
+    monkeypatch.chdir(made.folder.parent)
+    assert find_run("outputs", made.id).folder == made.folder.resolve()
+
+
+def test_an_ambiguous_beginning_lists_the_runs(tmp_path: Path):
+    for name in ("ab" + "0" * 14, "ab" + "1" * 14):
+        Run.of(tmp_path, name).begin("memmlp", {}, data="d", upstream=None)
+    with pytest.raises(InputError, match=r"2 ids begin so: ab0+, ab1+"):
+        find_run(tmp_path, "ab")
+
+
+def test_diff_names_what_differs(tmp_path: Path):
+    a, b = begun(tmp_path), begun(tmp_path, CONFIG | {"seed": 1, "extra": True})
+    write_json(a.results_path, {"stream": {"MPJPE": 1.0, "same": 2}})
+    write_json(b.results_path, {"stream": {"MPJPE": 3.0, "same": 2}})
+    found = diff(a, b)
+    assert found.config == {"seed": (0, 1), "extra": ("-", True)}
+    assert found.results == {"stream.MPJPE": (1.0, 3.0)}

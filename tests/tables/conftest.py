@@ -1,0 +1,22 @@
+"""A sweep and its table for the tests of tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from fake_runs import fake_sweep, table_of
+from fake_table import EFFECTS, FILE
+
+from memmlp.sweep.spec import Sweep, parse_sweep
+from memmlp.tables.table import Table
+
+
+@pytest.fixture
+def sweep() -> Sweep:
+    return parse_sweep("table11", FILE)
+
+
+@pytest.fixture
+def table(sweep: Sweep, tmp_path: Path) -> Table:
+    return table_of(sweep, fake_sweep(tmp_path, sweep, EFFECTS))

@@ -1,0 +1,176 @@
+"""Differences from controls, paired by seed and clip, their statistics and verdicts."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_runs import CLIPS, fake_run, fake_sweep, runs_of, table_of
+from fake_table import EFFECTS, cell, printed
+
+from memmlp.runs.evaluation_file import write_report
+from memmlp.statistics import Verdict, holm, paired_effects
+from memmlp.sweep.spec import Sweep
+from memmlp.tables.measured_run import load
+from memmlp.tables.table import Table
+
+
+def test_difference_is_paired_by_seed_and_clip(sweep: Sweep, tmp_path: Path):
+    """Effects that both arms share cancel: the interval is far narrower than the arms' own spread."""
+    table = table_of(sweep, fake_sweep(tmp_path, sweep, EFFECTS))
+    effect = cell(table, "no | memory", "MPJPE").effect
+    assert effect is not None
+    assert (effect.seeds, effect.clips, effect.groups) == (3, 12, 12)
+    assert effect.low < effect.mean < effect.high
+    means = [cell(table, label, "MPJPE").mean for label in ("no | memory", "full_model")]
+    assert effect.mean == pytest.approx(means[0] - means[1])
+    assert effect.mean == pytest.approx(0.2 * means[1], rel=0.1)
+    assert effect.significant
+    assert effect.high - effect.low < 0.5
+    run = load(next((tmp_path / "runs").iterdir()))
+    assert np.ptp(run.by_clip(CLIPS, "stream", "rotation", "MPJPE")) > 1.5
+
+
+def test_correction_is_over_all_modes_and_metrics(table: Table):
+    effects = [
+        c.effect for row in table.rows for cells in row.cells.values() for c in cells.values() if c.effect
+    ]
+    tested = [effect for effect in effects if effect.p is not None]
+    assert table.comparisons == len(tested) == 2 * 3 + 2 * 2  # the arm "by position" has no MPJRE
+    smallest = min(tested, key=lambda effect: effect.p)
+    assert smallest.holm == pytest.approx(min(1, smallest.p * len(tested)))
+
+
+def test_verdicts_follow_from_the_statistics(sweep: Sweep, tmp_path: Path):
+    """Interval, correction, equivalence and verdict equal those that are put together here by hand."""
+    find = fake_sweep(tmp_path, sweep, {"no | memory": 1.004, "by position": 1.05})
+    table, keys = (
+        table_of(sweep, find),
+        [("no | memory", "rotation", m) for m in ("MPJRE", "MPJPE", "Jitter")],
+    )
+    keys += [("by position", "position", metric) for metric in ("MPJPE", "Jitter")]
+    p = {}
+    for mode in table.modes:
+        for label, branch, metric in keys:
+            sides = [
+                np.array(
+                    [read.by_clip(CLIPS, mode, b, metric) for read in runs_of(sweep, find)[one].values()]
+                )
+                for one, b in ((label, branch), ("full_model", "rotation"))
+            ]
+            known = paired_effects((sides[0] - sides[1])[None])
+            effect = cell(table, label, metric, mode).effect
+            assert (effect.mean, effect.low, effect.high) == pytest.approx(
+                (known.mean[0], known.low[0], known.high[0])
+            )
+            p[label, mode, metric] = known.p[0]
+    corrected = dict(zip(p, holm(np.array(list(p.values()))), strict=True))
+    for (label, mode, metric), value in corrected.items():
+        effect = cell(table, label, metric, mode).effect
+        assert effect.holm == pytest.approx(value)
+        decided = (Verdict.HOLDS, Verdict.OPPOSITE, Verdict.HIGHER, Verdict.LOWER)
+        assert (effect.verdict in decided) == (value <= 0.05 and not effect.equal <= 0.05)
+    assert cell(table, "no | memory", "Jitter").effect.verdict == Verdict.EQUIVALENT
+
+
+def test_groups_of_clips_widen_the_interval(sweep: Sweep, tmp_path: Path):
+    groups = {clip: "one" if number < 6 else "other" for number, clip in enumerate(CLIPS)}
+    effects = [
+        cell(
+            table_of(sweep, fake_sweep(tmp_path / name, sweep, EFFECTS, **words)), "no | memory", "MPJPE"
+        ).effect
+        for name, words in (("each", {}), ("two", {"groups": groups}))
+    ]
+    assert [effect.groups for effect in effects] == [12, 2]
+    assert effects[1].high - effects[1].low > 1.5 * (effects[0].high - effects[0].low)
+
+
+def test_a_row_has_its_own_control(sweep: Sweep, tmp_path: Path):
+    arms = tuple(replace(arm, against="by position") if arm.paper else arm for arm in sweep.arms[1:3])
+    chain = replace(sweep, arms=(*arms, *sweep.arms[3:]))
+    table = table_of(chain, fake_sweep(tmp_path, chain, EFFECTS))
+    means = [cell(table, label, "MPJPE").mean for label in ("no | memory", "by position")]
+    found = cell(table, "no | memory", "MPJPE")
+    assert found.effect.mean == pytest.approx(means[0] - means[1])
+    assert found.paper_effect is None  # the paper has no value for the control
+    assert "of 'no | memory' from 'by position'" in " ".join(printed(table, 200).split())
+
+
+def test_one_head_is_told_by_its_positions(tmp_path: Path):
+    """Without a position branch both branches have the errors of the rotations, up to rounding."""
+    run = fake_run(tmp_path, "a")
+    assert not load(run.folder).one_head
+    for mode in ("stream", "window"):
+        report = json.loads(run.evaluation(f"{mode}-0").read_text())
+        mean = {"rotation": {"MPJPE": 26.688274383}, "position": {"MPJPE": 26.688272476}}
+        write_report(run.evaluation(f"{mode}-0"), {"mode": mode, "mean": mean, "clips": report["clips"]})
+    assert load(run.folder).one_head
+
+
+def test_another_branch_and_what_has_one_head(sweep: Sweep, tmp_path: Path):
+    source = replace(sweep, branch_source="the text says so").with_branch("combined")
+    find = fake_sweep(tmp_path, sweep)
+    for seed in sweep.seeds:
+        fake_run(tmp_path, f"{sweep.name} no | memory", seed, branches=["rotation"])
+    table = table_of(source, find)
+    rows = {row.label: row.branch for row in table.rows if not row.paper_only}
+    assert rows == {"no | memory": "rotation", "by position": "position", "full_model": "combined"}
+    assert (
+        sum("no other branch, so the row shows rotation: 'no | memory'" in flag for flag in table.flags) == 1
+    )
+    lines = " ".join(printed(table, 100).split())
+    assert "combined; 'no | memory' rotation, 'by position' position" in lines
+    assert "the text says so" not in lines  # the paper's values are of another branch
+    assert cell(table, "full_model", "MPJPE").paper is None
+    assert {row.cells["stream"]["MPJPE"].effect.verdict for row in table.rows[1:3]} <= {
+        "higher",
+        "lower",
+        "open",
+    }
+    run = runs_of(source, find)["full_model"][0]
+    assert cell(table, "full_model", "MPJPE").values[0] == run.value("stream", "combined", "MPJPE")
+
+
+def test_a_branch_that_was_not_evaluated_is_no_other(sweep: Sweep, tmp_path: Path):
+    """A network with two heads and no inverse kinematics yet is not shown by its rotation branch instead."""
+    find = fake_sweep(tmp_path, sweep, branches=["rotation", "position"])
+    table = table_of(sweep.with_branch("combined"), find, command="memmlp sweep 11")
+    assert cell(table, "full_model", "MPJPE").mean is None
+    assert (
+        "not evaluated in the branch combined: 'no | memory', 'full_model'; do so with: memmlp sweep 11"
+        in (table.flags)
+    )
+
+
+def test_a_branch_without_rotations_has_no_mpjre(table: Table):
+    assert cell(table, "by position", "MPJRE").mean is None
+    assert cell(table, "by position", "MPJPE").mean is not None
+
+
+def test_no_control_no_differences(sweep: Sweep, tmp_path: Path):
+    find = fake_sweep(tmp_path, sweep)
+    table = table_of(sweep, lambda arm, seed: None if arm.label == "full_model" else find(arm, seed))
+    assert table.comparisons == 0
+    assert all(c.effect is None for row in table.rows for cells in row.cells.values() for c in cells.values())
+
+
+def test_arms_that_are_one_run_are_not_compared(sweep: Sweep, tmp_path: Path):
+    """Compared with itself an arm would be equivalent with certainty, whatever the paper says."""
+    runs = {seed: fake_run(tmp_path, "one", seed) for seed in sweep.seeds}
+    table = table_of(sweep, lambda arm, seed: runs[seed])
+    assert cell(table, "no | memory", "MPJPE").effect is None
+    assert any("'no | memory' and 'full_model' are one run" in flag for flag in table.flags)
+    assert cell(table, "by position", "MPJPE").effect is not None  # it shows another branch
+
+
+def test_the_correction_is_the_same_whichever_mode_is_shown(sweep: Sweep, tmp_path: Path):
+    """Nobody gets a star by looking at one mode alone."""
+    find = fake_sweep(tmp_path, sweep, EFFECTS)
+    both, one = table_of(sweep, find), table_of(sweep, find, modes=("stream",))
+    assert one.modes == ("stream",)
+    assert one.comparisons == both.comparisons
+    for label, metric in (("no | memory", "MPJPE"), ("by position", "Jitter")):
+        assert cell(one, label, metric).effect == cell(both, label, metric).effect

@@ -1,0 +1,195 @@
+"""What a reader has to know of the runs, a line each."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, runs_of, table_of
+from fake_table import cell, printed
+
+from memmlp.runs.evaluation_file import write_report
+from memmlp.statistics import Verdict
+from memmlp.sweep.spec import Sweep
+from memmlp.tables.build_table import collect
+from memmlp.tables.formats import FORMATS
+from memmlp.tables.table import Table
+
+
+def test_missing_runs_are_shown_with_the_command(sweep: Sweep, tmp_path: Path):
+    find = fake_sweep(tmp_path, sweep)
+    unfinished = find(sweep.arms[1], 1)
+    assert unfinished is not None
+    unfinished.marker.unlink()
+    unfinished.fail("loss is NaN")
+    gone = {("by position", seed) for seed in (0, 1, 2)}
+    table = table_of(
+        sweep,
+        lambda arm, seed: None if (arm.label, seed) in gone else find(arm, seed),
+        command="memmlp sweep 11 data=mocap",
+    )
+    rows = {row.label: row for row in table.rows}
+    assert (rows["no | memory"].found, rows["by position"].found) == ((0, 2), ())
+    gaps = "'no | memory' seed 1 (failed), 'by position' seed 0, 1, 2"
+    assert f"missing: {gaps}; fill with: memmlp sweep 11 data=mocap" in table.flags
+    effect = cell(table, "no | memory", "MPJPE").effect
+    assert effect is not None
+    assert effect.seeds == 2
+    assert cell(table, "by position", "MPJPE").effect is None
+    assert "2/3" in printed(table, 100)
+    assert "0/3" in FORMATS["md"](table)
+
+
+def test_unequal_clips_are_flagged_and_left_out(sweep: Sweep, tmp_path: Path):
+    runs = {
+        (arm.label, seed): fake_run(
+            tmp_path, arm.label, seed, clips=CLIPS[:3] if arm.label == "full_model" else CLIPS[1:4]
+        )
+        for arm in sweep.runnable()
+        for seed in (0, 1)
+    }
+    table = table_of(replace(sweep, seeds=(0, 1)), lambda arm, seed: runs[arm.label, seed])
+    effect = cell(table, "no | memory", "MPJPE").effect
+    assert effect is not None
+    assert effect.clips == 2
+    assert abs(effect.mean) < 0.3  # the clip that is far harder than the others is in one arm alone
+    assert sum("unequal test clips" in flag and "share 2 of 4" in flag for flag in table.flags) == 2
+
+
+def test_a_clip_that_is_no_number_is_left_out(sweep: Sweep, tmp_path: Path):
+    find = fake_sweep(tmp_path, sweep)
+    run = find(sweep.arms[3], 1)
+    assert run is not None
+    path = run.evaluation("stream-0")
+    report = json.loads(path.read_text())
+    report["clips"][0]["rotation"]["Jitter"] = "nan"
+    write_report(path, {key: report[key] for key in ("mode", "mean", "clips")})
+    table = table_of(sweep, find)
+    assert [cell(table, "no | memory", metric).effect.clips for metric in ("Jitter", "MPJPE")] == [11, 12]
+
+
+@pytest.mark.parametrize("word", ["nan", "inf"])
+def test_a_network_that_diverged_on_a_clip_is_said(sweep: Sweep, tmp_path: Path, word: str):
+    """What its arm is compared by are the clips where it did not; too short a clip is so for every run."""
+    find = fake_sweep(tmp_path, sweep)
+    for arm in sweep.runnable():
+        for seed in sweep.seeds:
+            path = find(arm, seed).evaluation("stream-0")
+            report = json.loads(path.read_text())
+            for branch in ("rotation", "position"):
+                report["clips"][0][branch]["Jitter"] = "nan"
+            for number in (1, 2) if (arm.label, seed) == (sweep.arms[3].label, 1) else ():
+                report["clips"][number]["rotation"]["MPJPE"] = word
+            path.write_text(json.dumps(report))
+    table = table_of(sweep, find)
+    assert [cell(table, "no | memory", metric).effect.clips for metric in ("Jitter", "MPJPE")] == [11, 10]
+    line = (
+        "errors that are no numbers, of clips that are left out of differences: 'full_model' seed 1 (2 clips)"
+    )
+    assert [flag for flag in table.flags if "no numbers" in flag] == [line]
+
+
+def test_groups_that_differ_between_runs_are_said(sweep: Sweep, tmp_path: Path):
+    find = fake_sweep(tmp_path, sweep, groups={clip: f"take {i // 2}" for i, clip in enumerate(CLIPS)})
+    assert not any("data.split.groups" in flag for flag in table_of(sweep, find).flags)
+    for path in find(sweep.runnable()[0], 1).evaluations.glob("*.json"):
+        report = json.loads(path.read_text())
+        report["clips"][0]["group"] = "alone"
+        path.write_text(json.dumps(report))
+    assert any("runs differ in the groups of test clips" in flag for flag in table_of(sweep, find).flags)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"git": {"commit": "fedcba9876543210", "dirty": False}}, ("code differs", "fedcba9", "0123456")),
+        ({"git": ORIGIN["git"] | {"dirty": True}}, ("uncommitted changes", "'by position'")),
+        ({"data": "e" * 64}, ("data differs", "dddddddd of 'no | memory', 'full_model'", "eeeeeeee of 'by")),
+        ({"cpu": "Another one"}, ("hardware differs", "Another one of 'by position'")),
+        ({"git": None}, ("code differs", "version 0.3.0 of 'by position'")),
+        ({"device": "cuda"}, ("device differs", "cuda of 'by position'", "cpu of 'no | memory'")),
+        ({"gpu": "A card"}, ("GPU differs", "A card of 'by position'")),
+        ({"threads": 2}, ("threads differs", "2 of 'by position'")),
+        ({"packages": {"torch": "3.0"}}, ("torch differs", "3.0 of 'by position'")),
+        ({"precision": "bf16"}, ("precision differs", "bf16 of 'by position'")),
+        ({"recipes": {"memory": 2}}, ("recipe of memory differs", "2 of 'by position'")),
+    ],
+)  # fmt: skip
+def test_runs_of_different_origin_are_flagged(
+    sweep: Sweep, tmp_path: Path, change: dict, words: tuple[str, ...]
+):
+    runs = {
+        arm.label: fake_run(tmp_path, arm.label, origin=change if arm.label == "by position" else None)
+        for arm in sweep.runnable()
+    }
+    table = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label])
+    flags = [flag for flag in table.flags if words[0] in flag]
+    assert len(flags) == 1
+    assert all(word in flags[0] for word in words)
+    assert any("one seed" in flag for flag in table.flags)
+
+
+def test_equal_origins_are_not_flagged(table: Table):
+    assert [flag for flag in table.flags if "a group of its own" not in flag] == []
+
+
+def test_a_comparison_of_one_seed_among_others_of_more_is_said(sweep: Sweep, tmp_path: Path):
+    find = fake_sweep(tmp_path, sweep)
+    table = table_of(sweep, lambda arm, seed: find(arm, seed) if seed == 0 or "no" not in arm.label else None)
+    assert sum(flag.startswith("one seed, so that") and "'no | memory'" in flag for flag in table.flags) == 1
+
+
+def test_recipes_of_what_only_some_arms_have_do_not_differ(sweep: Sweep, tmp_path: Path):
+    recipes = {"by position": {"recipes": {"memory": 1, "gru": 7}}}
+    runs = {
+        arm.label: fake_run(tmp_path, arm.label, origin=recipes.get(arm.label)) for arm in sweep.runnable()
+    }
+    table = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label])
+    assert not any("recipe" in flag for flag in table.flags)
+
+
+@pytest.mark.parametrize(("shared", "flagged"), [(True, 1), (False, 0)])
+def test_seeds_that_share_a_vqvae_are_flagged(sweep: Sweep, tmp_path: Path, shared: bool, flagged: int):
+    runs = {
+        (arm.label, seed): fake_run(
+            tmp_path, arm.label, seed, origin={"upstream": "v" if shared else f"v{seed}"}
+        )
+        for arm in sweep.runnable()
+        for seed in sweep.seeds
+    }
+    table = table_of(sweep, lambda arm, seed: runs[arm.label, seed])
+    lines = [flag for flag in table.flags if "share one VQ-VAE" in flag]
+    assert len(lines) == flagged
+    assert all("'no | memory', 'by position', 'full_model'" in line for line in lines)
+
+
+def test_one_group_of_clips_is_said_and_starred_by_nobody(sweep: Sweep, tmp_path: Path):
+    find = fake_sweep(tmp_path, sweep, {"no | memory": 2.0}, groups=dict.fromkeys(CLIPS, "one"))
+    table = table_of(sweep, find)
+    assert any("one group of test clips" in flag for flag in table.flags)
+    assert table.comparisons == 0
+    effect = cell(table, "no | memory", "MPJPE").effect
+    assert (effect.significant, effect.verdict) == (False, Verdict.OPEN)
+    assert "*" not in printed(table, 100)
+
+
+@pytest.mark.parametrize(
+    ("number", "body", "flagged"), [(1, "builtin", 1), (1, "SMPL-H", 0), (4, "builtin", 0)]
+)
+def test_the_built_in_body_beside_smplh_numbers(
+    sweep: Sweep, tmp_path: Path, number: int, body: str, flagged: int
+):
+    sweep = replace(sweep, table=number)
+    table = table_of(sweep, fake_sweep(tmp_path, sweep, origin={"body": body}))
+    assert sum("data.body" in flag for flag in table.flags) == flagged
+
+
+def test_runs_of_an_older_recipe_are_named(sweep: Sweep, tmp_path: Path):
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
+    runs["no | memory"] = {seed: run for seed, run in runs["no | memory"].items() if seed}
+    table = collect(sweep, runs, older=lambda arm, seed: "abc" if arm.label != "full_model" else None)
+    assert "made by an earlier recipe, left out and made again by the sweep: 'no | memory' seed 0 (abc)" in (
+        table.flags
+    )

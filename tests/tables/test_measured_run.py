@@ -1,0 +1,65 @@
+"""What a finished run has to say for tables."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from fake_runs import ORIGIN, fake_run, fake_sweep, table_of
+
+from memmlp.common.errors import InputError
+from memmlp.runs.evaluation_file import write_report
+from memmlp.sweep.spec import Sweep
+from memmlp.tables.measured_run import load
+
+
+def test_costs_have_the_tables_units(tmp_path: Path):
+    costs = load(fake_run(tmp_path, "run").folder).costs
+    sizes = {"FLOPs": 0.026, "MACs": 0.013, "parameters": 0.356798, "size": 1.9}
+    assert costs == pytest.approx({**sizes, "ms": 0.8, "ratio": 0.6, "FPS": 1250})
+
+
+def test_what_an_evaluation_ran_on_counts_too(sweep: Sweep, tmp_path: Path):
+    """An evaluation's numbers depend on code and device as the weights do."""
+    other = {"device": "cuda:0", "made_by": {**ORIGIN, "git": {"commit": "fedcba98", "dirty": True}}}
+    runs = {
+        arm.label: fake_run(tmp_path, arm.label, evaluated=other if arm.label == "by position" else None)
+        for arm in sweep.runnable()
+    }
+    said = " ".join(table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label]).flags)
+    assert "0123456, fedcba9 of 'by position'" in said
+    assert ", cuda:0 of 'by position'" in said
+    assert "uncommitted changes: 'by position'" in said
+
+
+def test_damaged_results_are_one_line(tmp_path: Path, sweep: Sweep):
+    find = fake_sweep(tmp_path, sweep)
+    run = find(sweep.arms[3], 1)
+    assert run is not None
+    for text in ("[{", "[5]", "{}"):
+        run.evaluation("stream-0").write_text(text)
+        with pytest.raises(InputError, match=re.escape(str(run.evaluation("stream-0")))):
+            table_of(sweep, find)
+
+
+def test_costs_that_are_no_numbers_are_left_out(tmp_path: Path):
+    run = fake_run(tmp_path, "a")
+    path = run.deployment("fp32-0").latency
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"flops": "nan"}))
+    costs = load(run.folder).costs
+    assert "FLOPs" not in costs
+    assert "parameters" in costs
+
+
+def test_the_evaluations_of_a_table_are_its_own(tmp_path: Path):
+    """Where a run has two evaluations of one mode, each table reads the one that it asks for."""
+    run = fake_run(tmp_path, "a")
+    report = json.loads(run.evaluation("stream-0").read_text())
+    other = {"mode": "stream", "mean": {"combined": {"MPJPE": 1.0}}, "clips": report["clips"]}
+    write_report(run.evaluation("stream-1"), other)
+    assert load(run.folder, ["stream-0"]).value("stream", "combined", "MPJPE") != 1.0
+    assert load(run.folder, ["stream-1"]).value("stream", "combined", "MPJPE") == 1.0
+    assert load(run.folder, ["stream-1"]).value("stream", "rotation", "MPJPE") is None

@@ -1,0 +1,27 @@
+"""Seeds that the paper's effects need."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from fake_runs import CLIPS, fake_sweep, runs_of
+
+from memmlp.sweep.spec import Sweep
+from memmlp.tables.seeds_needed import needs
+
+
+def test_seeds_that_the_papers_effects_need(sweep: Sweep, tmp_path: Path):
+    find = fake_sweep(tmp_path, sweep)
+    found = {(n.label, n.mode, n.metric): n for n in needs(sweep, runs_of(sweep, find))}
+    assert {key[::2] for key in found} == {("no | memory", "MPJRE"), ("no | memory", "MPJPE")}
+    big = replace(sweep.arms[1], paper={"MPJRE": 9.0, "MPJPE": 9.0})
+    louder = replace(sweep, arms=(sweep.arms[0], big, *sweep.arms[2:]))
+    fewer = {(n.label, n.mode, n.metric): n for n in needs(louder, runs_of(louder, find))}
+    for key, need in found.items():
+        assert need.have == 3
+        assert fewer[key].seeds <= (need.seeds or 1000)
+    assert fewer["no | memory", "stream", "MPJPE"].seeds <= 3 < found["no | memory", "stream", "MPJPE"].seeds
+    assert needs(replace(sweep, seeds=(0,)), runs_of(replace(sweep, seeds=(0,)), find)) == []
+    one = fake_sweep(tmp_path / "one", sweep, groups=dict.fromkeys(CLIPS, "one"))
+    assert needs(sweep, runs_of(sweep, one)) == []

@@ -1,0 +1,25 @@
+"""The words of a table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fake_runs import fake_sweep, table_of
+from fake_table import SHIPPED, printed
+
+from memmlp.sweep.spec import load_sweep
+from memmlp.tables.table_text import heading
+
+
+def test_costs_show_how_many_times_the_controls_they_are(tmp_path: Path):
+    """The fake arms take 0.8, 0.88 and 0.96 ms, the paper's 6.0 and 30.1 ms."""
+    sweep = load_sweep(SHIPPED / "table17.yaml")
+    text = printed(table_of(sweep, fake_sweep(tmp_path, sweep)), 100)
+    table = table_of(sweep, fake_sweep(tmp_path, sweep))
+    ms = [row.cells[table.modes[0]]["ms"].mean for row in table.rows]
+    assert f"(x {ms[1] / ms[0]:.3g})" in text
+    assert f"(x {30.1 / 6.0:.3g})" in text
+
+
+def test_heads_tell_unit_and_direction():
+    assert [heading(name) for name in ("Jitter", "ms", "FPS")] == ["Jitter [10² m/s³] ↓", "ms ↓", "FPS ↑"]
