@@ -192,6 +192,7 @@ class TrainedRun(os.PathLike[str]):
             true_rotations=arrays["true_rotations"],
             positions=arrays["predicted_positions"],
             rotations=arrays["predicted_rotations"],
+            rest=self.model.normalizer.rest.double().numpy(),
             position_branch=arrays["predicted_positions_of_position_branch"] if learned else None,
         )
 
@@ -238,6 +239,7 @@ class Prediction:
         true_positions, true_rotations: (N, 22, 3) and (N, 22, 3, 3).
         positions: of the rotation branch (N, 22, 3): forward kinematics, the head on its tracker.
         rotations: of the rotation branch (N, 22, 3, 3).
+        rest: rest joints of the body (22, 3), SMPL's body frame: Y up, the person faces +Z.
         position_branch: of the position branch (N, 22, 3); None for a network without one.
     """
 
@@ -248,6 +250,7 @@ class Prediction:
     true_rotations: np.ndarray = field(repr=False)
     positions: np.ndarray = field(repr=False)
     rotations: np.ndarray = field(repr=False)
+    rest: np.ndarray = field(repr=False)
     position_branch: np.ndarray | None = field(repr=False)
 
     @property
@@ -300,6 +303,32 @@ class Prediction:
             raise InputError(f"poses {poses}: allowed are 1 to 20")
         first, last = span(len(self), self.clip, begin, end)
         write_picture(file, self._take(branch, first, last), poses)
+        return file
+
+    def save(self, path: StrPath, *, truth: bool = False) -> Path:
+        """Write the rotation branch, or the truth at the same frames, as motion that other programs open.
+
+        Args:
+            path: FILE.bvh (centimetres, Y up), FILE.glb (glTF: metres, Y up, with a body to look at), or
+                FILE.npz (AMASS' layout: metres, Z up; poses, trans and mocap_framerate).
+            truth: whether the truth is written.
+
+        Returns:
+            The file's path.
+
+        Raises:
+            InputError: for another kind of file, or one that cannot be written there.
+        """
+        from memmlp.evaluation.predictions import motion_clip
+        from memmlp.motion.exporting.write import format_of, write_motion
+
+        file = Path(path)
+        chosen = format_of(file)
+        if truth:
+            clip = motion_clip(self.clip, self.true_rotations, self.true_positions, self.rest)
+        else:
+            clip = motion_clip(self.clip, self.rotations, self.positions, self.rest)
+        write_motion(file, clip, self.rest, chosen)
         return file
 
     def _take(self, branch: Branch, first: int = 0, last: int | None = None) -> Take:

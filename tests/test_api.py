@@ -272,6 +272,25 @@ def test_bad_input_to_a_picture_is_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_motion_is_saved_for_other_programs(prediction: memmlp.Prediction, tmp_path: Path):
+    """As BVH, glTF and npz by the suffix; the root is where the prediction, or the truth, has it."""
+    for name in ("a.bvh", "deep/a.glb", "a.npz"):
+        assert prediction.save(tmp_path / name) == tmp_path / name
+    assert (tmp_path / "a.bvh").read_text().startswith("HIERARCHY\nROOT pelvis\n")
+    assert (tmp_path / "deep" / "a.glb").read_bytes()[:4] == b"glTF"
+    prediction.save(str(tmp_path / "truth.npz"), truth=True)
+    for name, positions in (("a", prediction.positions), ("truth", prediction.true_positions)):
+        with np.load(tmp_path / f"{name}.npz") as file:
+            np.testing.assert_allclose(file["trans"] + prediction.rest[0], positions[:, 0], atol=1e-6)
+            assert (file["poses"].shape, float(file["mocap_framerate"])) == ((len(prediction), 156), 60)
+
+
+def test_motion_of_another_kind_is_refused(prediction: memmlp.Prediction, tmp_path: Path):
+    with refused("path ", "a.fbx", ".bvh, .npz, .glb"):
+        prediction.save(tmp_path / "a.fbx")
+    assert list(tmp_path.iterdir()) == []
+
+
 # Live
 
 
@@ -313,6 +332,7 @@ def test_importing_it_is_quick():
 
 
 RIGHT = """
+from pathlib import Path
 from typing import assert_type
 
 import numpy as np
@@ -328,6 +348,7 @@ assert_type(run.results["stream"]["rotation"]["MPJPE"], float)
 prediction = run.predict("clip", mode="window")
 assert_type(prediction, memmlp.Prediction)
 prediction.draw("clip.gif", begin=1, end=2.5)
+assert_type(prediction.save("clip.glb", truth=True), Path)
 assert_type(run.model.count_parameters(), int)
 offsets = memmlp.Offsets(np.zeros((3, 3)), np.zeros((3, 3, 3)))
 pose = memmlp.Stream(run, space="unity", offsets=offsets).step(((0, 1, 0), np.eye(3)), None, None, time=0.5)
@@ -344,6 +365,7 @@ run.predict("clip", mod="window")
 run.predict("clip", "windows")
 run.predict("clip").draw("a.png", frames=3)
 run.predict("clip").error()
+run.predict("clip").save("clip.glb", thruth=True)
 run.seed = "0"
 run.stream(spcae="unity")
 memmlp.Stream("run", space="untiy")

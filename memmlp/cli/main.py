@@ -27,7 +27,7 @@ class Command(NamedTuple):
 COMMANDS = {
     "demo": Command("demo", "demo", "The whole way on embedded data, in minutes."),
     "train": Command("train", "command", "Train, evaluate, export and time one configuration (Hydra)."),
-    "data": Command("data", "data", "Make, import, prepare and inspect motion data."),
+    "data": Command("data", "data", "Make, import, prepare, inspect and export motion data."),
     "sweep": Command("sweep", "sweep", "Run what is missing of a table or of a sweep of your own."),
     "tune": Command("tune", "tune", "Search loss weights, or other keys, by the errors on validation."),
     "table": Command("table", "table", "The paper's tables beside measured numbers."),
@@ -37,6 +37,7 @@ COMMANDS = {
     "track": Command("mlflow_commands", "track", "Show run folders in MLflow."),
     "ui": Command("mlflow_commands", "ui", "MLflow's page on the tracked runs."),
     "eval": Command("evaluate", "evaluate", "Metrics and predictions of a finished run."),
+    "predict": Command("predict", "predict", "What a network makes of clips, as BVH, glTF or npz."),
     "render": Command("render", "render", "Figures and films of runs beside the truth, coloured by error."),
     "live": Command("live", "live", "A network live on a local page: a clip, or trackers by UDP or OSC."),
     "export": Command("export", "export", "ONNX file of a finished run."),

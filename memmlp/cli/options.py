@@ -30,3 +30,13 @@ outputs_option = click.option(
     show_default=True,
     help="Folder of runs and caches.",
 )
+
+format_option = click.option(
+    "--format",
+    "format_",
+    type=click.Choice(["bvh", "npz", "gltf"]),
+    help="Of the files.  [default: by the suffix .bvh, .npz or .glb of --out]",
+)
+strict_option = click.option(
+    "--strict", is_flag=True, help="Stop at the first bad file instead of skipping it."
+)

@@ -34,7 +34,7 @@ class OpenedRun(NamedTuple):
 
     def network(self) -> WindowModel:
         """The trained network, in evaluation mode, on the experiment's device."""
-        return self.experiment.architecture.load(self.run.weights()).to(self.experiment.device)
+        return trained_network(self.run, self.experiment)
 
 
 def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequence[str] = ()) -> OpenedRun:
@@ -55,16 +55,32 @@ def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequ
 
 def open_found(run: Run, device_name: str = "cpu", overrides: Sequence[str] = ()) -> OpenedRun:
     """The same of a run that was found already."""
-    experiment = replace(build_experiment(config_of(run, overrides)), device=device(device_name))
-    if trained_by(run.config) != trained_by(experiment.config):
-        words = ", ".join(overrides)
-        raise InputError(f"{words}: changes the training; allowed are keys of evaluation and export")
+    experiment = experiment_of(run, device_name, overrides)
+    return OpenedRun(run, experiment, data_of(run, experiment))
+
+
+def data_of(run: Run, experiment: Experiment) -> Prepared:
+    """The prepared data of a run. Raises InputError where it is no longer what the run was trained on."""
     # What it was trained on may be looked at, however much of its list that is: the digest proves it.
     data = replace(experiment.data, partial=True).prepare()
     if data.digest != run.manifest["data"]:
         root = experiment.data.source.root
         raise InputError(f"run {run.id}: its data has changed since (data.root={root})")
-    return OpenedRun(run, experiment, data)
+    return data
+
+
+def experiment_of(run: Run, device_name: str = "cpu", overrides: Sequence[str] = ()) -> Experiment:
+    """The experiment of a finished run, without its data; raises InputError as `open_run` does."""
+    experiment = replace(build_experiment(config_of(run, overrides)), device=device(device_name))
+    if trained_by(run.config) != trained_by(experiment.config):
+        words = ", ".join(overrides)
+        raise InputError(f"{words}: changes the training; allowed are keys of evaluation and export")
+    return experiment
+
+
+def trained_network(run: Run, experiment: Experiment) -> WindowModel:
+    """The trained network of a run, in evaluation mode, on the experiment's device."""
+    return experiment.architecture.load(run.weights()).to(experiment.device)
 
 
 def clip_of(test: MotionDataset, name: str, key: str = "--clip") -> Tensor:

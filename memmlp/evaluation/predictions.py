@@ -1,19 +1,32 @@
-"""Files of a network's predictions."""
+"""Files of a network's predictions: as arrays beside the truth, and as clips that other programs open."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from memmlp.common.errors import InputError
 from memmlp.evaluation import modes
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK, NoIK
-from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.body import FPS, SPARSE_DIM
+from memmlp.motion.clip import Clip, Skipped, resample
 from memmlp.motion.dataset import MotionDataset
+from memmlp.motion.exporting.folder import ExportReport, Plan, Target, read_motion, read_targets
+from memmlp.motion.exporting.write import write_motion
 from memmlp.motion.normalizer import Normalizer
+from memmlp.motion.preparing.cache import frame_blocks
 from memmlp.networks.window_model import WindowModel
+
+BRANCHES = {"rotation": "predicted", "combined": "combined", "truth": "true"}
+"""Names of what can be made a clip -> the beginnings of its arrays' names (`prediction_arrays`)."""
 
 
 def save_predictions(evaluation: Evaluation, model: WindowModel, test: MotionDataset, folder: Path) -> None:
@@ -52,3 +65,86 @@ def prediction_arrays(normalizer: Normalizer, clip: Tensor, motion: Tensor, ik: 
         arrays[f"{name}_positions"] = normalizer.pose(solved, sparse)
         arrays[f"{name}_rotations"] = modes.local_rotations(solved)
     return {name: tensor.cpu().numpy() for name, tensor in arrays.items()}
+
+
+def motion_clip(name: str, rotations: np.ndarray, positions: np.ndarray, rest: np.ndarray) -> Clip:
+    """Return motion as a clip at 60 Hz on the body with rest joints (22, 3), metres.
+
+    Args:
+        name: the clip's name.
+        rotations: local rotations (N, 22, 3, 3), the root's global.
+        positions: joints (N, 22, 3), metres, world; the root's count, the others follow.
+        rest: the body's rest joints.
+    """
+    poses = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec()
+    return Clip(name, poses.reshape(*rotations.shape[:2], 3), positions[:, 0] - rest[0], float(FPS))
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """A trained network that makes clips of clips.
+
+    Attributes:
+        model: the network.
+        mode: "stream" or "window".
+        branch: of BRANCHES: the rotation branch with the head on its tracker, the result of the evaluation's
+            inverse kinematics, or the truth, which is what came in.
+        evaluation: how the network is evaluated: batches, inverse kinematics, seed.
+    """
+
+    model: WindowModel
+    mode: str
+    branch: str
+    evaluation: Evaluation
+
+    @property
+    def rest(self) -> np.ndarray:
+        """Rest joints (22, 3), metres, of the body that the network was trained on."""
+        return self.model.normalizer.rest.cpu().double().numpy()
+
+    def predict(self, names: Sequence[str], clips: Sequence[Tensor]) -> list[Clip]:
+        """Return what the network makes of clips' frames (N, 252), as clips of N frames at 60 Hz."""
+        torch.manual_seed(self.evaluation.seed)
+        clips = [clip.to(self.model.normalizer.rest.device) for clip in clips]
+        ik = self.evaluation.ik if self.branch == "combined" else NoIK()
+        motions = modes.predict(self.model, clips, self.mode, self.evaluation.batch)
+        return [
+            self._clip(name, prediction_arrays(self.model.normalizer, clip, motion, ik))
+            for name, clip, motion in zip(names, clips, motions, strict=True)
+        ]
+
+    def _clip(self, name: str, arrays: Mapping[str, np.ndarray]) -> Clip:
+        """Return the branch of `prediction_arrays` as a clip."""
+        kind = BRANCHES[self.branch]
+        return motion_clip(name, arrays[f"{kind}_rotations"], arrays[f"{kind}_positions"], self.rest)
+
+    def export(self, plan: Plan, *, strict: bool = False) -> ExportReport:
+        """Write what the network makes of a plan's clips.
+
+        Args:
+            plan: what to write.
+            strict: whether a bad file raises; otherwise it is skipped and reported, if there are others.
+
+        Raises:
+            InputError: if no clip could be read, or a file cannot be written.
+        """
+        written: list[Path] = []
+        skipped: list[Skipped] = []
+        seconds = 0.0
+        clips = read_targets(plan, self._frames, skipped, strict)
+        while batch := list(islice(clips, self.evaluation.batch)):
+            targets, frames = zip(*batch, strict=True)
+            made = self.predict([target.name for target in targets], frames)
+            for target, clip in zip(targets, made, strict=True):
+                write_motion(target.path, clip, self.rest, plan.format)
+                written.append(target.path)
+                seconds += len(clip) / FPS
+        return ExportReport(tuple(written), seconds, tuple(skipped))
+
+    def _frames(self, target: Target) -> Tensor:
+        """Read a clip's frames (N, 252), as in a cache on the network's body. Raises InputError."""
+        clip, _ = resample(read_motion(target))
+        if len(clip) < 2:
+            few = f"{target.source}: one frame at {FPS} Hz"
+            raise InputError(f"{few}; allowed: two or more, as a velocity needs them")
+        return torch.from_numpy(np.concatenate(list(frame_blocks(clip, self.rest))))

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from memmlp.render.mannequin import LIMBS, NEUTRAL, Limb, ends, heat
+from memmlp.motion.limbs import LIMBS, Limb, ends
+from memmlp.render.error_colours import NEUTRAL, heat
 
 SAMPLES = 2  # samples along a pixel's side
 SPHERES = 18  # spheres of a limb

@@ -13,7 +13,7 @@ from matplotlib.image import FigureImage
 from matplotlib.text import Text
 from PIL import Image
 
-from memmlp.render.mannequin import HEAT, NEUTRAL, heat
+from memmlp.render.error_colours import HEAT, NEUTRAL, heat
 
 DPI = 100
 INK, FAINT = "#1b1f24", "#5c6670"

@@ -10,7 +10,8 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import FPS, ROOT
-from memmlp.render.mannequin import RADII, scale
+from memmlp.motion.limbs import RADII
+from memmlp.render.error_colours import scale
 from memmlp.render.raster import Camera
 
 MIDDLE = 0.88  # height of a picture's middle above the floor, metres

@@ -15,8 +15,9 @@ from PIL import Image
 from memmlp.common.errors import InputError
 from memmlp.evaluation.modes import joint_positions
 from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.limbs import LIMBS, ends
 from memmlp.render import figure, film
-from memmlp.render.mannequin import HEAT, LIMBS, ends, heat, scale
+from memmlp.render.error_colours import HEAT, heat, scale
 from memmlp.render.raster import Camera, draw
 from memmlp.render.take import Take
 

@@ -1,9 +1,10 @@
-"""`memmlp data`: make, import, verify, prepare and inspect motion."""
+"""`memmlp data`: make, import, verify, prepare, inspect and export motion."""
 
 from __future__ import annotations
 
 import click
 
+from memmlp.cli.data.export import export
 from memmlp.cli.data.import_ import import_
 from memmlp.cli.data.inspect import inspect
 from memmlp.cli.data.prepare import prepare
@@ -13,8 +14,8 @@ from memmlp.cli.data.verify import verify
 
 @click.group("data")
 def data() -> None:
-    """Make, import, prepare and inspect motion data."""
+    """Make, import, prepare, inspect and export motion data."""
 
 
-for command in (synth, import_, verify, prepare, inspect):
+for command in (synth, import_, verify, prepare, inspect, export):
     data.add_command(command)

@@ -13,6 +13,9 @@ from rich.table import Table
 from memmlp.common.errors import one_line
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from memmlp.motion.exporting.folder import ExportReport
     from memmlp.motion.preparing.manifest import ClipRecord, Manifest
 
 SHOWN = 8  # skipped files that are named on the screen; the manifest lists all
@@ -76,3 +79,10 @@ def show_some(lines: list[str], what: str) -> None:
         click.echo(line)
     if len(lines) > SHOWN:
         click.echo(f"{len(lines) - SHOWN} more {what}")
+
+
+def show_exported(report: ExportReport, out: Path) -> None:
+    """Print what an export skipped and how much it wrote."""
+    show_skipped([f"{file.file}: {file.reason}" for file in report.skipped])
+    clips = "1 clip" if len(report.written) == 1 else f"{len(report.written)} clips"
+    click.echo(f"{clips}, {report.seconds / 60:.1f} minutes, in {out}")

@@ -14,7 +14,8 @@ from memmlp.live.player.sources import PoseSource
 from memmlp.live.spaces import SPACES, Space
 from memmlp.live.stream import Stream
 from memmlp.motion.body import FPS, JOINTS
-from memmlp.render.mannequin import HEAT, LIMBS
+from memmlp.motion.limbs import LIMBS
+from memmlp.render.error_colours import HEAT
 
 SHOWN = SPACES["openxr"]  # the page's axes: those of three.js
 TOP = 20  # cm at the top of the page's colour scale

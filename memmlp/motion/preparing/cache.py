@@ -139,7 +139,7 @@ def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) 
             np.lib.format.write_array_header_1_0(file, header)
         for record in progress_bar(manifest.clips, "writing"):
             clip, _ = resample(read_clip(source.root / record.file, record.name))
-            for block in _frames(clip, rest):
+            for block in frame_blocks(clip, rest):
                 files[record.split].write(block.tobytes())
         for file in files.values():
             _sync(file)
@@ -155,7 +155,7 @@ def _sync(file: BinaryIO) -> None:
     os.fsync(file.fileno())
 
 
-def _frames(clip: Clip, rest: np.ndarray) -> Iterator[np.ndarray]:
+def frame_blocks(clip: Clip, rest: np.ndarray) -> Iterator[np.ndarray]:
     """Yield the frames of a 60 Hz clip in blocks (<= CHUNK, 252), float32, computed in float64."""
     import torch  # takes seconds to import, and finding a finished cache does not need it
 

@@ -1,0 +1,108 @@
+"""`memmlp predict`: what a finished run's network makes of clips, as files that other programs open."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from memmlp.cli.options import PATH, format_option, outputs_option, strict_option
+
+if TYPE_CHECKING:
+    from memmlp.config.open_run import OpenedRun
+    from memmlp.evaluation.evaluation import Evaluation
+    from memmlp.evaluation.predictions import Predictor
+    from memmlp.motion.exporting.folder import ExportReport
+
+
+@click.command("predict")
+@click.argument("run")
+@click.argument("source")
+@click.option("--out", required=True, type=PATH, help="A file for a clip, a folder for a folder.")
+@format_option
+@click.option("--mode", default="stream", show_default=True, type=click.Choice(["stream", "window"]))
+@click.option(
+    "--ik", type=click.Choice(["off", "lbfgs"]), help="Inverse kinematics.  [default: as in the evaluation]"
+)
+@click.option(
+    "--branch", type=click.Choice(["rotation", "combined", "truth"]),
+    help="The rotation branch, the rotations that inverse kinematics brought to the position branch, or the "
+    "clip itself.  [default: combined with inverse kinematics, else rotation]",
+)  # fmt: skip
+@strict_option
+@click.option("--device", default="auto", type=click.Choice(["auto", "cpu", "cuda"]), show_default=True)
+@outputs_option
+def predict(
+    run: str,
+    source: str,
+    out: Path,
+    format_: str | None,
+    mode: str,
+    ik: str | None,
+    branch: str | None,
+    strict: bool,
+    device: str,
+    outputs: Path,
+) -> None:
+    """Write what the network of a finished RUN (id, its beginning, or folder) makes of clips.
+
+    SOURCE is an AMASS npz file, a folder of such, or else a test clip's name. Predictions are at 60 Hz on the
+    body that the network was trained on; their first frame is the clip's second.
+    """
+    from memmlp.cli.data.show import show_exported
+    from memmlp.config.open_run import OpenedRun, data_of, experiment_of, trained_network
+    from memmlp.evaluation.predictions import Predictor
+    from memmlp.motion.exporting.folder import plan_export
+    from memmlp.runs.lookup import find_run
+
+    found = find_run(outputs, run)
+    experiment = experiment_of(found, device, [] if ik is None else [f"evaluation.ik={ik}"])
+    chosen = chosen_branch(experiment.evaluation, branch)
+    predictor = Predictor(trained_network(found, experiment), mode, chosen, experiment.evaluation)
+    if Path(source).exists():
+        report = predictor.export(plan_export(Path(source), out, format_), strict=strict)
+    else:
+        opened = OpenedRun(found, experiment, data_of(found, experiment))
+        report = predict_test_clip(predictor, opened, source, out, format_)
+    click.echo(f"run {found.id}: {chosen}, {mode} mode")
+    show_exported(report, out)
+
+
+def chosen_branch(evaluation: Evaluation, branch: str | None) -> str:
+    """Return what --branch says, else the evaluation's best: with inverse kinematics or without.
+
+    Raises:
+        InputError: where --branch combined has no inverse kinematics.
+    """
+    from memmlp.common.errors import InputError
+    from memmlp.evaluation.ik import NoIK
+
+    solved = not isinstance(evaluation.ik, NoIK)
+    if branch == "combined" and not solved:
+        raise InputError(
+            "--branch combined: the run's evaluation has no such result; allowed: with --ik lbfgs"
+        )
+    return branch or ("combined" if solved else "rotation")
+
+
+def predict_test_clip(
+    predictor: Predictor, run: OpenedRun, name: str, out: Path, format_: str | None
+) -> ExportReport:
+    """Write what the network makes of a test clip.
+
+    Raises:
+        InputError: where there is no such clip, or `out` is not a file of that format or cannot be written.
+    """
+    from memmlp.common.errors import InputError
+    from memmlp.motion.body import FPS
+    from memmlp.motion.exporting.folder import ExportReport, choose_format
+    from memmlp.motion.exporting.write import write_motion
+
+    chosen, test = choose_format(out, format_, folder=False), run.test
+    if name not in test.names:
+        wrong = f"SOURCE {name}: no file, no folder and no test clip of the run"
+        raise InputError(f"{wrong}; allowed test clips: {', '.join(test.names)}")
+    (clip,) = predictor.predict([name], [test.clip(test.names.index(name))])
+    write_motion(out, clip, predictor.rest, chosen)
+    return ExportReport((out,), len(clip) / FPS, ())

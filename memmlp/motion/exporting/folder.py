@@ -1,0 +1,195 @@
+"""Exports a folder of AMASS npz, or a single file: each clip becomes a file of the same name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from memmlp.common.errors import InputError, one_line
+from memmlp.common.progress import progress_bar
+from memmlp.motion.body import load_rest_joints
+from memmlp.motion.clip import Clip, Skipped, resample
+from memmlp.motion.exporting.write import FORMATS, SUFFIXES, Format, format_of, write_motion
+from memmlp.motion.formats.npz import NoMotion, read_clip
+from memmlp.motion.plausible import check_plausible
+from memmlp.motion.preparing.survey import clip_name, sources
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Target:
+    """A clip to be written.
+
+    Attributes:
+        name: the clip's name: its path below the source folder, without suffix.
+        source: its npz file.
+        path: the file to write.
+    """
+
+    name: str
+    source: Path
+    path: Path
+
+    @property
+    def file(self) -> str:
+        """The source's path below its folder."""
+        return self.name + self.source.suffix
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be written, and how.
+
+    Attributes:
+        targets: the clips.
+        format: their files' format.
+    """
+
+    targets: tuple[Target, ...]
+    format: Format
+
+
+@dataclass(frozen=True)
+class ExportReport:
+    """What an export did.
+
+    Attributes:
+        written: the files that it wrote.
+        seconds: how long they last, together.
+        skipped: the clips that it skipped.
+    """
+
+    written: tuple[Path, ...]
+    seconds: float
+    skipped: tuple[Skipped, ...]
+
+
+def plan_export(source: Path, out: Path, name: str | None = None) -> Plan:
+    """Plan the export of an npz file to the file `out`, or of a folder's npz files to the folder `out`.
+
+    Args:
+        source: file or folder.
+        out: file or folder; in a folder each file has its source's path, with the format's suffix.
+        name: the format, of FORMATS; by default a file's suffix decides.
+
+    Raises:
+        InputError: where there is nothing to export, the format is unclear, `out` is a file where a folder is
+            needed or the other way round, or a file would be written over a source.
+    """
+    if not source.exists():
+        raise InputError(f"{source}: no such file or folder; allowed: an npz file, or a folder of such")
+    chosen = choose_format(out, name, folder=source.is_dir())
+    if source.is_dir():
+        _check_folder(source, out)
+        targets = tuple(_targets(source, out, chosen.suffix))
+    else:
+        targets = (Target(source.stem, source, out),)
+    if any(target.path.resolve() == target.source.resolve() for target in targets):
+        raise InputError(f"--out {out}: would be written over its source; allowed: another file")
+    return Plan(targets, chosen)
+
+
+def choose_format(out: Path, name: str | None, folder: bool) -> Format:
+    """Return the format of the file, or the folder of files, `out`: the named one, or that of its suffix.
+
+    Raises:
+        InputError: where neither tells, they contradict, a folder has a file's suffix, or a file is a folder.
+    """
+    if folder and name is None:
+        raise InputError(f"--format: needed for a folder; allowed: {', '.join(FORMATS)}")
+    if folder and (out.is_file() or out.suffix.lower() in SUFFIXES):
+        raise InputError(f"--out {out}: is a file, or named as one; allowed for several clips: a folder")
+    if not folder and out.is_dir():
+        raise InputError(f"--out {out}: is a folder; allowed for one clip: a file")
+    if folder:
+        return FORMATS[str(name)]
+    chosen = format_of(out, "--out")
+    if name is not None and FORMATS[name] is not chosen:
+        raise InputError(f"--out {out}: not a file of --format {name}; allowed: *{FORMATS[name].suffix}")
+    return chosen
+
+
+def _targets(folder: Path, out: Path, suffix: str) -> Iterator[Target]:
+    """Yield a target below `out` for each npz file below a folder."""
+    for file in sources(folder):
+        name = clip_name(file)
+        yield Target(name, folder / file, out / (name + suffix))
+
+
+def _check_folder(source: Path, out: Path) -> None:
+    """Raise InputError where a file below `out` could be written over a source, or be taken for one later."""
+    above, below = source.resolve(), out.resolve()
+    if below.is_relative_to(above) or above.is_relative_to(below):
+        raise InputError(f"--out {out}: in {source}, or around it; allowed: a folder beside it")
+
+
+def read_targets(
+    plan: Plan, read: Callable[[Target], T], skipped: list[Skipped], strict: bool = False
+) -> Iterator[tuple[Target, T]]:
+    """Yield each target of a plan with what is read of its source, while a progress bar counts them.
+
+    Args:
+        plan: the targets.
+        read: reads a target's source, or raises InputError: NoMotion for a file that is no clip at all.
+        skipped: gets the other sources that cannot be read, unless there is only one.
+        strict: whether the first of those raises instead.
+
+    Raises:
+        InputError: as told, and at the end where every source was skipped.
+    """
+    alone, usable = len(plan.targets) == 1, False
+    for target in progress_bar(plan.targets, "export"):
+        try:
+            found = read(target)
+        except InputError as error:
+            if alone or (strict and not isinstance(error, NoMotion)):
+                raise
+            if not isinstance(error, NoMotion):  # AMASS has files of shapes beside its clips
+                skipped.append(Skipped(target.file, str(error).removeprefix(one_line(f"{target.source}: "))))
+        else:
+            usable = True
+            yield target, found
+    if not usable:
+        first = f"; the first: {skipped[0].file}: {skipped[0].reason}" if skipped else ""
+        raise InputError(f"no usable clip in {len(plan.targets)} files{first}; allowed: AMASS npz files")
+
+
+def read_motion(target: Target) -> Clip:
+    """Read a target's clip. Raises InputError where it is damaged or cannot be a person's motion."""
+    clip = read_clip(target.source, target.name)
+    check_plausible(target.source, clip)
+    return clip
+
+
+def export(
+    plan: Plan, *, body: str = "builtin", fps: float | None = None, strict: bool = False
+) -> ExportReport:
+    """Write a plan's clips.
+
+    Args:
+        plan: what to write.
+        body: `builtin`, or an SMPL-H model.npz: the bones of the formats that have bones.
+        fps: frame rate, Hz, to which the clips are resampled; by default each keeps its own.
+        strict: whether a bad file raises; otherwise it is skipped and reported, if there are others.
+
+    Raises:
+        InputError: for a bad body, if no clip could be read, or a file cannot be written.
+    """
+    rest = load_rest_joints(body)
+    written: list[Path] = []
+    skipped: list[Skipped] = []
+    seconds = 0.0
+    for target, clip in read_targets(plan, lambda target: _motion(target, fps), skipped, strict):
+        write_motion(target.path, clip, rest, plan.format)
+        written.append(target.path)
+        seconds += len(clip) / clip.fps
+    return ExportReport(tuple(written), seconds, tuple(skipped))
+
+
+def _motion(target: Target, fps: float | None) -> Clip:
+    """Read a target's clip, at its own frame rate or another."""
+    clip = read_motion(target)
+    return clip if fps is None else resample(clip, fps)[0]

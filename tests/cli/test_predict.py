@@ -1,0 +1,105 @@
+"""`memmlp predict`: a run's predictions as files of other programs."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from pathlib import Path
+
+import command_line
+import numpy as np
+import pytest
+
+from memmlp.config.open_run import open_run
+from memmlp.evaluation.predictions import predict_clip
+from memmlp.motion.formats.bvh import read_bvh
+from memmlp.motion.formats.npz import read_clip
+from memmlp.runs.lookup import is_trained, list_runs
+
+
+@pytest.fixture(scope="module")
+def home(tiny_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the folder with one finished run, and its clips as npz; tests add files alone."""
+    home = Path(shutil.copytree(tiny_home, tmp_path_factory.mktemp("home") / "home"))
+    command_line.run(home, "data", "synth", "--out", "clips", "--minutes", "0.2", "--seed", "3")
+    return home
+
+
+@pytest.fixture(scope="module")
+def run(home: Path) -> str:
+    (only,) = [run.id for run in list_runs(home / "outputs") if is_trained(run)]
+    return only
+
+
+@pytest.fixture(scope="module")
+def clip(home: Path, run: str) -> str:
+    with contextlib.chdir(home):
+        return open_run(Path("outputs"), run).test.names[0]
+
+
+def test_a_test_clip_is_written_in_every_format(home: Path, run: str, clip: str):
+    for name in ("a.bvh", "a.glb", "deep/a.npz"):
+        said = command_line.run(home, "predict", run, clip, "--out", name)
+        assert said.startswith(f"run {run}: rotation, stream mode\n1 clip, ")
+        assert (home / name).stat().st_size > 10_000
+    with contextlib.chdir(home):
+        opened = open_run(Path("outputs"), run)
+        frames = opened.test.clip(0)
+        expected = predict_clip(opened.network(), frames, "stream")["predicted_positions"]
+    root = read_bvh(home / "a.bvh").kinematics()[1][:, 0]
+    np.testing.assert_allclose(root / 100, expected[:, 0][:, [0, 2, 1]] * [1, 1, -1], atol=1e-5)
+
+
+def test_mode_branch_and_inverse_kinematics_are_told(home: Path, run: str, clip: str):
+    words = {
+        "window": ["--mode", "window"], "lbfgs": ["--ik", "lbfgs"], "truth": ["--branch", "truth"],
+        "plain": ["--ik", "lbfgs", "--branch", "rotation"], "rotation": [],
+    }  # fmt: skip
+    said = {
+        name: command_line.run(home, "predict", run, clip, "--out", f"{name}.npz", *options)
+        for name, options in words.items()
+    }
+    assert "rotation, window mode" in said["window"]
+    assert "combined, stream mode" in said["lbfgs"]
+    assert "truth, stream mode" in said["truth"]
+    poses = {name: read_clip(home / f"{name}.npz", name).poses for name in words}
+    np.testing.assert_array_equal(poses["plain"], poses["rotation"])
+    for name in ("window", "lbfgs", "truth"):
+        assert np.abs(poses[name] - poses["rotation"]).max() > 1e-3
+
+
+def test_foreign_clips_need_the_run_alone(home: Path, run: str, tmp_path: Path):
+    """No cache and no data of the run; names are kept, and a bad clip is skipped and named."""
+    shutil.copytree(home / "outputs" / "runs", tmp_path / "outputs" / "runs")
+    shutil.copytree(home / "clips", tmp_path / "clips")
+    (tmp_path / "clips" / "bad.npz").write_bytes(b"none")
+    said = command_line.run(tmp_path, "predict", run, "clips", "--out", "out", "--format", "gltf")
+    assert "skipped bad.npz: " in said
+    assert names(tmp_path / "out", "glb") == names(tmp_path / "clips", "npz") - {"bad"} != set()
+    assert not (tmp_path / "outputs" / "cache").exists()
+
+
+def names(folder: Path, suffix: str) -> set[str]:
+    files = folder.rglob(f"*.{suffix}")
+    return {file.relative_to(folder).as_posix().removesuffix(f".{suffix}") for file in files}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["nobody", "--out", "b.bvh"], ("SOURCE nobody", "no test clip", "allowed test clips")),
+        (["CLIP", "--out", "b.fbx"], ("--out b.fbx", ".bvh, .npz, .glb")),
+        (["CLIP", "--out", "b.glb", "--format", "bvh"], ("--out b.glb", "*.bvh")),
+        (["CLIP", "--out", "b.bvh", "--branch", "combined"], ("--branch combined", "--ik lbfgs")),
+        (["clips", "--out", "b"], ("--format", "bvh, npz, gltf")),
+        (["clips/none.npz", "--out", "b.bvh"], ("clips/none.npz", "no file")),
+    ],
+)
+def test_bad_input_is_one_line(home: Path, run: str, clip: str, words: list[str], said: tuple[str, ...]):
+    given = [clip if word == "CLIP" else word for word in words]
+    line = command_line.run(home, "predict", run, *given, code=2)
+    assert line.startswith("memmlp: ")
+    assert line.count("\n") == 1
+    for word in said:
+        assert word in line
+    assert not [path for path in home.iterdir() if path.stem == "b"]
