@@ -17,7 +17,7 @@ from memmlp.evaluation import modes
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK, NoIK
 from memmlp.motion.body import FPS, SPARSE_DIM
-from memmlp.motion.clip import Clip, Skipped, resample
+from memmlp.motion.clip import Clip, resample
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.exporting.folder import ExportReport, Plan, Target, read_motion, read_targets
 from memmlp.motion.exporting.write import write_motion
@@ -129,7 +129,7 @@ class Predictor:
             InputError: if no clip could be read, or a file cannot be written.
         """
         written: list[Path] = []
-        skipped: list[Skipped] = []
+        skipped = list(plan.skipped)
         seconds = 0.0
         clips = read_targets(plan, self._frames, skipped, strict)
         while batch := list(islice(clips, self.evaluation.batch)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from memmlp.motion.clip import Clip, Skipped, resample
 from memmlp.motion.exporting.write import FORMATS, SUFFIXES, Format, format_of, write_motion
 from memmlp.motion.formats.npz import NoMotion, read_clip
 from memmlp.motion.plausible import check_plausible
-from memmlp.motion.preparing.survey import clip_name, sources
+from memmlp.motion.preparing.find import clip_name, find_clips
 
 T = TypeVar("T")
 
@@ -46,10 +47,12 @@ class Plan:
     Attributes:
         targets: the clips.
         format: their files' format.
+        skipped: folders that cannot be listed.
     """
 
     targets: tuple[Target, ...]
     format: Format
+    skipped: tuple[Skipped, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -83,13 +86,23 @@ def plan_export(source: Path, out: Path, name: str | None = None) -> Plan:
         raise InputError(f"{source}: no such file or folder; allowed: an npz file, or a folder of such")
     chosen = choose_format(out, name, folder=source.is_dir())
     if source.is_dir():
-        _check_folder(source, out)
-        targets = tuple(_targets(source, out, chosen.suffix))
-    else:
-        targets = (Target(source.stem, source, out),)
-    if any(target.path.resolve() == target.source.resolve() for target in targets):
+        return _plan_folder(source, out, chosen)
+    if out.resolve() == source.resolve():
         raise InputError(f"--out {out}: would be written over its source; allowed: another file")
-    return Plan(targets, chosen)
+    return Plan((Target(source.stem, source, out),), chosen)
+
+
+def _plan_folder(source: Path, out: Path, chosen: Format) -> Plan:
+    """Plan the export of a folder."""
+    _check_folder(source, out)
+    found = find_clips(source)
+    targets = tuple(_targets(source, found.files, out, chosen.suffix))
+    path, count = Counter(target.path for target in targets).most_common(1)[0]
+    if count > 1:
+        raise InputError(f"{path}: {count} npz files of this name in {source}; allowed: one")
+    return Plan(
+        targets, chosen, tuple(Skipped(folder, reason) for folder, reason in found.unreadable.items())
+    )
 
 
 def choose_format(out: Path, name: str | None, folder: bool) -> Format:
@@ -112,9 +125,9 @@ def choose_format(out: Path, name: str | None, folder: bool) -> Format:
     return chosen
 
 
-def _targets(folder: Path, out: Path, suffix: str) -> Iterator[Target]:
-    """Yield a target below `out` for each npz file below a folder."""
-    for file in sources(folder):
+def _targets(folder: Path, files: list[str], out: Path, suffix: str) -> Iterator[Target]:
+    """Yield a target below `out` for each file of a folder."""
+    for file in files:
         name = clip_name(file)
         yield Target(name, folder / file, out / (name + suffix))
 
@@ -180,7 +193,7 @@ def export(
     """
     rest = load_rest_joints(body)
     written: list[Path] = []
-    skipped: list[Skipped] = []
+    skipped = list(plan.skipped)
     seconds = 0.0
     for target, clip in read_targets(plan, lambda target: _motion(target, fps), skipped, strict):
         write_motion(target.path, clip, rest, plan.format)

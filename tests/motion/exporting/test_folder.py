@@ -90,6 +90,20 @@ def test_what_is_no_person_is_skipped(folder: Path, tmp_path: Path):
     assert "degrees" in report.skipped[1].reason
 
 
+def test_two_files_of_one_name_are_refused(folder: Path, tmp_path: Path):
+    write_clip(folder / "walk.NPZ", moving(5))
+    if len(list(folder.glob("walk.*"))) == 1:
+        pytest.skip("this file system does not tell letter case")
+    with pytest.raises(InputError, match=r"walk\.bvh: 2 npz files of this name"):
+        plan_export(folder, tmp_path / "out", "bvh")
+
+
+def test_a_file_behind_several_links_is_exported_once(folder: Path, tmp_path: Path):
+    (folder / "again").symlink_to(folder)
+    (folder / "other.npz").symlink_to(folder / "walk.npz")
+    assert len(export(plan_export(folder, tmp_path / "out", "bvh")).written) == 2
+
+
 def test_a_folder_of_shapes_has_no_clip(tmp_path: Path):
     (tmp_path / "in").mkdir()
     np.savez(tmp_path / "in" / "shape.npz", betas=np.zeros(16))
