@@ -12,10 +12,25 @@ from memmlp.cli.options import outputs_option
 @click.command("eval")
 @click.argument("run")
 @click.argument("overrides", nargs=-1)
-@click.option("--save-predictions", type=click.Path(path_type=Path), help="Folder for one npz a test clip.")
-@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write per-clip values here.")
-@click.option("--again", is_flag=True, help="Evaluate anew what was evaluated before.")
-@click.option("--device", default="auto", type=click.Choice(["auto", "cpu", "cuda"]), show_default=True)
+@click.option(
+    "--save-predictions",
+    type=click.Path(path_type=Path),
+    help="Folder to write true and predicted motion into, one npz file for each test clip.",
+)
+@click.option(
+    "--json",
+    "json_path",
+    type=click.Path(path_type=Path),
+    help="File to write the metrics into, means and one row for each clip, as JSON.",
+)
+@click.option("--again", is_flag=True, help="Measure again what was measured before.")
+@click.option(
+    "--device",
+    default="auto",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    show_default=True,
+    help="Device to compute on; auto takes a GPU where there is one.",
+)
 @outputs_option
 def evaluate(
     run: str,

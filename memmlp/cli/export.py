@@ -18,41 +18,45 @@ if TYPE_CHECKING:
 
 @click.command("export")
 @click.argument("run")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="The ONNX file to write.")
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="ONNX file to write.")
 @click.option(
     "--graph",
     default="auto",
     show_default=True,
     type=click.Choice(["auto", "streaming", "naive"]),
-    help="With each frame's own share computed once and kept as state, or the network as it was trained; "
-    "auto is the first that there is.",
+    help="Graph to export: streaming computes each frame's own share once and keeps it as state, naive is "
+    "the network as it was trained; auto is the first that there is.",
 )
 @click.option(
     "--precision",
     default="fp32",
     show_default=True,
     type=click.Choice(["fp32", "int8"]),
-    help="int8 is calibrated on training clips and measured on test clips.",
+    help="Precision of the weights: fp32, or int8, which is calibrated on training clips and measured on "
+    "test clips.",
 )
 @click.option(
     "--max-growth",
     default=1.0,
     show_default=True,
-    help="Percent by which MPJPE may grow in int8; no file is written where it grows more.",
+    help="How much MPJPE may grow in int8, percent; no file is written where it grows more.",
 )
 @click.option(
     "--scope",
     default="network",
     show_default=True,
     type=click.Choice(["network", "full"]),
-    help="The network alone, from its 54 inputs, or all of the way from the trackers' poses to the joints.",
+    help="What the file computes: the network alone, from its 54 inputs, or all of the way from the "
+    "trackers' poses to the joints.",
 )
 @click.option(
     "--space",
     type=click.Choice(["amass", "openxr", "unity"]),
-    help="Frame of reference of scope full; amass by default.",
+    help="Frame of reference of poses, with --scope full.  [default: amass]",
 )
-@click.option("--clips", default=1, show_default=True, help="Test clips to check it on; 0: all.")
+@click.option(
+    "--clips", default=1, show_default=True, help="How many test clips the file is checked on; 0 for all."
+)
 @outputs_option
 def export(
     run: str,

@@ -21,23 +21,44 @@ PORT = click.IntRange(1, 65535)
 
 @click.command("live")
 @click.argument("network", metavar="RUN|FILE.onnx")
-@click.option("--clip", help="A test clip's name, or an AMASS npz.  [default: the run's first test clip]")
-@click.option("--udp", type=PORT, metavar="PORT", help="Take JSON packets at this port of 127.0.0.1.")
-@click.option("--osc", type=PORT, metavar="PORT", help="Take OSC bundles at this port of 127.0.0.1.")
+@click.option(
+    "--clip",
+    help="Clip to play: a test clip's name, or an AMASS npz file.  [default: the run's first test clip]",
+)
+@click.option(
+    "--udp",
+    type=PORT,
+    metavar="PORT",
+    help="Take tracker poses as JSON packets at this UDP port of 127.0.0.1, in place of a clip.",
+)
+@click.option(
+    "--osc",
+    type=PORT,
+    metavar="PORT",
+    help="Take tracker poses as OSC bundles at this UDP port of 127.0.0.1, in place of a clip.",
+)
 @click.option(
     "--space", default="amass", show_default=True, type=click.Choice(["amass", "openxr", "unity"]),
-    help="Frame of reference of the packets, also of those of --send.",
+    help="Frame of reference of the packets, also of those that --send sends.",
 )  # fmt: skip
 @click.option(
     "--hz",
     default=60.0,
     show_default=True,
     type=Finite(10, 1000),
-    help="Samples a second of a clip.",
+    help="How many samples of a clip are played a second, Hz.",
 )
-@click.option("--port", default=8765, show_default=True, type=click.IntRange(0, 65535), help="Of the page.")
-@click.option("--no-browser", is_flag=True, help="Only say where the page is.")
-@click.option("--send", is_flag=True, help="Send the clip once to the port of --udp or --osc instead.")
+@click.option(
+    "--port",
+    default=8765,
+    show_default=True,
+    type=click.IntRange(0, 65535),
+    help="Port of the page at 127.0.0.1; 0 takes a free one.",
+)
+@click.option("--no-browser", is_flag=True, help="Print the page's address, and open no browser.")
+@click.option(
+    "--send", is_flag=True, help="Send the clip once, to the port of --udp or --osc, and show no page."
+)
 @outputs_option
 def live(
     network: str,

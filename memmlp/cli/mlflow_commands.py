@@ -18,7 +18,11 @@ def track() -> None:
 
 
 @track.command("sync")
-@click.option("--uri", default=None, help="MLflow's store, if not MLFLOW_TRACKING_URI or sqlite in OUTPUTS.")
+@click.option(
+    "--uri",
+    default=None,
+    help="Address of MLflow's store.  [default: MLFLOW_TRACKING_URI, or else sqlite in OUTPUTS]",
+)
 @outputs_option
 def sync(uri: str | None, outputs: Path) -> None:
     """Bring MLflow up to date with all runs.

@@ -28,7 +28,7 @@ outputs_option = click.option(
     default=Path("outputs"),
     envvar="MEMMLP_OUTPUTS",
     show_default=True,
-    help="Folder of runs and caches.",
+    help="Folder in which runs and caches of data are kept.",
 )
 
 format_option = click.option(

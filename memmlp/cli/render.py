@@ -20,24 +20,45 @@ POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions
 
 @click.command("render")
 @click.argument("runs", nargs=-1, required=True)
-@click.option("--clip", help="A test clip's name.  [default: the first]")
+@click.option("--clip", help="Name of the test clip to draw.  [default: the first one]")
 @click.option(
-    "--out", required=True, type=click.Path(path_type=Path, dir_okay=False), help="FILE.png, .gif or .mp4."
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="File to write: a figure (.png) or a film (.gif, .mp4).",
 )
-@click.option("--label", "labels", multiple=True, help="A run's label, once for each.  [default: its id]")
+@click.option(
+    "--label",
+    "labels",
+    multiple=True,
+    help="Label of a run in the picture; given once for each run, in order.  [default: its id]",
+)
 @click.option(
     "--branch", default="rotation", show_default=True, type=click.Choice(["rotation", "position"]),
-    help="Forward kinematics of the rotations with the head on its tracker, or the positions as they are.",
+    help="Branch whose joints are drawn: rotation, by forward kinematics with the head on its tracker, or "
+    "position, as the network gives them.",
 )  # fmt: skip
 @click.option("--mode", default="stream", show_default=True, type=click.Choice(["stream", "window"]))
-@click.option("--from", "begin", default=0.0, show_default=True, type=Finite(min=0), help="Seconds.")
-@click.option("--to", "end", type=Finite(min=0, min_open=True), help="Seconds.  [default: the end]")
+@click.option(
+    "--from",
+    "begin",
+    default=0.0,
+    show_default=True,
+    type=Finite(min=0),
+    help="Time at which the piece begins, seconds.",
+)
+@click.option(
+    "--to",
+    "end",
+    type=Finite(min=0, min_open=True),
+    help="Time at which the piece ends, seconds.  [default: the clip's end]",
+)
 @click.option(
     "--frames",
     default=6,
     show_default=True,
     type=click.IntRange(1, 20),
-    help="Poses of a PNG, evenly spaced.",
+    help="How many poses a PNG shows, evenly spaced over the piece.",
 )
 @outputs_option
 def render(

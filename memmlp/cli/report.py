@@ -21,7 +21,9 @@ EVERY = ["all", "memory_control"]
 @click.command("report")
 @click.argument("words", nargs=-1, metavar="[NAMES]... [OVERRIDES]...")
 @click.option(
-    "--out", type=click.Path(path_type=Path, dir_okay=False), help="[default: report.html in --outputs]"
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="HTML file to write.  [default: report.html in --outputs]",
 )
 @outputs_option
 def report(words: tuple[str, ...], out: Path | None, outputs: Path) -> None:

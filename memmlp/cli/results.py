@@ -35,9 +35,9 @@ def results() -> None:
     type=click.Path(path_type=Path, file_okay=False),
     default=FOLDER / "data",
     show_default=True,
-    help="Folder of the files.",
+    help="Folder into which the file of results is written.",
 )
-@click.option("--name", "stem", help="Of the file, in place of the sweep's.")
+@click.option("--name", "stem", help="Name of the file, without its ending.  [default: the sweep's name]")
 @outputs_option
 def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | None, outputs: Path) -> None:
     """Keep a sweep's results in one small file.
@@ -75,7 +75,7 @@ def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | N
     type=click.Path(path_type=Path, file_okay=False),
     default=FOLDER,
     show_default=True,
-    help="Where the pages lie, data/ and templates/ below it.",
+    help="Folder of the pages, with data/ and templates/ below it.",
 )
 @click.option("--check", is_flag=True, help="Write nothing; exit with 1 where a page differs.")
 def docs(folder: Path, check: bool) -> None:

@@ -33,7 +33,7 @@ def runs() -> None:
 
 
 @runs.command("list")
-@click.option("--all", "every", is_flag=True, help=f"All of them, not only the newest {NEWEST}.")
+@click.option("--all", "every", is_flag=True, help=f"List all runs, and not only the newest {NEWEST}.")
 @outputs_option
 def list_command(every: bool, outputs: Path) -> None:
     """List the runs, the newest first.
@@ -59,7 +59,7 @@ def list_command(every: bool, outputs: Path) -> None:
 
 @runs.command("show")
 @click.argument("run")
-@click.option("--config", "config", is_flag=True, help="Print the resolved config too.")
+@click.option("--config", "config", is_flag=True, help="Print the run's resolved config, too.")
 @outputs_option
 def show_command(run: str, config: bool, outputs: Path) -> None:
     """Show one run and its results.

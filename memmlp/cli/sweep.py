@@ -29,14 +29,25 @@ OPTIONS = ("partition", "time", "mem_gb", "cpus", "gpus", "account", "qos", "con
 @click.command("sweep")
 @click.argument("name")
 @click.argument("overrides", nargs=-1)
-@click.option("--workers", default=None, type=click.IntRange(1), help="At once; as many as cores by default.")
-@click.option("--status", is_flag=True, help="Show how far it is, and do nothing.")
-@click.option("--dry-run", is_flag=True, help="Show what would be run, and do nothing.")
-@click.option("--retry", is_flag=True, help="Run again what failed.")
-@click.option("--again", is_flag=True, help="Do its finished networks again; their VQ-VAEs stay.")
+@click.option(
+    "--workers",
+    default=None,
+    type=click.IntRange(1),
+    help="How many workers run at once.  [default: one a core]",
+)
+@click.option("--status", is_flag=True, help="Show how far the sweep is, and run nothing.")
+@click.option(
+    "--dry-run", is_flag=True, help="Show what would be run and how long it may take, and run nothing."
+)
+@click.option("--retry", is_flag=True, help="Run again what failed before.")
+@click.option("--again", is_flag=True, help="Train the sweep's finished networks again; their VQ-VAEs stay.")
 @click.option("--fail-fast", is_flag=True, help="End the sweep with the first run that fails.")
-@click.option("--until-decided", is_flag=True, help="Spend seeds in rounds, where verdicts are open.")
-@click.option("--max-seeds", type=int, help="Of an arm, with --until-decided; 13 by default.")
+@click.option(
+    "--until-decided", is_flag=True, help="Add seeds in rounds, to arms whose verdicts are open alone."
+)
+@click.option(
+    "--max-seeds", type=int, help="Most seeds that an arm may get, with --until-decided.  [default: 13]"
+)
 @click.option("--yes", is_flag=True, hidden=True)
 @outputs_option
 def sweep(

@@ -31,16 +31,31 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
 @click.argument("name")
 @click.argument("overrides", nargs=-1)
 @click.option(
-    "--format", "form", type=click.Choice(["md", "tex", "json", "html"]), help="In place of the screen's."
+    "--format",
+    "form",
+    type=click.Choice(["md", "tex", "json", "html"]),
+    help="Format to print in.  [default: a table for the screen]",
 )
 @click.option(
-    "--out", type=click.Path(path_type=Path, dir_okay=False), help="File; its ending tells the format."
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="File to write the table into; its ending tells the format.",
 )
 @click.option(
-    "--mode", type=click.Choice(list(SHOWN_MODES)), default="both", show_default=True, help="Of evaluation."
+    "--mode",
+    type=click.Choice(list(SHOWN_MODES)),
+    default="both",
+    show_default=True,
+    help="Mode of evaluation whose errors are shown.",
 )
-@click.option("--branch", type=click.Choice(BRANCHES), help="In place of the paper's for this table.")
-@click.option("--plan", is_flag=True, help="Show how many seeds the paper's effects would need here.")
+@click.option(
+    "--branch",
+    type=click.Choice(BRANCHES),
+    help="Branch whose errors are shown.  [default: that of the paper's table]",
+)
+@click.option(
+    "--plan", is_flag=True, help="Show how many seeds it would take to see the paper's effects on this data."
+)
 @outputs_option
 def table(
     name: str,

@@ -24,9 +24,18 @@ if TYPE_CHECKING:
 
 @click.command("tune")
 @click.argument("overrides", nargs=-1)
-@click.option("--workers", default=None, type=click.IntRange(1), help="At once; as many as cores by default.")
-@click.option("--status", is_flag=True, help="Show how far it is, and do nothing.")
-@click.option("--config-dir", type=click.Path(path_type=Path), help="Folder of configs of your own.")
+@click.option(
+    "--workers",
+    default=None,
+    type=click.IntRange(1),
+    help="How many workers run at once.  [default: one a core]",
+)
+@click.option("--status", is_flag=True, help="Show how far the search is, and run nothing.")
+@click.option(
+    "--config-dir",
+    type=click.Path(path_type=Path),
+    help="Folder of your own configs, searched beside memmlp's; it may name classes of yours.",
+)
 @outputs_option
 def tune(
     overrides: tuple[str, ...], workers: int | None, status: bool, config_dir: Path | None, outputs: Path

@@ -1,8 +1,10 @@
-"""Progress bars that show the time left; they are silent where stderr is no terminal."""
+"""Progress bars that show the time left, silent where stderr is no terminal; lines that say what begins."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator, Sized
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TypeVar
 
 from rich.console import Console
@@ -16,6 +18,24 @@ from rich.progress import (
 )
 
 T = TypeVar("T")
+
+_SAY: ContextVar[Callable[[str], None] | None] = ContextVar("what is told of stages", default=None)
+
+
+def stage_begins(line: str) -> None:
+    """Say in a line what begins now, where somebody listens (`telling_stages`)."""
+    if say := _SAY.get():
+        say(line)
+
+
+@contextmanager
+def telling_stages(say: Callable[[str], None]) -> Iterator[None]:
+    """Hand the lines of stages that begin in this context to `say`."""
+    token = _SAY.set(say)
+    try:
+        yield
+    finally:
+        _SAY.reset(token)
 
 
 def progress() -> Progress:

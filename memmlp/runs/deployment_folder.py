@@ -49,10 +49,7 @@ class DeploymentFolder:
     @property
     def record(self) -> dict[str, Any]:
         """What was measured: sizes, times, int8's accuracy; empty if the run was not deployed."""
-        # Version 0.1 called the timing yardstick "reference" in its keys.
-        return {
-            re.sub(r"(^|_)reference(_|$)", r"\1yardstick\2", k): v for k, v in read_json(self.latency).items()
-        }
+        return _current(read_json(self.latency))
 
     @property
     def made(self) -> str:
@@ -68,3 +65,13 @@ class DeploymentFolder:
     def prefers_int8(self) -> bool:
         """Whether the int8 file is accurate enough to be used instead of the float32 one."""
         return self.int8.exists() and bool(self.record.get("int8", {}).get("default"))
+
+
+def _current(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record with the keys of this version; 0.1 called the timing yardstick "reference"."""
+    return {
+        re.sub(r"(^|_)reference(_|$)", r"\1yardstick\2", key): _current(value)
+        if isinstance(value, Mapping)
+        else value
+        for key, value in record.items()
+    }

@@ -37,10 +37,24 @@ Launch = Callable[[], subprocess.Popen[bytes]]
 
 
 @click.command("chaos")
-@click.option("--runs", default=12, show_default=True, help="Runs of the sweep, two arms with seeds.")
-@click.option("--kills", default=20, show_default=True, help="SIGKILLs of workers and controllers.")
-@click.option("--controllers", default=3, show_default=True, help="Concurrent memmlp sweep processes.")
-@click.option("--seed", default=0, show_default=True, help="Of the killer.")
+@click.option(
+    "--runs", default=12, show_default=True, help="How many runs the sweep has, of two arms with seeds."
+)
+@click.option(
+    "--kills",
+    default=20,
+    show_default=True,
+    help="How many times a worker or a controller is killed (SIGKILL).",
+)
+@click.option(
+    "--controllers",
+    default=3,
+    show_default=True,
+    help="How many memmlp sweep processes work at the same time.",
+)
+@click.option(
+    "--seed", default=0, show_default=True, help="Seed of the random choice of what is killed, and when."
+)
 @click.argument("overrides", nargs=-1)
 def chaos(runs: int, kills: int, controllers: int, seed: int, overrides: tuple[str, ...]) -> None:
     """Run a sweep under random SIGKILLs.
@@ -66,9 +80,16 @@ def chaos(runs: int, kills: int, controllers: int, seed: int, overrides: tuple[s
 
 
 @click.command("chaos-tune")
-@click.option("--trials", default=10, show_default=True, help="search.n_trials.")
-@click.option("--kills", default=8, show_default=True, help="SIGKILLs of the controller and of workers.")
-@click.option("--seed", default=0, show_default=True, help="Of the killer.")
+@click.option("--trials", default=10, show_default=True, help="How many trials the search has.")
+@click.option(
+    "--kills",
+    default=8,
+    show_default=True,
+    help="How many times the controller or a worker is killed (SIGKILL).",
+)
+@click.option(
+    "--seed", default=0, show_default=True, help="Seed of the random choice of what is killed, and when."
+)
 @click.argument("overrides", nargs=-1)
 def chaos_tune(trials: int, kills: int, seed: int, overrides: tuple[str, ...]) -> None:
     """Run a search under random SIGKILLs.

@@ -26,11 +26,30 @@ VARIANTS = ("naive", "streaming", "int8")
 
 
 @click.command("latency")
-@click.option("--rounds", default=5, show_default=True, type=click.IntRange(5), help="Rounds.")
-@click.option("--steps", default=20, show_default=True, type=click.IntRange(2), help="Steps a round, each.")
-@click.option("--models", default=",".join(MODELS), show_default=True, help="Which, by comma.")
-@click.option("--json", "file", type=click.Path(path_type=Path), help="Write the rows to this file.")
-@click.option("--profile", help="Show where the time goes in one of them, e.g. mem_mlp_41:int8.")
+@click.option(
+    "--rounds",
+    default=5,
+    show_default=True,
+    type=click.IntRange(5),
+    help="How many rounds are timed, the networks in turn.",
+)
+@click.option(
+    "--steps",
+    default=20,
+    show_default=True,
+    type=click.IntRange(2),
+    help="How many steps of each network a round has.",
+)
+@click.option(
+    "--models", default=",".join(MODELS), show_default=True, help="Networks to time, separated by commas."
+)
+@click.option(
+    "--json", "file", type=click.Path(path_type=Path), help="File to write the measured rows into, as JSON."
+)
+@click.option(
+    "--profile",
+    help="Show instead where the time of one network goes: NETWORK:VARIANT, such as mem_mlp_41:int8.",
+)
 @click.argument("overrides", nargs=-1)
 def latency(
     rounds: int, steps: int, models: str, file: Path | None, profile: str | None, overrides: tuple[str, ...]

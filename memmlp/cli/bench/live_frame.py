@@ -15,13 +15,21 @@ if TYPE_CHECKING:
 
 
 @click.command("avatar")
-@click.option("--run", help="A finished run; without one, a network with random weights.")
-@click.option("--onnx", type=click.Path(path_type=Path), help="An ONNX file instead.")
-@click.option("--frames", default=300, show_default=True, help="Frames a round.")
-@click.option("--rounds", default=5, show_default=True, help="Rounds.")
-@click.option("--space", default="amass", show_default=True, help="Frame of reference of the poses.")
+@click.option("--run", help="Finished run to time.  [default: a network with random weights]")
+@click.option("--onnx", type=click.Path(path_type=Path), help="ONNX file to time, in place of a run.")
+@click.option("--frames", default=300, show_default=True, help="How many frames a round has.")
+@click.option("--rounds", default=5, show_default=True, help="How many rounds are timed.")
 @click.option(
-    "--rotations", default="matrix", show_default=True, help="How they come out: matrix, quaternion."
+    "--space",
+    default="amass",
+    show_default=True,
+    help="Frame of reference of the poses: amass, openxr or unity.",
+)
+@click.option(
+    "--rotations",
+    default="matrix",
+    show_default=True,
+    help="Format of the rotations that come out: matrix or quaternion.",
 )
 @outputs_option
 @click.argument("overrides", nargs=-1)

@@ -6,7 +6,7 @@ import click
 
 
 @click.command("prepare")
-@click.option("--minutes", default=60.0, show_default=True, help="Length of the synthetic motion.")
+@click.option("--minutes", default=60.0, show_default=True, help="Length of the synthetic motion, minutes.")
 def prepare(minutes: float) -> None:
     """Time the preparation of synthetic motion.
 

@@ -16,8 +16,10 @@ if TYPE_CHECKING:
 
 @click.command("soak")
 @click.argument("run", required=False)
-@click.option("--onnx", type=click.Path(path_type=Path), help="An ONNX file in the place of the run's own.")
-@click.option("--hours", default=1.0, show_default=True, help="Of motion, at least.")
+@click.option(
+    "--onnx", type=click.Path(path_type=Path), help="ONNX file to stream with.  [default: the run's own]"
+)
+@click.option("--hours", default=1.0, show_default=True, help="Least length of the streamed motion, hours.")
 @outputs_option
 def soak(run: str | None, onnx: Path | None, hours: float, outputs: Path) -> None:
     """Stream for hours of motion without a reset.

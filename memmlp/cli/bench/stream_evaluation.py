@@ -6,9 +6,11 @@ import click
 
 
 @click.command("stream")
-@click.option("--clips", default=64, show_default=True, help="Clips side by side.")
-@click.option("--frames", default=60, show_default=True, help="Frames a clip.")
-@click.option("--rounds", default=3, show_default=True, help="Rounds, the two ways in turn.")
+@click.option("--clips", default=64, show_default=True, help="How many clips are evaluated side by side.")
+@click.option("--frames", default=60, show_default=True, help="Length of each clip, frames.")
+@click.option(
+    "--rounds", default=3, show_default=True, help="How many rounds are timed, the two ways in turn."
+)
 @click.option("--device", default="cpu", show_default=True, type=click.Choice(["cpu", "cuda"]))
 @click.argument("overrides", nargs=-1)
 def stream(clips: int, frames: int, rounds: int, device: str, overrides: tuple[str, ...]) -> None:

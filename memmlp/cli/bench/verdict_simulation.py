@@ -79,10 +79,18 @@ def markdown(rows: Sequence[dict[str, Any]], seed: int) -> str:
 
 
 @click.command("calibration")
-@click.option("--tables", default=5000, show_default=True, type=click.IntRange(1), help="Tables a cell.")
-@click.option("--quick", is_flag=True, help=f"At most {QUICK} clips.")
-@click.option("--seed", default=0, show_default=True, help="Of the random numbers.")
-@click.option("--json", "file", type=click.Path(path_type=Path), help="Write all rates to this file.")
+@click.option(
+    "--tables",
+    default=5000,
+    show_default=True,
+    type=click.IntRange(1),
+    help="How many tables are simulated for each cell of the grid.",
+)
+@click.option("--quick", is_flag=True, help=f"Simulate the cells of at most {QUICK} clips alone.")
+@click.option("--seed", default=0, show_default=True, help="Seed of the random numbers.")
+@click.option(
+    "--json", "file", type=click.Path(path_type=Path), help="File to write all rates into, as JSON."
+)
 @click.option("--markdown", "as_markdown", is_flag=True, help="Print the table as Markdown.")
 def calibration(tables: int, quick: bool, seed: int, file: Path | None, as_markdown: bool) -> None:
     """Simulate how often verdicts are wrong.
