@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: setup demo test test-fast coverage golden check docs dist pre-commit clean
+.PHONY: setup demo test test-fast coverage mutants golden check docs dist pre-commit clean
 
 setup: $(STAMP)
 
@@ -27,6 +27,9 @@ test-fast: $(STAMP)
 
 coverage: $(STAMP)
 	$(PYTEST) --cov --cov-report=term:skip-covered
+
+mutants: $(STAMP)
+	$(BIN)/python tests/mutants.py $(MUTANTS)
 
 golden: $(STAMP)
 	$(BIN)/python tests/golden.py

@@ -9,8 +9,9 @@ from command_line import SMALL, run
 
 
 @pytest.mark.slow
-def test_every_trial_is_there_once(tmp_path: Path):
-    """With two seeds a trial, so that some kills come between a trial's runs."""
+def test_every_trial_is_there_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """With two seeds a trial, so that some kills come between a trial's runs, which are short here."""
+    monkeypatch.setattr("memmlp.cli.bench.chaos.LONG_PAUSES", (2.0, 6.0))
     words = ["--trials", "2", "--kills", "3", *SMALL, "search.seeds=2"]
     said = run(tmp_path, "bench", "chaos-tune", *words)
     assert "2 trials with 3 kills" in said

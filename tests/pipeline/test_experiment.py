@@ -37,7 +37,7 @@ CHANGES: dict[str, str] = {
     "seed": "1", "device": "cpu", "threads": "2", "force": "true", "save_predictions": "elsewhere",
     "data.name": "other", "data.min_frames": "43", "data.strict": "true", "data.weighting": "clips",
     "data.split.test": "0.3", "data.split.val": "0.3",
-    "data.split.seed": "1", "data.split.groups": "['[a-d]1']",
+    "data.split.seed": "1", "data.split.groups": "['[a-d]1']", "data.split.groups_file": "groups.csv",
     "frame.coordinates": "world", "frame.normalize": "false",
     "model.frames": "6", "model.width": "12", "model.depth": "3",
     "memory.layers": "[2,4]", "memory.width": "5", "memory.shift": "window", "memory.history": "latest",
@@ -93,12 +93,16 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         torch.set_num_threads(threads)
 
 
+NAMES = ("a1", "a2", "b1", "b2", "c1", "c2", "d1", "d2")
+
+
 def clips(folder: Path) -> None:
-    """Eight short clips of an upright person who moves."""
+    """Eight short clips of an upright person who moves, and a file that groups them."""
     folder.mkdir()
-    for number, name in enumerate(("a1", "a2", "b1", "b2", "c1", "c2", "d1", "d2")):
+    folder.with_name("groups.csv").write_text("clip,group\n" + "".join(f"{n},{n[0]}\n" for n in NAMES))
+    for number, name in enumerate(NAMES):
         rng = np.random.default_rng(number)
-        phase = np.linspace(0, 6, 60 + 8 * number)[:, None] + rng.uniform(0, 6, 156)
+        phase = np.linspace(0, 6, 46 + 2 * number)[:, None] + rng.uniform(0, 6, 156)
         poses = 0.2 * np.sin(phase) * rng.normal(size=156)
         poses[:, :3] = [np.pi / 2, 0, 0]
         trans = np.array([0, 0, 0.95]) + 0.1 * np.sin(phase[:, :3])
@@ -122,7 +126,7 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
     model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)
     found = data.open("test")
     short = MotionDataset(
-        found.frames[:30], torch.tensor([0]), torch.tensor([30]), found.names[:1], found.groups[:1]
+        found.frames[:16], torch.tensor([0]), torch.tensor([16]), found.names[:1], found.groups[:1]
     )
     settings = experiment.evaluation
     reports = {

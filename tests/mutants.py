@@ -1,0 +1,192 @@
+"""Random one-line mutants of the package: does the mirrored test file kill each of them?
+
+    python tests/mutants.py --count 20 --seed 0
+
+A mutant is the package with one change on one line. It is put into a throwaway copy of the checkout, and the
+test file that mirrors its module is run there, or the tests of the module's folder where none does. Exits
+with 1 where a mutant survives: a test is missing, or the change makes no difference.
+
+mutmut and cosmic-ray go through all mutants, with one command for all tests; a sample of them, each with its
+own test file, is what this is for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import functools
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parent.parent
+TIMEOUT = 1800  # seconds; a mutant that makes the tests hang so long counts as killed
+OTHER: dict[type, str] = {
+    ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==",
+    ast.In: "not in", ast.NotIn: "in", ast.Is: "is not", ast.IsNot: "is",
+    ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*", ast.FloorDiv: "*", ast.Mod: "*",
+    ast.Pow: "*", ast.MatMult: "*", ast.BitOr: "&", ast.BitAnd: "|", ast.And: "or", ast.Or: "and",
+}  # fmt: skip
+"""What stands for each operator in a mutant."""
+
+
+class Mutant(NamedTuple):
+    """A change: of `file` (relative to the checkout), from `start` to `end` (in bytes), to `text`."""
+
+    file: Path
+    line: int
+    start: int
+    end: int
+    text: str
+
+    def __str__(self) -> str:
+        before = (ROOT / self.file).read_bytes()[self.start : self.end].decode()
+        return f"{self.file}:{self.line}: {' '.join(before.split())} -> {self.text}"
+
+    def apply(self, root: Path) -> None:
+        """Make the change in a copy of the checkout."""
+        content = (ROOT / self.file).read_bytes()
+        (root / self.file).write_bytes(content[: self.start] + self.text.encode() + content[self.end :])
+
+
+def replacements(node: ast.AST) -> Iterator[tuple[ast.AST, str]]:
+    """Pieces of a node, each with what stands for it in a mutant."""
+    match node:
+        case ast.Compare(left, [op, *_], [right, *rest]) if not rest:
+            yield node, f"{ast.unparse(left)} {OTHER[type(op)]} {ast.unparse(right)}"
+        case ast.BinOp(left, op, right) if type(op) in OTHER:
+            yield node, f"(({ast.unparse(left)}) {OTHER[type(op)]} ({ast.unparse(right)}))"
+        case ast.BoolOp(op, values):
+            yield node, f"({f' {OTHER[type(op)]} '.join(f'({ast.unparse(value)})' for value in values)})"
+        case ast.UnaryOp(ast.Not() | ast.USub(), operand):
+            yield node, f"({ast.unparse(operand)})"
+        case ast.Constant(bool(value)):
+            yield node, repr(not value)
+        case ast.Constant(int(value) | float(value)):
+            yield node, repr(value + 1)
+        case ast.Return(ast.AST() as value) if ast.unparse(value) != "None":
+            yield node, "return None"
+        case ast.Expr(ast.Call()) | ast.AugAssign() | ast.Raise():
+            yield node, "pass"
+        case ast.If(test) | ast.IfExp(test):
+            yield test, f"(not ({ast.unparse(test)}))"
+
+
+def code(node: ast.AST) -> Iterator[ast.AST]:
+    """The nodes that are computed: no annotations, imports for types alone, or parts of f-strings."""
+    if isinstance(node, ast.JoinedStr) or (
+        isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+    ):
+        return
+    yield node
+    for name, value in ast.iter_fields(node):
+        if name not in ("annotation", "returns", "decorator_list"):
+            for child in value if isinstance(value, list) else [value]:
+                if isinstance(child, ast.AST):
+                    yield from code(child)
+
+
+def mutants(file: Path) -> list[Mutant]:
+    """All mutants of a module."""
+    content = (ROOT / file).read_bytes()
+    starts = [0]
+    for line in content.splitlines(keepends=True):
+        starts.append(starts[-1] + len(line))
+    found = []
+    for node in code(ast.parse(content)):
+        for piece, text in replacements(node):
+            start = starts[piece.lineno - 1] + piece.col_offset  # type: ignore[attr-defined]
+            end = starts[piece.end_lineno - 1] + piece.end_col_offset  # type: ignore[attr-defined]
+            found.append(Mutant(file, piece.lineno, start, end, text))  # type: ignore[attr-defined]
+    return found
+
+
+def drawn(count: int, seed: int, skip: list[str]) -> list[Mutant]:
+    """Lines drawn at random from all that have a mutant, and one mutant of each."""
+    files = sorted(path.relative_to(ROOT) for path in (ROOT / "memmlp").rglob("*.py"))
+    files = [file for file in files if not any(file.is_relative_to(room) for room in skip)]
+    lines: dict[tuple[Path, int], list[Mutant]] = {}
+    for mutant in (mutant for file in files for mutant in mutants(file)):
+        lines.setdefault((mutant.file, mutant.line), []).append(mutant)
+    dice = random.Random(seed)
+    return [dice.choice(lines[line]) for line in dice.sample(sorted(lines), count)]
+
+
+def mirrored(file: Path) -> Path:
+    """The test file of a module or of its folder, or the nearest folder of tests (below the checkout)."""
+    place = Path("tests", *file.parts[1:])
+    candidates = [
+        (path.with_name(f"test_{path.stem}.py"), path) for path in (place, *list(place.parents)[:-1])
+    ]
+    return next(path for pair in candidates for path in pair if (ROOT / path).exists())
+
+
+@functools.cache
+def sound(root: Path, tests: Path, marker: str) -> bool:
+    """Whether the tests pass without a mutant."""
+    return passes(root, tests, marker)
+
+
+def passes(root: Path, tests: Path, marker: str) -> bool:
+    """Whether the tests with these marks pass in a copy of the checkout; none pass too."""
+    line = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", "-m", marker]
+    options = {"cwd": root, "env": {**os.environ, "PYTHONPATH": str(root)}, "capture_output": True}
+    try:
+        return subprocess.run([*line, str(tests)], timeout=TIMEOUT, **options).returncode in (0, 5)
+    except subprocess.TimeoutExpired:
+        return False
+
+
+def survives(root: Path, mutant: Mutant) -> bool:
+    """Whether a mutant passes its tests, the quick ones first, all of which pass without it."""
+    tests = mirrored(mutant.file)
+    for marker in ("not slow", "slow"):
+        if not sound(root, tests, marker):
+            sys.exit(f"{tests}: fails without a mutant")
+        mutant.apply(root)
+        try:
+            if not passes(root, tests, marker):
+                return False
+        finally:
+            shutil.copy2(ROOT / mutant.file, root / mutant.file)
+    return True
+
+
+def copied(folder: str) -> Path:
+    """A copy of what git knows of the checkout."""
+    names = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
+    root = Path(folder) / "copy"
+    for name in names.decode().split("\0"):
+        if name and (ROOT / name).is_file():
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, root / name)
+    return root
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Are random one-line mutants killed by their tests?")
+    parser.add_argument("--count", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--skip", action="append", default=[], help="a folder or file of the package")
+    parser.add_argument("--dry-run", action="store_true", help="draw, and run nothing")
+    words = parser.parse_args()
+    chosen = drawn(words.count, words.seed, words.skip)
+    with tempfile.TemporaryDirectory() as folder:
+        root = copied(folder)
+        survivors = 0
+        for number, mutant in enumerate(chosen, 1):
+            survived = not words.dry_run and survives(root, mutant)
+            verdict = "drawn" if words.dry_run else "survived" if survived else "killed"
+            print(f"{number:3} {verdict:8} {mutant} [{mirrored(mutant.file)}]", flush=True)
+            survivors += survived
+    sys.exit(survivors > 0)
+
+
+if __name__ == "__main__":
+    main()
