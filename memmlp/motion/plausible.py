@@ -20,7 +20,7 @@ HEAD, ANKLES = JOINTS.index("head"), [JOINTS.index("left_ankle"), JOINTS.index("
 MOST_TURN = 4 * math.pi  # a rotation vector has no reason to be longer than pi; fits wind up to 2 pi and more
 MOST_SPEED = 30.0  # m/s; the fastest runner reached 12.4
 MOST_HEIGHT = 10.0  # metres of the pelvis over z = 0 beyond which the feet have to prove that they stand
-SAMPLES = 100  # frames looked at for posture
+SAMPLES = 50  # frames looked at for posture
 
 
 def check_plausible(path: Path, clip: Clip) -> None:

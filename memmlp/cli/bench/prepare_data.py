@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import click
 
 
 @click.command("prepare")
 @click.option("--minutes", default=60.0, show_default=True, help="Length of the synthetic motion, minutes.")
-def prepare(minutes: float) -> None:
+@click.option("--clips", default=0, metavar="N", help="Instead, this many pieces of two seconds.")
+def prepare(minutes: float, clips: int) -> None:
     """Time the preparation of synthetic motion.
 
-    Printed are seconds, frames a second, and peak memory.
+    Printed are seconds, those of the processor, frames a second, and peak memory.
     """
     import resource
     import tempfile
     import time
-    from pathlib import Path
 
     from memmlp.motion.preparing.cache import ClipFolder
     from memmlp.motion.preparing.cache import prepare as run
@@ -24,13 +26,33 @@ def prepare(minutes: float) -> None:
 
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "clips"
-        synthesize(root, minutes=minutes)
-        start = time.perf_counter()
+        if clips:
+            _pieces(root, clips)
+        else:
+            synthesize(root, minutes=minutes)
+        start, start_cpu = time.perf_counter(), time.process_time()
         manifest = run(ClipFolder(root, SeededSplit()), Path(folder) / "cache")
-        seconds = time.perf_counter() - start
+        seconds, cpu = time.perf_counter() - start, time.process_time() - start_cpu
     frames = sum(int(part["frames"]) for part in manifest.totals.values())
     peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     click.echo(
-        f"{frames} frames ({frames / 216000:.2f} h) in {seconds:.1f} s: {frames / seconds:.0f} frames/s, "
+        f"{len(manifest.clips)} clips, {frames} frames ({frames / 216000:.2f} h) in {seconds:.1f} s "
+        f"({cpu:.1f} s of the processor): {frames / seconds:.0f} frames/s, "
         f"{seconds / (frames / 216000):.1f} s an hour of motion, peak memory {peak / 2**20:.2f} GB"
     )
+
+
+def _pieces(root: Path, count: int) -> None:
+    """Write pieces of two seconds, each from another second of a walk and with its own noise in the place."""
+    import numpy as np
+
+    from memmlp.motion.clip import Clip
+    from memmlp.motion.formats.npz import write_clip
+    from memmlp.motion.synthetic import synthesize_clip
+
+    walk, rng = synthesize_clip("walking", 0, seconds=30), np.random.default_rng(0)
+    for index in range(count):
+        piece = slice(index % 28 * 60, index % 28 * 60 + 120)
+        trans = walk.trans[piece] + [*rng.uniform(-1, 1, 2), 0.0]
+        name = f"{index // 100}/{index}"
+        write_clip(root / f"{name}.npz", Clip(name, walk.poses[piece], trans, walk.fps))

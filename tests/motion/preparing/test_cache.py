@@ -204,3 +204,21 @@ def test_frames_of_an_older_recipe_are_made_again(root, tmp_path, monkeypatch):
     again = prepare(source(root), tmp_path / "cache")
     assert (tmp_path / "cache" / "train.npy").stat().st_mtime_ns > made
     assert again.digest == first.digest
+
+
+def test_torch_has_one_thread_while_frames_are_made(root, tmp_path, monkeypatch):
+    """With more of them many small clips take four times as long."""
+    before, seen, made = torch.get_num_threads(), [], module.frame_blocks
+
+    def frames(*args):
+        seen.append(torch.get_num_threads())
+        return made(*args)
+
+    monkeypatch.setattr(module, "frame_blocks", frames)
+    torch.set_num_threads(2)
+    try:
+        prepare(source(root), tmp_path / "cache")
+        assert set(seen) == {1}
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
