@@ -139,14 +139,16 @@ def open_npz(path: Path) -> Iterator[Npz]:
     """
     try:
         with open(path, "rb") as raw:
-            if raw.read(len(MAGIC)) != MAGIC:
-                raise InputError(f"{path}: no zip, so no npz")
+            magic = raw.read(len(MAGIC))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    if magic != MAGIC:
+        raise InputError(f"{path}: no zip, so no npz")
+    try:
         with _Bounded(io.FileIO(path)) as file, zipfile.ZipFile(file) as archive:
             yield Npz(path, archive)
     except InputError:
         raise
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or brief(error)})") from error
     except Exception as error:
         raise InputError(f"{path}: not a readable npz ({brief(error)})") from error
 

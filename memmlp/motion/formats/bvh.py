@@ -8,6 +8,7 @@ channels, if it has any, replace the numbers of its OFFSET.
 from __future__ import annotations
 
 import re
+from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,7 +24,10 @@ CHANNELS = tuple(axis + kind for kind in ("position", "rotation") for axis in AX
 END = ".end"  # an end site's name is that of its joint with this suffix
 LIMIT = 1e6  # the largest size of any number in the file, in its units or degrees
 MAX_JOINTS = 1000
-MAX_BYTES = 2**30
+MAX_BYTES = 2**29
+MAX_HEAD = 2**22  # bytes before MOTION
+MAX_LINE = 200_000  # bytes
+MAX_VALUES = 2**24  # in all frames: 25 minutes of 93 channels at 120 Hz
 RATE_DIGITS = 1e-4  # relative: 1 / 0.00833333 s is 120 Hz, as the header has no more digits
 
 
@@ -170,11 +174,8 @@ def read_bvh(path: Path) -> Bvh:
             than 1000 joints, bytes that are no text); the message names the file and where possible the line.
     """
     lines = _lines(path)
-    start = next((n for n, line in enumerate(lines) if line.strip().upper() == b"MOTION"), None)
-    if start is None:
-        raise InputError(f"{path}: no MOTION line, so truncated or no BVH; allowed: HIERARCHY, then MOTION")
-    hierarchy = _Hierarchy(_Words(path, lines[:start]))
-    frame_time, values = _motion(path, lines, start + 1, sum(map(len, hierarchy.channels)))
+    hierarchy = _Hierarchy(_Words(path, _head(path, lines)))
+    frame_time, values = _motion(path, lines, sum(map(len, hierarchy.channels)))
     return Bvh(
         path=path,
         names=tuple(hierarchy.names),
@@ -187,14 +188,34 @@ def read_bvh(path: Path) -> Bvh:
     )
 
 
-def _lines(path: Path) -> list[bytes]:
-    """Return the file's lines, whatever ends them (LF, CRLF or CR)."""
+def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
+    """Yield the file's lines with their numbers, whatever ends them (LF, CRLF or CR)."""
     try:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: too large; allowed: a BVH of at most {MAX_BYTES >> 20} MiB")
-        return path.read_bytes().splitlines()
+        with open(path, encoding="latin-1") as file:  # Latin-1 gives every byte back
+            for number, line in enumerate(iter(lambda: file.readline(MAX_LINE), ""), start=1):
+                if len(line) == MAX_LINE:
+                    _fail(path, number, "too long", f"{MAX_LINE} bytes")
+                yield number, line.encode("latin-1")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); allowed: a BVH file") from error
+
+
+def _head(path: Path, lines: Iterator[tuple[int, bytes]]) -> list[bytes]:
+    """Take the lines before MOTION, and MOTION itself, from the file's lines; return those before."""
+    head: list[bytes] = []
+    size = 0
+    for _, line in lines:
+        if line.strip().upper() == b"MOTION":
+            return head
+        head.append(line)
+        size += len(line)
+        if size > MAX_HEAD:
+            raise InputError(
+                f"{path}: no MOTION line in its first {MAX_HEAD >> 20} MiB; allowed: HIERARCHY, then MOTION"
+            )
+    raise InputError(f"{path}: no MOTION line, so truncated or no BVH; allowed: HIERARCHY, then MOTION")
 
 
 def _fail(path: Path, line: int, wrong: str, allowed: str) -> NoReturn:
@@ -323,22 +344,28 @@ class _Hierarchy:
         return name
 
 
-def _motion(path: Path, lines: list[bytes], start: int, width: int) -> tuple[float, np.ndarray]:
+def _motion(path: Path, lines: Iterator[tuple[int, bytes]], width: int) -> tuple[float, np.ndarray]:
     """Read frame time and values (N, width) from the lines after MOTION; blank lines do not count."""
-    rows = [(number, line) for number, line in enumerate(lines[start:], start + 1) if line.strip()]
-    if len(rows) < 2 or width == 0:
-        _fail(path, start, "no motion", "channels, Frames:, Frame Time: and the frames")
-    frames = _header(path, *rows[0], "Frames:")
+    rows = ((number, line) for number, line in lines if line.strip())
+    first, second = next(rows, None), next(rows, None)
+    if first is None or second is None or width == 0:
+        raise InputError(f"{path}: no motion; allowed: channels, Frames:, Frame Time: and the frames")
+    frames = _header(path, *first, "Frames:")
     if not re.fullmatch(r"0*[1-9]\d{0,8}", frames, re.ASCII):
-        _fail(path, rows[0][0], f"Frames: {_show(frames)}", "a whole number from 1")
+        _fail(path, first[0], f"Frames: {_show(frames)}", "a whole number from 1")
     low, high = FRAME_RATE_RANGE
-    seconds = _number(word := _header(path, *rows[1], "Frame Time:"))
+    seconds = _number(word := _header(path, *second, "Frame Time:"))
     if not 1 / high <= seconds <= 1 / low:
-        _fail(path, rows[1][0], f"Frame Time: {_show(word)}", f"{1 / high:g} to {1 / low:g} s")
-    if len(rows) - 2 != int(frames):
-        wrong = f"Frames: {int(frames)}, but {len(rows) - 2} lines of values follow"
-        _fail(path, rows[0][0], wrong, "one line for each frame")
-    return seconds, _values(path, rows[2:], width)
+        _fail(path, second[0], f"Frame Time: {_show(word)}", f"{1 / high:g} to {1 / low:g} s")
+    values = array("d")  # a list of rows would be much larger than its numbers
+    for number, line in rows:
+        values.extend(_values(path, number, line, width))
+        if len(values) > MAX_VALUES:
+            _fail(path, number, "too many frames", f"{MAX_VALUES} values")
+    if len(values) != int(frames) * width:
+        wrong = f"Frames: {int(frames)}, but {len(values) // width} lines of values follow"
+        _fail(path, first[0], wrong, "one line for each frame")
+    return seconds, np.array(values).reshape(-1, width)
 
 
 def _header(path: Path, number: int, line: bytes, key: str) -> str:
@@ -349,20 +376,16 @@ def _header(path: Path, number: int, line: bytes, key: str) -> str:
     return match[1] if match else _fail(path, number, _show(text), f"{key} and one number")
 
 
-def _values(path: Path, rows: list[tuple[int, bytes]], width: int) -> np.ndarray:
-    """Parse the numbers (N, width) of the frames' lines."""
-    values = np.empty((len(rows), width))
-    for row, (number, line) in zip(values, rows, strict=True):
-        words = line.split()
-        if len(words) != width:
-            _fail(path, number, f"{len(words)} values", f"{width}, one for each channel")
-        try:
-            row[:] = float("nan") if b"_" in line else list(map(float, words))
-        except ValueError:
-            row[:] = float("nan")
-    good = np.abs(values) <= LIMIT
-    if not good.all():
-        number, line = rows[good.all(1).argmin()]
+def _values(path: Path, number: int, line: bytes, width: int) -> np.ndarray:
+    """Parse the numbers (width,) of a frame's line."""
+    words = line.split()
+    if len(words) != width:
+        _fail(path, number, f"{len(words)} values", f"{width}, one for each channel")
+    try:
+        values = np.array([float("nan")] if b"_" in line else list(map(float, words)))
+    except ValueError:
+        values = np.array([float("nan")])
+    if not (np.abs(values) <= LIMIT).all():
         texts = line.decode("latin-1").split()
         wrong = next((text for text in texts if not abs(_number(text)) <= LIMIT), texts[0])
         _fail(path, number, _show(wrong), f"numbers up to {LIMIT:g} in size")

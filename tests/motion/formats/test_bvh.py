@@ -278,6 +278,18 @@ def test_files_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert "too large" in refusal(write(tmp_path, SMALL))
 
 
+@pytest.mark.parametrize(
+    ("limit", "value", "said"),
+    [("MAX_HEAD", 50, "no MOTION line in its first"), ("MAX_LINE", 20, "line 5: too long"),
+     ("MAX_VALUES", 5, "too many frames")],
+)  # fmt: skip
+def test_what_is_read_is_bounded(
+    limit: str, value: int, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(f"memmlp.motion.formats.bvh.{limit}", value)
+    assert said in refusal(write(tmp_path, SMALL))
+
+
 def test_deep_and_wide_hierarchies(tmp_path: Path) -> None:
     def chain(depth: int) -> str:
         joints = "".join(f"JOINT j{n} {{ OFFSET 0 1 0 CHANNELS 0\n" for n in range(depth))
