@@ -76,6 +76,13 @@ def test_points_of_ours_are_named_where_they_are_few(count: int):
     assert [svg.count(point.label) for point in points] == [int(count <= 12)] * count
 
 
+def test_a_figures_arms_are_named():
+    """In the legend, for lines have no other names."""
+    curve = figures.Curve([1, 2], [1.0, 0.5])
+    svg = figures.curves("losses", {"loss": {"one arm": [curve], "other arm": [curve, curve]}})
+    assert (svg.count("one arm"), svg.count("other arm")) == (1, 1)
+
+
 def test_page_has_every_table_and_figure(chapters: list[Chapter], text: str):
     for chapter in chapters:
         assert f'<section class="result" id="{chapter.sweep.name}">' in text

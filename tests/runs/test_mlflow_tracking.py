@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import sys
 import time
@@ -239,3 +240,11 @@ def test_sync_rebuilds_the_view_and_changes_nothing_the_second_time(tmp_path: Pa
         )
     assert views[0] == views[1]
     assert [name for name, *_ in views[0]] == ["0" * 16, "mine"]
+
+
+def test_packages_are_as_talkative_afterwards_as_before(tmp_path: Path):
+    logger = logging.getLogger("alembic")
+    for level in (logging.INFO, logging.ERROR):
+        logger.setLevel(level)
+        MLflowTracking(None, tmp_path).project(a_run(tmp_path))
+        assert logger.level == level

@@ -7,7 +7,7 @@ import tiny
 import torch
 
 from memmlp.motion.body import LOWER, SPARSE_DIM
-from memmlp.training.losses import HandFK, HandPosition, Manual, MotionLoss, NoHand, Uncertainty
+from memmlp.training.losses import HandFK, HandPosition, Loss, Manual, MotionLoss, NoHand, Uncertainty
 
 BOTH = frozenset({"rotation", "position"})
 DRAW = torch.Generator().manual_seed(0)
@@ -79,3 +79,8 @@ def test_uncertainty_settles_where_the_weight_is_one_over_the_loss():
         optimiser.step()
     assert weighting.weights() == pytest.approx({"rotation": 1 / 4, "position": 10}, rel=1e-2)
     assert weighting.s["rotation"].item() == pytest.approx(math.log(4), rel=1e-2)
+
+
+def test_a_loss_without_terms_is_none():
+    with pytest.raises(NotImplementedError):
+        Loss()(MOTION, TRUTH[..., SPARSE_DIM:], SPARSE, NORMALIZER)
