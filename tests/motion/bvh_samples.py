@@ -112,6 +112,7 @@ def person(skeleton: str, frames: int, seed: int, folded: bool = False) -> Sampl
     """
     sample, random = tree(skeleton, seed), np.random.default_rng([seed, 1])
     values = random.uniform(-180, 180, (frames, sample.values.shape[1]))
+    values[:, :6] *= [0.01, 0.01, 0.01, 0.1, 0.1, 0.1]  # nobody is faster
     values[0, 3:] = 0
     for joint, name in enumerate(sample.names):
         if name in FOLDED and not folded:
@@ -172,7 +173,7 @@ def write(folder: Path, text: str | bytes, name: str = "clip.bvh") -> Path:
 
 
 def read(folder: Path, skeleton: str, frames: int = 5, **options: int) -> Bvh:
-    return read_bvh(write(folder, person(skeleton, frames, **{"seed": 3, **options}).text()))
+    return read_bvh(write(folder, person(skeleton, frames, **{"seed": 3, **options}).text(dt="0.1")))
 
 
 @contextmanager
@@ -259,7 +260,9 @@ def performed(
         else:
             own = body[:, JOINTS.index(joint)] @ corrections[JOINTS.index(joint)].T
             turned[1:, index] = world @ own @ axes.T
-    root = (clip.trans + REST[0]) @ world.T / (chosen.unit or 0.01)
+    unit = chosen.unit or 0.01
+    scale = unit * leg(chosen, sample) / np.linalg.norm(REST[[4, 7]] - REST[[1, 4]], axis=-1).sum()
+    root = scale * (clip.trans + REST[0]) @ world.T / unit
     values = [np.concatenate([np.zeros((1, 3)), root])]
     turns = np.tile(np.eye(3), (len(sample.names), 1, 1)) if turns is None else turns
     offsets = np.array(sample.offsets)
@@ -278,6 +281,12 @@ def performed(
     ends = [(joint, (turns[joint].T @ offset).tolist()) for joint, offset in sample.ends]
     table = np.concatenate(values, 1)[0 if chosen.calibration_frame else 1 :]
     return replace(sample, offsets=offsets.tolist(), ends=ends, values=table)
+
+
+def leg(chosen: SkeletonMap, sample: Sample) -> float:
+    """The length from hip to ankle, in the file's unit."""
+    offsets = dict(zip(sample.names, sample.offsets, strict=True))
+    return float(sum(np.linalg.norm(offsets[chosen.joints[end]]) for end in ("left_knee", "left_ankle")))
 
 
 def joints_nodes(chosen: SkeletonMap) -> list[str]:

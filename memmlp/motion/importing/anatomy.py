@@ -111,6 +111,10 @@ def why_no_stance(pose: np.ndarray) -> str | None:
     tilt = abs(90 - angles(pose[HIPS[0]] - pose[HIPS[1]], UP))
     if tilt > LEVEL:
         return f"the line of the hips is {tilt:.0f} degrees from level"
+    for hip in HIPS:
+        axis = bend(pose, hip)
+        if axis is not None and axis @ (pose[HIPS[0]] - pose[HIPS[1]]) < 0:
+            return f"{JOINTS[LIMBS[hip]]} bends forward, seen from the hips: left and right may be swapped"
     return None
 
 

@@ -13,6 +13,7 @@ from memmlp.motion.importing.floor import find_floor
 from memmlp.motion.importing.recording import Performance, Recording, perform
 from memmlp.motion.importing.retarget import fit, to_body
 from memmlp.motion.importing.skeleton import SkeletonMap
+from memmlp.motion.plausible import check_plausible
 
 AUTO, NONE = "auto", "none"  # what a floor may be beside a height
 
@@ -28,6 +29,8 @@ class Converted:
         floor: height of the floor in the recording, metres on the body's scale, which was taken off; None
             where it is unknown or was not asked for.
         rest_pose: the pose from which the skeleton was read, in words.
+        unit: the file's unit, metres, told or found.
+        up: the file's up axis, told or found.
     """
 
     clip: Clip
@@ -35,6 +38,8 @@ class Converted:
     fidelity: Fidelity
     floor: float | None
     rest_pose: str
+    unit: float
+    up: str
 
 
 def convert(
@@ -57,18 +62,26 @@ def convert(
         floor: `auto`, found from the feet; `none`, left as it is; or its height in the file, metres.
 
     Raises:
-        InputError: as `retarget.fit` and `recording.perform` do.
+        InputError: as `retarget.fit` and `recording.perform` do, and for motion that no person does.
     """
     settled = settle(recording, skeleton)
     performance = perform(recording, settled)
     fitted = fit(recording, settled, performance, rest)
     clip = to_body(performance, fitted, rest, name, fps or recording.fps)
-    height = find_floor(pose(clip, rest)[1], clip.fps) if floor == AUTO else None
-    if isinstance(floor, float):
-        height = floor * fitted.scale
+    if floor == AUTO:
+        height = find_floor(pose(clip, rest)[1], clip.fps)
+    else:
+        height = None if floor == NONE else float(floor) * fitted.scale
     clip = lowered(clip, height or 0.0)
+    check_plausible(recording.path, clip)
     return Converted(
-        clip, performance, compare(clip, performance, rest, skeleton.name), height, fitted.rest_pose
+        clip=clip,
+        performance=performance,
+        fidelity=compare(clip, performance, rest, skeleton.name),
+        floor=height,
+        rest_pose=fitted.rest_pose,
+        unit=float(settled.unit or 1.0),
+        up=str(settled.up),
     )
 
 

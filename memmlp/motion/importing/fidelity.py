@@ -12,11 +12,23 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from memmlp.motion.body import HEAD, JOINTS, PARENTS
 from memmlp.motion.clip import Clip
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
-from memmlp.motion.importing.anatomy import FEET, HIPS, LIMBS, SHOULDERS, angles, segments, unit
+from memmlp.motion.importing.anatomy import (
+    FEET,
+    HINGES,
+    HIPS,
+    LIMBS,
+    SHOULDERS,
+    angles,
+    hinge,
+    segments,
+    unit,
+)
+from memmlp.motion.importing.axes import LEG
 from memmlp.motion.importing.recording import Performance
 from memmlp.motion.importing.skeleton import Z_UP
 
@@ -26,7 +38,9 @@ TRUNK = 25.0  # degrees between pelvis to head on the body and in the file
 UPRIGHT_SHARE = 0.5  # of the frames, in which the head must be above the pelvis
 BENT, FORWARD_SHARE = 0.35, 0.3  # sine of a knee's bend that counts; share of it that may be the wrong way
 LENGTHS = (0.5, 2.0)  # of a limb to the legs' length, over the same on the body
-HEAD_TURN = 90.0  # degrees
+HEAD_TURN = 90.0  # degrees between head and pelvis
+TORSO, TURN = (3, 6, 9, 12, 13, 14, 15), 60.0  # spine, neck, collars, head; degrees against the joint above
+TWIST = 45.0  # degrees by which a knee's or elbow's axis may be off the body's
 SIDES = 1.25  # left over right
 FLOOR = 0.3  # metres: how far from the floor feet may stay through a whole clip
 STRETCH = 0.02  # metres by which a segment may change its length
@@ -81,6 +95,8 @@ def compare(clip: Clip, performance: Performance, rest: np.ndarray, skeleton: st
     faults = (
         *_unlike_the_file(found, positions, expected, performance.mapped),
         *_unlike_people(rotations, positions, performance.mapped),
+        *_odd_turns(rotations),
+        *_twisted_limbs(rotations, positions),
         *_odd_lengths(expected, rest),
     )
     return replace(found, faults=faults)
@@ -165,7 +181,6 @@ def _unlike_people(rotations: np.ndarray, positions: np.ndarray, mapped: np.ndar
     if wrong > FORWARD_SHARE:
         yield f"the knees bend forward in {wrong:.0%} of their bends"
     yield from _backward_feet(rotations, positions, mapped)
-    yield from _odd_head(rotations)
     lowest = float(np.quantile(positions[:, [7, 8, 10, 11], 2].min(1), 0.05))
     if abs(lowest) > FLOOR:
         side = "above" if lowest > 0 else "below"
@@ -191,12 +206,28 @@ def _backward_feet(rotations: np.ndarray, positions: np.ndarray, mapped: np.ndar
         yield f"the feet point backward in {np.mean(backward):.0%} of the frames"
 
 
-def _odd_head(rotations: np.ndarray) -> Iterator[str]:
-    """Yield how the head is turned on the trunk, if no neck turns so far in half of the frames."""
+def _odd_turns(rotations: np.ndarray) -> Iterator[str]:
+    """Yield the joints of the torso that are turned, in half of the frames, as far as no body's are."""
     turns = [angles(rotations[:, HEAD, :, axis], rotations[:, 0, :, axis]) for axis in (1, 2)]
     turn = max(np.median(angle) for angle in turns)
     if turn > HEAD_TURN:
         yield f"the head is turned by {turn:.0f} degrees against the pelvis in half of the frames"
+    for joint in TORSO:
+        own = rotations[:, PARENTS[joint]].swapaxes(-1, -2) @ rotations[:, joint]
+        turn = np.degrees(np.median(Rotation.from_matrix(own).magnitude()))
+        if turn > TURN:
+            against = f"{turn:.0f} degrees against {JOINTS[PARENTS[joint]]} in half of the frames"
+            yield f"{JOINTS[joint]} is turned by {against}: rest, the zero pose or the map is wrong"
+
+
+def _twisted_limbs(rotations: np.ndarray, positions: np.ndarray) -> Iterator[str]:
+    """Yield the thighs and upper arms that are turned about themselves, by the axes of knees and elbows."""
+    for joint, axis in HINGES.items():
+        own = hinge(rotations[:, joint], positions, joint)
+        off = 0.0 if own is None else angles(own, np.array(axis))
+        if off > TWIST:
+            turned = f"bends about an axis {off:.0f} degrees off the body's"
+            yield f"{JOINTS[LIMBS[joint]]} {turned}: the limb is turned about itself in rest or the zero pose"
 
 
 def _odd_lengths(expected: np.ndarray, rest: np.ndarray) -> Iterator[str]:
@@ -208,6 +239,8 @@ def _odd_lengths(expected: np.ndarray, rest: np.ndarray) -> Iterator[str]:
     def legs(at: np.ndarray) -> float:
         return sum(length(at, start, LIMBS[start]) for start in (1, 2, 4, 5)) / 2
 
+    if not LEG[0] <= legs(expected) <= LEG[1]:
+        yield f"the legs are {legs(expected):.2f} m long, so the unit may be wrong"
     for left, right in ((1, 2), (4, 5), (16, 17), (18, 19)):
         both = [length(expected, start, LIMBS[start]) for start in (left, right)]
         if max(both) > SIDES * min(both):

@@ -13,7 +13,7 @@ LOWEST = 0.05  # share of the standing toes that may be lower: noise, and feet t
 
 
 def find_floor(positions: np.ndarray, fps: float) -> float | None:
-    """Return the height of the floor, metres: below the lowest toes that stand still.
+    """Return the height of the floor, metres: below the lowest toes that stand still, and below all else.
 
     Args:
         positions: global joint positions (N, 22, 3), world (Z up).
@@ -29,4 +29,5 @@ def find_floor(positions: np.ndarray, fps: float) -> float | None:
     standing = toes[..., 2][speed < STILL]
     if len(standing) < SECONDS * fps:
         return None
-    return float(np.quantile(standing, LOWEST)) - CONTACT
+    lowest = np.quantile(positions[..., 2].min(1), LOWEST)  # of who lies, whose toes are up
+    return float(min(np.quantile(standing, LOWEST) - CONTACT, lowest))

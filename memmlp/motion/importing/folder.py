@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.importing.convert import AUTO, convert, lowered
 from memmlp.motion.importing.rates import folder_key, true_rate
 from memmlp.motion.importing.recording import Recording
+from memmlp.motion.importing.rest_pose import STRAIGHTEST
 from memmlp.motion.importing.skeleton import SkeletonMap, find_skeleton, is_number, load_skeleton
 from memmlp.motion.preparing.groups import Grouping
 
@@ -37,6 +39,8 @@ class Imported:
         sha256: digest of that file.
         clip: the npz file's path below its folder.
         skeleton: name of the skeleton map.
+        unit: the file's unit, metres.
+        up: the file's up axis, `y` or `z`.
         rest_pose: the pose from which the skeleton was read, in words.
         frames: number of frames.
         header_fps: frame rate that the file's header tells, Hz.
@@ -50,6 +54,8 @@ class Imported:
     sha256: str
     clip: str
     skeleton: str
+    unit: float
+    up: str
     rest_pose: str
     frames: int
     header_fps: float
@@ -112,7 +118,7 @@ def import_folder(source: Path, out: Path, how: How | None = None) -> ImportRepo
             be written.
     """
     how, files = how or How(), find_bvh(source)
-    _check_import(files, out, how.fps)
+    _check_import(files, out, how)
     rest, clips, skipped = load_rest_joints(how.body), [], []
     chosen = None if how.skeleton is None else load_skeleton(how.skeleton)
     sources = [relative.as_posix() for relative in files]
@@ -133,9 +139,7 @@ def import_folder(source: Path, out: Path, how: How | None = None) -> ImportRepo
         if not clips:
             raise InputError(f"{source}: no usable BVH file of {len(files)}; the first: {skipped[0].reason}")
         clips = _one_floor_a_take(clips, takes, Path(staging))
-        rates = dict.fromkeys(_note(clip) for clip in clips if clip.fps != clip.header_fps)
-        notes = [f"{skeleton.name}: {skeleton.note}" for skeleton in maps.values() if skeleton.note]
-        report = ImportReport(tuple(clips), (*rates, *notes), tuple(skipped))
+        report = ImportReport(tuple(clips), tuple(_notes(clips, maps, how)), tuple(skipped))
         _publish(Path(staging), out, report, Path(how.body).name)
     return report
 
@@ -160,8 +164,8 @@ def _npz(relative: Path) -> Path:
     return relative.with_suffix(".npz")
 
 
-def _check_import(files: Mapping[Path, Path], out: Path, fps: Mapping[str, float]) -> None:
-    """Raise InputError for two sources of one clip, foreign clips in `out`, or rates for no folder."""
+def _check_import(files: Mapping[Path, Path], out: Path, how: How) -> None:
+    """Raise InputError for two sources of one clip, foreign clips in `out`, wrong takes or rates."""
     npz, count = Counter(_npz(relative) for relative in files).most_common(1)[0]
     if count > 1:
         raise InputError(f"{npz.with_suffix('').as_posix()}: {count} BVH files of this name; allowed: one")
@@ -169,8 +173,13 @@ def _check_import(files: Mapping[Path, Path], out: Path, fps: Mapping[str, float
     if foreign or (out.exists() and not out.is_dir()):
         wrong = f"has other clips, such as {foreign[0].as_posix()}" if foreign else "is a file"
         raise InputError(f"{out}: {wrong}; allowed: a new folder, or that of the same import")
+    for pattern in how.takes:
+        try:
+            re.compile(pattern)
+        except re.error as error:
+            raise InputError(f"take: {pattern!r}: {error}; allowed: a regular expression") from error
     folders = sorted({folder_key(folder) for relative in files for folder in relative.parents})
-    for folder, rate in fps.items():
+    for folder, rate in how.fps.items():
         if folder not in folders or not is_number(rate, *FRAME_RATE_RANGE):
             allowed = f"1 to 1000 Hz for {', '.join(map(repr, folders))} ('' is all)"
             raise InputError(f"fps: {rate!r} for {folder!r}; allowed: {allowed}")
@@ -206,6 +215,8 @@ def _import_file(
         sha256=sha256,
         clip=_npz(relative).as_posix(),
         skeleton=skeleton.name,
+        unit=converted.unit,
+        up=converted.up,
         rest_pose=converted.rest_pose,
         frames=len(converted.clip),
         header_fps=recording.fps,
@@ -216,7 +227,32 @@ def _import_file(
     )
 
 
-def _note(clip: Imported) -> str:
+def _notes(clips: Sequence[Imported], maps: Mapping[str, SkeletonMap], how: How) -> Iterator[str]:
+    """Yield what a person has to know of an import, a line each."""
+    yield from dict.fromkeys(_rate_note(clip) for clip in clips if clip.fps != clip.header_fps)
+    yield from (f"{skeleton.name}: {skeleton.note}" for skeleton in maps.values() if skeleton.note)
+    for name in maps:
+        yield from _family_notes(name, [clip for clip in clips if clip.skeleton == name])
+    floorless = [clip.source for clip in clips if clip.floor is None]
+    if how.floor == AUTO and floorless:
+        more = f" and {len(floorless) - 1} more" if len(floorless) > 1 else ""
+        yield f"{floorless[0]}{more}: no foot stands still, so the floor is as in the file"
+
+
+def _family_notes(name: str, clips: Sequence[Imported]) -> Iterator[str]:
+    """Yield what may differ from clip to clip of one skeleton."""
+    for key in ("up", "unit"):
+        found = Counter(getattr(clip, key) for clip in clips)
+        if len(found) > 1:
+            several = ", ".join(f"{value} in {count} clips" for value, count in found.most_common())
+            yield f"{name}: {key} is found as {several}; tell it in the map if that is wrong"
+    read = [clip for clip in clips if clip.rest_pose.endswith(STRAIGHTEST)]
+    if len(read) > 1:
+        each = f"{len(read)} clips, whose zero pose is no stance, are each read from a frame of their own"
+        yield f"{name}: {each}, so head, hands and feet may be turned differently; a map's rest mends that"
+
+
+def _rate_note(clip: Imported) -> str:
     """Describe a folder's corrected rate in one line."""
     folder = Path(clip.source).parent.as_posix()
     return f"{folder}: {clip.fps:g} Hz, {clip.fps_reason}; the header says {clip.header_fps:g} Hz"

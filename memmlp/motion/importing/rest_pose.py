@@ -15,6 +15,7 @@ from memmlp.motion.importing import anatomy
 from memmlp.motion.importing.recording import Performance, Recording
 from memmlp.motion.importing.skeleton import SkeletonMap
 
+STRAIGHTEST = "the straightest"  # how a frame was chosen, beside a given one
 TRIED = 500  # frames of a file, evenly spread, among which a stance is looked for
 
 
@@ -75,9 +76,12 @@ def _straightest(performance: Performance, why: str) -> RestPose:
     """Return the frame in which the person stands straightest; `why` is what is wrong with the zero pose."""
     frames = np.unique(np.linspace(0, len(performance) - 1, TRIED).astype(int))
     order = frames[np.argsort(anatomy.unevenness(performance.positions[frames]), kind="stable")]
-    for frame in order:
-        if anatomy.why_no_stance(performance.positions[frame]) is None:
-            return _frame(performance, int(frame), "the straightest")
+    stances = [int(frame) for frame in order if anatomy.why_no_stance(performance.positions[frame]) is None]
+    for frame in stances:
+        if anatomy.wrong_sides(performance.positions[frame], performance.mapped) is None:
+            return _frame(performance, frame, STRAIGHTEST)
+    if stances:
+        return _frame(performance, stances[0], STRAIGHTEST)  # which says what is wrong
     best = anatomy.why_no_stance(performance.positions[order[0]])
     wrong = f"the person stands neither in the zero pose ({why}) nor in any frame (at best, {best})"
     raise InputError(

@@ -55,7 +55,8 @@ def fit(
     if not stance.straight:
         turned = _turned_to_hinges(turned, stance, performance, rest)
     corrections = stance.rotations.swapaxes(-1, -2) @ turned
-    return Retargeting(corrections, _leg_length(rest) / _leg_length(stance.positions), stance.source)
+    scale = float(_leg_length(rest) / np.median(_leg_length(performance.positions)))
+    return Retargeting(corrections, scale, stance.source)
 
 
 def to_body(performance: Performance, fitted: Retargeting, rest: np.ndarray, name: str, fps: float) -> Clip:
@@ -124,6 +125,7 @@ def _turned_to_hinges(
     return turned
 
 
-def _leg_length(positions: np.ndarray) -> float:
-    """Return the length of thigh and shin of positions (22, 3), the mean of both sides."""
-    return sum(float(np.linalg.norm(positions[end] - positions[start])) for start, end in LEGS.items()) / 2
+def _leg_length(positions: np.ndarray) -> np.ndarray:
+    """Return the lengths (...) of thigh and shin of positions (..., 22, 3), the mean of both sides."""
+    bones = [positions[..., end, :] - positions[..., start, :] for start, end in LEGS.items()]
+    return np.linalg.norm(bones, axis=-1).sum(0) / 2

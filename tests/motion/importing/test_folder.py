@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from bvh_samples import mutate, person, refuse, write
+from bvh_samples import mutate, performed, person, random_turns, refuse, tree, write
+from plain_kinematics import npz_kinematics
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import builtin_rest_joints
+from memmlp.motion.body import JOINTS, builtin_rest_joints
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.npz import read_clip
-from memmlp.motion.importing.convert import convert
+from memmlp.motion.importing.convert import NONE, convert
 from memmlp.motion.importing.folder import How, import_folder
-from memmlp.motion.importing.skeleton import find_skeleton
+from memmlp.motion.importing.skeleton import SKELETONS, find_skeleton, load_skeleton
+from memmlp.motion.synthetic import synthesize_clip
 
 REST = builtin_rest_joints()
 
@@ -64,7 +67,7 @@ def rates(out: Path) -> dict[str, float]:
 
 def test_import_writes_clips_and_record(source: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    report = import_folder(source, out)
+    report = import_folder(source, out, How(floor=NONE))
     assert rates(out) == {"indian/01.npz": 120, "salsa/01.npz": 60, "salsa/02.npz": 60, "top.npz": 120}
     assert [clip.source for clip in report.clips] == [
         "indian/01.bvh",
@@ -101,7 +104,7 @@ def test_import_twice_is_the_same(source: Path, tmp_path: Path) -> None:
     ],
 )
 def test_given_rates(source: Path, tmp_path: Path, fps: dict[str, float], expected: list[float]) -> None:
-    report = import_folder(source, tmp_path / "out", How(fps=fps))
+    report = import_folder(source, tmp_path / "out", How(fps=fps, floor=NONE))
     assert list(rates(tmp_path / "out").values()) == expected
     assert [clip.fps for clip in report.clips] == expected
     assert all("given" in clip.fps_reason for clip in report.clips if clip.fps not in (60, 120))
@@ -114,7 +117,7 @@ def test_given_rates(source: Path, tmp_path: Path, fps: dict[str, float], expect
 )
 def test_wrong_rates_are_refused(source: Path, tmp_path: Path, fps: dict[str, float]) -> None:
     with refuse("fps: ", "'indian', 'salsa'"):
-        import_folder(source, tmp_path / "out", How(fps=fps))
+        import_folder(source, tmp_path / "out", How(fps=fps, floor=NONE))
 
 
 def test_known_rate_holds_for_the_folder_or_file_itself(source: Path, tmp_path: Path) -> None:
@@ -125,7 +128,7 @@ def test_known_rate_holds_for_the_folder_or_file_itself(source: Path, tmp_path: 
 
 def test_a_header_that_is_right_is_not_corrected(source: Path, tmp_path: Path) -> None:
     write(source, person("cmu_daz", 3, 0).text(dt="0.0166667"), "indian/01.bvh")
-    report = import_folder(source / "indian/01.bvh", tmp_path / "out")
+    report = import_folder(source / "indian/01.bvh", tmp_path / "out", How(floor=NONE))
     assert (report.clips[0].fps, report.clips[0].fps_reason) == (60, "the header's")
     assert report.notes == ()
 
@@ -183,3 +186,98 @@ def test_foreign_clips_in_out_are_refused(source: Path, tmp_path: Path) -> None:
         import_folder(source, tmp_path / "out")
     with refuse(source / "top.bvh", "is a file"):
         import_folder(source, source / "top.bvh")
+
+
+# Floors, takes, notes
+
+
+@pytest.fixture
+def takes(tmp_path: Path) -> Path:
+    """Walks a and b of take 1 on floors of 0.3 and 0.5 m, and one of take 2 on a floor of 0.9 m."""
+    chosen = load_skeleton("cmu_daz")
+    walk = synthesize_clip("walking", 1, seconds=2.0)
+    for name, floor in (("1a", 0.3), ("1b", 0.5), ("2a", 0.9)):
+        raised = replace(walk, trans=walk.trans + np.array([0, 0, floor]))
+        text = performed(chosen, raised, sample=tree("cmu_daz")).text(dt="0.0166667")
+        write(tmp_path / "source", text, f"{name}.bvh")
+    return tmp_path / "source"
+
+
+def toes(out: Path) -> dict[str, float]:
+    """The lower toe's tenth percentile of each clip, metres."""
+    feet = [JOINTS.index("left_foot"), JOINTS.index("right_foot")]
+    return {
+        path.stem: float(np.percentile(npz_kinematics(path)[1][:, feet, 2].min(1), 10))
+        for path in sorted(out.rglob("*.npz"))
+    }
+
+
+def test_each_clip_is_put_on_its_floor(takes: Path, tmp_path: Path) -> None:
+    report = import_folder(takes, tmp_path / "out")
+    assert report.notes == ()
+    assert max(abs(height - 0.02) for height in toes(tmp_path / "out").values()) < 0.01
+    found = [float(clip.floor or 0) for clip in report.clips]
+    assert np.diff(found) == pytest.approx([0.2, 0.4], abs=0.01)
+
+
+def test_clips_of_a_take_share_its_lowest_floor(takes: Path, tmp_path: Path) -> None:
+    apart = import_folder(takes, tmp_path / "apart")
+    report = import_folder(takes, tmp_path / "out", How(takes=[r"^(\d)"]))
+    assert [clip.floor for clip in report.clips] == [apart.clips[index].floor for index in (0, 0, 2)]
+    heights = toes(tmp_path / "out")
+    assert heights["1b"] - heights["1a"] == pytest.approx(0.2, abs=0.01)
+    assert heights["2a"] == pytest.approx(0.02, abs=0.01)
+
+
+def test_floors_as_told(takes: Path, tmp_path: Path) -> None:
+    left = import_folder(takes, tmp_path / "left", How(floor=NONE))
+    told = import_folder(takes, tmp_path / "told", How(floor=0.3))
+    assert [clip.floor for clip in left.clips] == [None] * 3
+    scale = {clip.floor for clip in told.clips}
+    assert len(scale) == 1
+    taken = np.subtract(list(toes(tmp_path / "left").values()), list(toes(tmp_path / "told").values()))
+    np.testing.assert_allclose(taken, scale.pop(), atol=1e-5)
+    zero = import_folder(takes, tmp_path / "zero", How(floor=0))
+    assert [clip.floor for clip in zero.clips] == [0.0] * 3
+
+
+def test_a_clip_without_a_floor_says_so(takes: Path, tmp_path: Path) -> None:
+    write(takes, person("cmu_daz", 9, 9).text(), "flying.bvh")
+    report = import_folder(takes, tmp_path / "out")
+    assert report.notes == ("flying.bvh: no foot stands still, so the floor is as in the file",)
+    assert {clip.source: clip.floor for clip in report.clips}["flying.bvh"] is None
+
+
+def test_patterns_of_takes_are_checked(takes: Path, tmp_path: Path) -> None:
+    with refuse("take: '('"):
+        import_folder(takes, tmp_path / "out", How(takes=["("]))
+
+
+def test_clips_that_are_each_read_from_a_frame_are_noted(tmp_path: Path) -> None:
+    chosen, walk = load_skeleton("cmu_daz"), synthesize_clip("walking", 1, seconds=2.0)
+    turns = random_turns(tree("cmu_daz"), 1)
+    text = performed(chosen, walk, sample=tree("cmu_daz"), turns=turns).text()
+    for name in "ab":
+        write(tmp_path / "source", text, f"{name}.bvh")
+    notes = import_folder(tmp_path / "source", tmp_path / "out").notes
+    assert [note for note in notes if note.startswith("cmu_daz: 2 clips, whose zero pose is no stance")]
+
+
+def test_several_up_axes_of_one_skeleton_are_noted(tmp_path: Path) -> None:
+    chosen = replace(load_skeleton("cmu_daz"), up=None)
+    walk, path = synthesize_clip("walking", 1, seconds=2.0), tmp_path / "auto.yaml"
+    path.write_text((SKELETONS / "cmu_daz.yaml").read_text().replace("up: y", "up: auto"))
+    for name, up in (("a", "y"), ("b", "z"), ("c", "y")):
+        text = performed(replace(chosen, up=up), walk).text()
+        write(tmp_path / "source", text, f"{name}.bvh")
+    notes = import_folder(tmp_path / "source", tmp_path / "out", How(skeleton=str(path))).notes
+    assert "cmu_daz: up is found as y in 2 clips, z in 1 clips; tell it in the map if that is wrong" in notes
+
+
+def test_faults_are_kept_in_the_record(tmp_path: Path) -> None:
+    chosen, walk = load_skeleton("cmu_daz"), synthesize_clip("walking", 1, seconds=2.0)
+    write(tmp_path, performed(chosen, replace(walk, trans=walk.trans + np.array([0, 0, 2.0]))).text())
+    report = import_folder(tmp_path / "clip.bvh", tmp_path / "out", How(floor=NONE))
+    assert report.clips[0].faults[0].startswith("the feet stay 2.")
+    record = json.loads((tmp_path / "out" / "import.json").read_text())
+    assert record["clips"][0]["faults"] == list(report.clips[0].faults)

@@ -171,12 +171,12 @@ def test_up_axis(tmp_path: Path) -> None:
 def test_translation_is_scaled_by_the_legs(tmp_path: Path) -> None:
     sample = person("cmu_daz", 3, 0)
     sample.values[:] = 0
-    sample.values[2, :3] = [100, 20, -50]
+    sample.values[2, :3] = [10, 2, -5]
     bvh = read_bvh(write(tmp_path, sample.text()))
     legs = [np.linalg.norm(REST[child] - REST[joint]) for joint, child in ((1, 4), (4, 7))]
     source = np.linalg.norm([0, -36.8, 0.7]) + np.linalg.norm([-0.7, -45.1, -5.1])
     moved = np.diff(imported(bvh, load_skeleton("cmu_daz")).trans, axis=0)[0]
-    np.testing.assert_allclose(moved, np.array([100, 50, 20]) * sum(legs) / source, atol=1e-9)
+    np.testing.assert_allclose(moved, np.array([10, 5, 2]) * sum(legs) / source, atol=1e-9)
 
 
 def test_hip_joints_lie_where_the_scaled_source_has_them(tmp_path: Path) -> None:
