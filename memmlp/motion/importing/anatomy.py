@@ -114,7 +114,9 @@ def why_no_stance(pose: np.ndarray) -> str | None:
     for hip in HIPS:
         axis = bend(pose, hip)
         if axis is not None and axis @ (pose[HIPS[0]] - pose[HIPS[1]]) < 0:
-            return f"{JOINTS[LIMBS[hip]]} bends forward, seen from the hips: left and right may be swapped"
+            return (
+                f"{JOINTS[LIMBS[hip]]} bends forward: left and right, or the joints of the leg, may be wrong"
+            )
     return None
 
 

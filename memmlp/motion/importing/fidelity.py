@@ -41,7 +41,7 @@ LENGTHS = (0.5, 2.0)  # of a limb to the legs' length, over the same on the body
 HEAD_TURN = 90.0  # degrees between head and pelvis
 TORSO, TURN = (3, 6, 9, 12, 13, 14, 15), 60.0  # spine, neck, collars, head; degrees against the joint above
 TWIST = 45.0  # degrees by which a knee's or elbow's axis may be off the body's
-SIDES = 1.25  # left over right
+SIDES = 1.1  # left over right
 FLOOR = 0.3  # metres: how far from the floor feet may stay through a whole clip
 STRETCH = 0.02  # metres by which a segment may change its length
 
@@ -168,7 +168,9 @@ def _unlike_the_file(
     for segment in segments(mapped):
         lengths = np.linalg.norm(expected[:, segment.end] - expected[:, segment.start], axis=-1)
         if np.ptp(lengths) > STRETCH:
-            change = f"{segment.name} changes its length by {1000 * np.ptp(lengths):.0f} mm in the file"
+            frame = int(np.abs(lengths - np.median(lengths)).argmax())
+            size = f"{1000 * np.ptp(lengths):.0f} mm in the file (most in frame {frame})"
+            change = f"{segment.name} changes its length by {size}"
             yield f"{change}, which no body's does: a joint between them turns, or the map is wrong"
 
 

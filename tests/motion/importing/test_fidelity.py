@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bvh_samples import TREES, performed, person, tree, write
+from bvh_samples import TREES, own_tree, performed, person, rest_turns, tree, write
+from scipy.spatial.transform import Rotation
 
 from memmlp.motion.body import JOINTS, builtin_rest_joints
 from memmlp.motion.clip import Clip
@@ -100,3 +101,83 @@ def test_segments_that_stretch_are_said(walk: Converted) -> None:
     positions[10:, JOINT["left_wrist"]] += 0.1
     faults = compare(walk.clip, replace(walk.performance, positions=positions), REST, "cmu_daz").faults
     assert any("left_elbow to left_wrist changes its length by" in fault for fault in faults)
+
+
+# Wrong maps, units and rest poses
+
+
+def faults(folder: Path, written: SkeletonMap, chosen: SkeletonMap, **how: np.ndarray) -> tuple[str, ...]:
+    """What is said of a walk that is written by one map and read by another."""
+    file = performed(written, synthesize_clip("walking", 1, seconds=2.0), **how)
+    return converted(write(folder, file.text()), chosen).fidelity.faults
+
+
+DAZ, BANDAI = replace(load_skeleton("cmu_daz"), calibration_frame=False), load_skeleton("bandai_namco")
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"left_ankle": "lFoot.end", "left_foot": None}, "left_knee to left_ankle changes its length by"),
+        (
+            {"left_shoulder": "lCollar", "left_collar": None},
+            "left_shoulder to left_elbow is 0.33 m and the right one 0.30 m",
+        ),
+        ({"head": "abdomen", "spine1": None, "spine2": None, "neck": None}, "pelvis to head is 0."),
+    ],
+)
+def test_joints_that_stand_for_others_are_said(
+    tmp_path: Path, changes: dict[str, str | None], said: str
+) -> None:
+    joints = {joint: node for joint, node in (DAZ.joints | changes).items() if node is not None}
+    if "head" in changes:
+        joints = {joint: node for joint, node in joints.items() if "collar" not in joint}
+    told = faults(tmp_path, DAZ, replace(DAZ, joints=joints))
+    assert [fault for fault in told if said in fault], told
+
+
+def test_swapped_sides_without_toes_are_said(tmp_path: Path) -> None:
+    other = {"left": "right", "right": "left"}
+    joints = {}
+    for joint in DAZ.joints:
+        side, _, part = joint.partition("_")
+        if part != "foot":
+            joints[joint] = DAZ.joints[f"{other[side]}_{part}" if part else joint]
+    said = faults(tmp_path, DAZ, replace(DAZ, joints=joints))
+    assert any(fault.startswith("the knees bend forward in 100%") for fault in said)
+
+
+def test_a_small_unit_is_said(tmp_path: Path) -> None:
+    said = faults(tmp_path, DAZ, replace(DAZ, unit=0.0045))
+    assert said == ("the legs are 0.34 m long, so the unit may be wrong",)
+
+
+@pytest.mark.parametrize(
+    ("joint", "turn", "said"),
+    [
+        ("Head", [0.0, 0.0, 180.0], "the head is turned by 1"),
+        ("Head", [0.0, 180.0, 0.0], "head is turned by 1"),
+        ("Chest", [65.0, 0.0, 0.0], "left_collar is turned by"),
+    ],
+)
+def test_a_wrong_rest_is_said(tmp_path: Path, joint: str, turn: list[float], said: str) -> None:
+    """The map's rest with one joint turned further, about the axes of that joint."""
+    assert isinstance(BANDAI.rest, dict)
+    own = Rotation.from_euler("ZXY", BANDAI.rest[joint], degrees=True)
+    values = (own * Rotation.from_euler("ZXY", turn, degrees=True)).as_euler("ZXY", degrees=True).tolist()
+    chosen = replace(BANDAI, rest={**BANDAI.rest, joint: values})
+    turns = rest_turns(BANDAI, own_tree(BANDAI))
+    assert faults(tmp_path, BANDAI, BANDAI, turns=turns) == ()
+    assert any(said in fault for fault in faults(tmp_path, BANDAI, chosen, turns=turns))
+
+
+@pytest.mark.parametrize("degrees", [90.0, -90.0, 180.0])
+def test_palms_that_face_elsewhere_are_said(tmp_path: Path, degrees: float) -> None:
+    """A T-pose whose arms are turned about themselves, which only the axes of the elbows show."""
+    sample = own_tree(DAZ)
+    turns = np.tile(np.eye(3), (len(sample.names), 1, 1))
+    for name in ("lShldr", "lForeArm", "lHand"):
+        turns[sample.names.index(name)] = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+    said = faults(tmp_path, DAZ, DAZ, turns=turns)
+    assert len(said) == 1
+    assert said[0].startswith("left_elbow bends about an axis ")

@@ -1,0 +1,150 @@
+"""Segments, stances and how joints lie in them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from memmlp.motion.body import JOINTS, builtin_rest_joints
+from memmlp.motion.importing import anatomy
+from memmlp.motion.importing.anatomy import HINGES, LIMBS
+
+REST = builtin_rest_joints()
+ALL = np.ones(len(JOINTS), bool)
+JOINT = {name: index for index, name in enumerate(JOINTS)}
+
+
+def without(*names: str) -> np.ndarray:
+    return np.array([name not in names for name in JOINTS])
+
+
+def test_segments_go_on_past_joints_that_are_missing() -> None:
+    assert len(anatomy.segments(ALL)) == 17
+    names = [segment.name for segment in anatomy.segments(without("spine3", "neck", "left_foot"))]
+    assert "spine2 to head" in names
+    assert not [name for name in names if "left_foot" in name]
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-4, 1.0, np.pi - 1e-6])
+def test_angles_are_accurate(size: float) -> None:
+    turned = Rotation.from_rotvec([0, 0, size]).apply([1.0, 0, 0])
+    assert anatomy.angles(np.array([2.0, 0, 0]), 3 * turned) == pytest.approx(np.degrees(size), rel=1e-6)
+
+
+def test_least_rotation_turns_one_direction_onto_another() -> None:
+    random = np.random.default_rng(0)
+    a, b = anatomy.unit(random.normal(size=(2, 50, 3)))
+    turn = anatomy.least_rotation(a, b)
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", turn, a), b, atol=1e-12)
+    own = np.degrees(Rotation.from_matrix(turn).magnitude())
+    np.testing.assert_allclose(own, anatomy.angles(a, b), atol=1e-9)
+    np.testing.assert_array_equal(anatomy.least_rotation(a[:1] * 0, b[:1]), np.eye(3)[None])
+
+
+# Stances
+
+
+def turned(joint: str, axis: str, degrees: float) -> np.ndarray:
+    """The rest pose with what is below a joint turned about it."""
+    pose, index = REST.copy(), JOINT[joint]
+    below = [index]
+    for child, parent in enumerate(anatomy.PARENTS):
+        if parent in below:
+            below.append(child)
+    turn = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+    pose[below] = pose[index] + (pose[below] - pose[index]) @ turn.T
+    return pose
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180, 270])
+def test_the_rest_pose_is_a_stance_whichever_way_it_faces(degrees: float) -> None:
+    pose = REST @ Rotation.from_euler("y", degrees, degrees=True).as_matrix().T
+    assert anatomy.why_no_stance(pose) is None
+    assert anatomy.wrong_sides(pose, ALL) is None
+    np.testing.assert_allclose(pose @ anatomy.facing(pose).T, REST, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("pose", "said"),
+    [
+        (turned("pelvis", "x", 90), "pelvis to head is"),
+        (turned("spine1", "x", 120), "pelvis to head is"),
+        (turned("left_hip", "x", -90), "left_hip to left_knee is"),
+        (turned("right_knee", "x", 90), "right_knee to right_ankle is"),
+        (turned("left_knee", "x", -40), "left_knee bends forward"),
+        (REST * [1, 1, 1] + np.eye(22)[:, [1]] * [0, 0.3, 0], "the line of the hips is"),
+        (REST * 0, "at the same place"),
+    ],
+)
+def test_what_is_no_stance(pose: np.ndarray, said: str) -> None:
+    assert said in str(anatomy.why_no_stance(pose))
+
+
+def test_a_person_who_walks_is_a_stance() -> None:
+    for joint, degrees in (("left_hip", -40), ("right_knee", 50), ("spine1", 25), ("left_shoulder", 80)):
+        assert anatomy.why_no_stance(turned(joint, "x", degrees)) is None
+
+
+def test_wrong_sides() -> None:
+    swapped = REST.copy()
+    swapped[[16, 17]] = REST[[17, 16]]
+    assert "the left shoulder" in str(anatomy.wrong_sides(swapped, ALL))
+    assert "the feet point backward" in str(anatomy.wrong_sides(REST * [-1, 1, 1], ALL))
+    assert anatomy.wrong_sides(REST * [-1, 1, 1], without("left_foot", "right_foot")) is None
+
+
+def test_the_straightest_is_the_least_uneven() -> None:
+    poses = np.stack([turned("left_knee", "x", 30), REST, turned("spine1", "z", 20)])
+    assert anatomy.unevenness(poses).argmin() == 1
+
+
+# Joints in a stance
+
+
+def test_a_body_in_its_rest_pose_is_not_turned() -> None:
+    own = anatomy.orientations(REST, ALL, REST)
+    np.testing.assert_allclose(
+        own[[0, 1, 2, 4, 5, 15, 16, 17, 18, 19]], np.eye(3)[None].repeat(10, 0), atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("mapped", [ALL, without("spine3"), without("neck", "left_collar", "spine1")])
+def test_every_segment_points_as_in_the_stance(mapped: np.ndarray) -> None:
+    stance = turned("left_shoulder", "z", -60)
+    stance[JOINT["right_wrist"]] += [0.1, -0.1, 0.05]
+    stance[JOINT["left_knee"]] += [0.0, 0.02, 0.06]
+    own = anatomy.orientations(stance, mapped, REST)
+    for start, end in anatomy.segments(mapped):
+        if start > 0:
+            there = stance[end] - stance[start]
+            assert anatomy.angles(own[start] @ (REST[end] - REST[start]), there) < 1e-6
+
+
+def test_bends_and_hinges() -> None:
+    """Knees and elbows of the body bend about `HINGES`, seen in one pose or in a motion."""
+    for joint, axis in HINGES.items():
+        middle = LIMBS[joint]
+        bends = Rotation.from_rotvec(np.radians([[20.0], [50.0], [70.0]]) * axis).as_matrix()
+        positions = np.tile(REST, (3, 1, 1))
+        end = LIMBS[middle]
+        straight = REST[middle] - REST[joint]
+        positions[:, end] = positions[:, middle] + 0.3 * bends @ straight
+        upper = np.tile(np.eye(3), (3, 1, 1))
+        found = anatomy.hinge(upper, positions, joint)
+        assert found is not None
+        seen = anatomy.bend(positions[2], joint)
+        assert seen is not None
+        for own in (found, seen):
+            assert anatomy.angles(own, np.array(axis)) < 15
+        positions[:, end] = positions[:, middle] + straight
+        assert anatomy.hinge(upper, positions, joint) is None
+        assert anatomy.bend(positions[2], joint) is None
+
+
+def test_a_limb_is_turned_about_itself_to_its_hinge() -> None:
+    bone = REST[18] - REST[16]
+    wanted = anatomy.unit(np.cross(bone, [0.3, 0.2, 1.0]))
+    own = anatomy.turned_to_hinge(np.eye(3), 16, bone, wanted)
+    np.testing.assert_allclose(own @ bone, bone, atol=1e-12)
+    assert anatomy.angles(own @ np.array(HINGES[16]), wanted) < 3
