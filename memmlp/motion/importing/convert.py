@@ -13,7 +13,6 @@ from memmlp.motion.importing.floor import find_floor
 from memmlp.motion.importing.recording import Performance, Recording, perform
 from memmlp.motion.importing.retarget import fit, to_body
 from memmlp.motion.importing.skeleton import SkeletonMap
-from memmlp.motion.plausible import check_plausible
 
 AUTO, NONE = "auto", "none"  # what a floor may be beside a height
 
@@ -62,7 +61,7 @@ def convert(
         floor: `auto`, found from the feet; `none`, left as it is; or its height in the file, metres.
 
     Raises:
-        InputError: as `retarget.fit` and `recording.perform` do, and for motion that no person does.
+        InputError: as `retarget.fit` and `recording.perform` do.
     """
     settled = settle(recording, skeleton)
     performance = perform(recording, settled)
@@ -73,7 +72,6 @@ def convert(
     else:
         height = None if floor == NONE else float(floor) * fitted.scale
     clip = lowered(clip, height or 0.0)
-    check_plausible(recording.path, clip)
     return Converted(
         clip=clip,
         performance=performance,

@@ -31,6 +31,7 @@ from memmlp.motion.importing.anatomy import (
 from memmlp.motion.importing.axes import LEG
 from memmlp.motion.importing.recording import Performance
 from memmlp.motion.importing.skeleton import Z_UP
+from memmlp.motion.plausible import implausible
 
 MOST_MM, MOST_DEGREES = 1.0, 3.0  # the largest errors that an import may have
 SHORTEST = 1e-2  # metres: a shorter segment has no direction to speak of
@@ -98,6 +99,7 @@ def compare(clip: Clip, performance: Performance, rest: np.ndarray, skeleton: st
         *_odd_turns(rotations),
         *_twisted_limbs(rotations, positions),
         *_odd_lengths(expected, rest),
+        *_implausible(clip),
     )
     return replace(found, faults=faults)
 
@@ -187,6 +189,13 @@ def _unlike_people(rotations: np.ndarray, positions: np.ndarray, mapped: np.ndar
     if abs(lowest) > FLOOR:
         side = "above" if lowest > 0 else "below"
         yield f"the feet stay {abs(lowest):.2f} m {side} the floor"
+
+
+def _implausible(clip: Clip) -> Iterator[str]:
+    """Yield why preparing will skip the clip."""
+    reason = implausible(clip)
+    if reason is not None:
+        yield reason.partition("; allowed: ")[0]
 
 
 def _forward_bends(rotations: np.ndarray, positions: np.ndarray) -> float:

@@ -85,6 +85,7 @@ def test_a_joint_that_is_off_in_one_frame_is_named(walk: Converted, joint: str, 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
+        (lambda c: replace(c, fps=1000.0, trans=20 * c.trans), "the pelvis moves at"),
         (lambda c: bent(c, "head", slice(None), [0.0, np.pi, 0.0]), "the head is turned by"),
         (lambda c: replace(c, trans=c.trans + np.array([0, 0, 0.7])), "the feet stay 0."),
         (lambda c: replace(c, trans=c.trans - np.array([0, 0, 0.7])), "m below the floor"),
