@@ -31,6 +31,7 @@ from memmlp.common.errors import InputError
 )
 @click.option("--body", default="builtin", show_default=True, help="builtin, or an SMPL-H model.npz.")
 @click.option("--strict", is_flag=True, help="Stop at the first bad file instead of skipping it.")
+@click.option("--sound", is_flag=True, help="Skip clips with faults instead of writing them with a warning.")
 def import_(
     source: Path,
     out: Path,
@@ -40,6 +41,7 @@ def import_(
     take: tuple[str, ...],
     body: str,
     strict: bool,
+    sound: bool,
 ) -> None:
     """Import BVH files as AMASS npz.
 
@@ -48,7 +50,7 @@ def import_(
     """
     from memmlp.motion.importing.folder import How, import_folder
 
-    how = How(skeleton, dict(map(_rate, fps)), body, _floor(floor), take, strict)
+    how = How(skeleton, dict(map(_rate, fps)), body, _floor(floor), take, strict, sound)
     report = import_folder(source, out, how)
     for note in report.notes:
         click.echo(f"note: {note}")

@@ -39,7 +39,7 @@ TRUNK = 25.0  # degrees between pelvis to head on the body and in the file
 UPRIGHT_SHARE = 0.5  # of the frames, in which the head must be above the pelvis
 BENT, FORWARD_SHARE = 0.35, 0.3  # sine of a knee's bend that counts; share of it that may be the wrong way
 LENGTHS = (0.5, 2.0)  # of a limb to the legs' length, over the same on the body
-HEAD_TURN = 90.0  # degrees between head and pelvis
+CHEST, HEAD_TURN, HEAD_SHARE = 9, 110.0, 0.01  # degrees no neck turns up, down or aside; share of the frames
 TORSO, TURN = (3, 6, 9, 12, 13, 14, 15), 60.0  # spine, neck, collars, head; degrees against the joint above
 TWIST = 45.0  # degrees by which a knee's or elbow's axis may be off the body's
 SIDES = 1.1  # left over right
@@ -218,11 +218,12 @@ def _backward_feet(rotations: np.ndarray, positions: np.ndarray, mapped: np.ndar
 
 
 def _odd_turns(rotations: np.ndarray) -> Iterator[str]:
-    """Yield the joints of the torso that are turned, in half of the frames, as far as no body's are."""
-    turns = [angles(rotations[:, HEAD, :, axis], rotations[:, 0, :, axis]) for axis in (1, 2)]
-    turn = max(np.median(angle) for angle in turns)
-    if turn > HEAD_TURN:
-        yield f"the head is turned by {turn:.0f} degrees against the pelvis in half of the frames"
+    """Yield the joints of the torso that are turned as far as no body's are."""
+    turns = [angles(rotations[:, HEAD, :, axis], rotations[:, CHEST, :, axis]) for axis in (1, 2)]
+    odd = np.max(turns, axis=0) > HEAD_TURN
+    if odd.mean() > HEAD_SHARE:
+        turned = f"the head is turned by more than {HEAD_TURN:.0f} degrees against the chest"
+        yield f"{turned} in {odd.mean():.0%} of the frames, first in frame {odd.argmax()}"
     for joint in TORSO:
         own = rotations[:, PARENTS[joint]].swapaxes(-1, -2) @ rotations[:, joint]
         turn = np.degrees(np.median(Rotation.from_matrix(own).magnitude()))

@@ -94,6 +94,7 @@ class How:
         takes: patterns (regular expressions); clips that match one alike were recorded at once, and have one
             floor.
         strict: whether a bad file raises; otherwise it is skipped and reported.
+        sound: whether a clip with faults is skipped, too; otherwise it is written and its faults are told.
     """
 
     skeleton: str | None = None
@@ -102,6 +103,7 @@ class How:
     floor: str | float = AUTO
     takes: Sequence[str] = ()
     strict: bool = False
+    sound: bool = False
 
 
 def import_folder(source: Path, out: Path, how: How | None = None) -> ImportReport:
@@ -134,8 +136,7 @@ def import_folder(source: Path, out: Path, how: How | None = None) -> ImportRepo
             except InputError as error:
                 if how.strict or len(files) == 1:
                     raise
-                source_name = relative.as_posix()
-                skipped.append(Skipped(source_name, str(error).replace(str(path), source_name)))
+                skipped.append(Skipped(relative.as_posix(), str(error).removeprefix(f"{path}: ")))
         if not clips:
             raise InputError(f"{source}: no usable BVH file of {len(files)}; the first: {skipped[0].reason}")
         clips = _one_floor_a_take(clips, takes, Path(staging))
@@ -209,6 +210,10 @@ def _import_file(
     rate = true_rate(recording.fps, relative, sha256, top, how.fps)
     name = relative.with_suffix("").as_posix()
     converted = convert(recording, skeleton, rest, name=name, fps=rate.fps, floor=how.floor)
+    if how.sound and converted.fidelity.faults:
+        raise InputError(
+            f"{recording.path}: {'; '.join(converted.fidelity.faults)}; allowed: no faults (--sound)"
+        )
     write_clip(folder / _npz(relative), converted.clip)
     return Imported(
         source=relative.as_posix(),

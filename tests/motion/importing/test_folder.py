@@ -138,7 +138,7 @@ def test_bad_files_are_skipped(source: Path, tmp_path: Path) -> None:
     write(source, "HIERARCHY", "salsa/01.bvh")
     report = import_folder(source, tmp_path / "out")
     assert [skipped.file for skipped in report.skipped] == ["salsa/01.bvh"]
-    assert report.skipped[0].reason.startswith("salsa/01.bvh: no MOTION")
+    assert report.skipped[0].reason.startswith("no MOTION")
     assert list(rates(tmp_path / "out")) == ["indian/01.npz", "salsa/02.npz", "top.npz"]
     assert str(tmp_path) not in (tmp_path / "out" / "import.json").read_text()
 
@@ -281,3 +281,15 @@ def test_faults_are_kept_in_the_record(tmp_path: Path) -> None:
     assert report.clips[0].faults[0].startswith("the feet stay 2.")
     record = json.loads((tmp_path / "out" / "import.json").read_text())
     assert record["clips"][0]["faults"] == list(report.clips[0].faults)
+
+
+def test_clips_with_faults_are_left_out_where_only_sound_ones_are_wanted(tmp_path: Path) -> None:
+    chosen, walk = load_skeleton("cmu_daz"), synthesize_clip("walking", 1, seconds=2.0)
+    write(tmp_path / "in", performed(chosen, walk).text(), "sound.bvh")
+    hanging = replace(walk, trans=walk.trans + np.array([0, 0, 2.0]))
+    write(tmp_path / "in", performed(chosen, hanging).text(), "hanging.bvh")
+    report = import_folder(tmp_path / "in", tmp_path / "out", How(floor=NONE, sound=True))
+    assert [clip.clip for clip in report.clips] == ["sound.npz"]
+    assert report.skipped[0].file == "hanging.bvh"
+    assert "the feet stay 2." in report.skipped[0].reason
+    assert not (tmp_path / "out" / "hanging.npz").exists()
