@@ -88,3 +88,16 @@ def test_someone_who_hardly_moves_in_centimetres_is_refused():
     clip = motion("idling")
     still = replace(clip, trans=clip.trans[0] + 0.05 * (clip.trans - clip.trans[0]))
     assert "at z = " in implausible(replace(still, trans=100 * still.trans))
+
+
+def test_who_lies_long_and_then_stands_passes():
+    """Lying alone would look like standing along Y here: the feet are at y = 0."""
+    clip = motion("idling")
+    long = lying(clip)
+    long = moved(long, y=0.95 - np.median(long.trans[:, 1]))
+    assert "Y is up" in implausible(long)
+    cut = len(clip) * 7 // 10
+    poses, trans = (
+        np.concatenate([getattr(long, part)[:cut], getattr(clip, part)[cut:]]) for part in ("poses", "trans")
+    )
+    assert implausible(replace(clip, poses=poses, trans=trans)) is None
