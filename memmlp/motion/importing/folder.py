@@ -138,7 +138,8 @@ def import_folder(source: Path, out: Path, how: How | None = None) -> ImportRepo
                     raise
                 skipped.append(Skipped(relative.as_posix(), str(error).removeprefix(f"{path}: ")))
         if not clips:
-            raise InputError(f"{source}: no usable BVH file of {len(files)}; the first: {skipped[0].reason}")
+            first = f"the first: {skipped[0].file}: {skipped[0].reason}"
+            raise InputError(f"{source}: no usable BVH file of {len(files)}; {first}")
         clips = _one_floor_a_take(clips, takes, Path(staging))
         report = ImportReport(tuple(clips), tuple(_notes(clips, maps, how)), tuple(skipped))
         _publish(Path(staging), out, report, Path(how.body).name)
