@@ -59,6 +59,21 @@ def test_a_zero_pose_that_lies_does_not_serve(tmp_path: Path, walk: Clip, axis: 
     assert not rest.straight
 
 
+def test_a_runner_whose_feet_point_back_is_no_stance(tmp_path: Path, walk: Clip) -> None:
+    """The next straightest frame serves."""
+    turns = random_turns(own_tree(DAZ), 1)
+    first = found(tmp_path, walk, DAZ, turns=turns)
+    bvh = read_bvh(tmp_path / "clip.bvh")
+    performance = perform(bvh, DAZ)
+    frame = int(first.source.split()[1].rstrip(","))
+    for ankle, toes in ((7, 10), (8, 11)):
+        foot = performance.positions[frame, toes] - performance.positions[frame, ankle]
+        performance.positions[frame, toes] -= 2 * foot * [1, 0, 1]
+    other = find_rest_pose(bvh, DAZ, performance)
+    assert other.source.endswith("the straightest")
+    assert other.source != first.source
+
+
 def test_a_given_frame(tmp_path: Path, walk: Clip) -> None:
     rest = found(tmp_path, walk, replace(DAZ, rest=7))
     assert rest.source == "frame 7, given"

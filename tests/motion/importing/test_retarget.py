@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from bvh_samples import FOLDED, TREES, Sample, performed, person, read, refuse, tree, write
+from bvh_samples import FOLDED, POSITIONS, TREES, Sample, performed, person, read, refuse, tree, write
 from scipy.spatial.transform import Rotation
 
 from memmlp.motion.body import JOINTS, builtin_rest_joints
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh import END, Bvh, read_bvh
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
-from memmlp.motion.importing.anatomy import LIMBS
+from memmlp.motion.importing.anatomy import segments
 from memmlp.motion.importing.convert import NONE, convert
 from memmlp.motion.importing.recording import perform
 from memmlp.motion.importing.retarget import Retargeting, fit
@@ -56,13 +56,17 @@ def to_z_up(vectors: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("skeleton", TREES)
-def test_limbs_point_as_in_the_file(tmp_path: Path, skeleton: str) -> None:
+def test_segments_point_as_in_the_file(tmp_path: Path, skeleton: str) -> None:
     """Exactly, and though the unmapped joints between mapped ones turn too."""
     bvh, chosen = read(tmp_path, skeleton, folded=True), load_skeleton(skeleton)
     positions = to_z_up(bvh.kinematics()[1])[1:]
     body = on_body(imported(bvh, chosen))[1]
-    for joint, child in LIMBS.items():
+    mapped = np.array([name in chosen.joints for name in JOINTS])
+    pairs = [segment for segment in segments(mapped) if segment.start > 0]
+    for joint, child in (*pairs, (JOINT["right_hip"], JOINT["left_hip"])):
         start, end = (bvh.nodes.index(chosen.joints[JOINTS[index]]) for index in (joint, child))
+        if np.linalg.norm(bvh.zero_pose()[end] - bvh.zero_pose()[start]) < 1e-6:
+            continue
         expected = unit(positions[:, end] - positions[:, start])
         np.testing.assert_allclose(unit(body[:, child] - body[:, joint]), expected, atol=1e-9)
 
@@ -177,6 +181,23 @@ def test_translation_is_scaled_by_the_legs(tmp_path: Path) -> None:
     source = np.linalg.norm([0, -36.8, 0.7]) + np.linalg.norm([-0.7, -45.1, -5.1])
     moved = np.diff(imported(bvh, load_skeleton("cmu_daz")).trans, axis=0)[0]
     np.testing.assert_allclose(moved, np.array([10, 5, 2]) * sum(legs) / source, atol=1e-9)
+
+
+def test_lengths_are_those_of_the_motion(tmp_path: Path) -> None:
+    """Where every joint has position channels, they count, and no OFFSET does."""
+    chosen = replace(load_skeleton("cmu_daz"), calibration_frame=False)
+    sample = performed(chosen, synthesize_clip("walking", 1, seconds=0.5))
+    expected = imported(read_bvh(write(tmp_path, sample.text())), chosen)
+    frames, column = len(sample.values), sum(map(len, sample.channels))
+    wide = replace(sample, channels=list(sample.channels), values=sample.values.copy())
+    for joint in range(len(sample.names) - 1, 0, -1):
+        column -= len(sample.channels[joint])
+        places = np.tile(sample.offsets[joint], (frames, 1))
+        wide.values = np.insert(wide.values, [column] * 3, places, axis=1)
+        wide.channels[joint] = (*POSITIONS, *sample.channels[joint])
+    wide.offsets = (10 * np.array(sample.offsets)).tolist()
+    found = imported(read_bvh(write(tmp_path, wide.text())), chosen)
+    np.testing.assert_allclose(found.trans, expected.trans, atol=1e-3)
 
 
 def test_hip_joints_lie_where_the_scaled_source_has_them(tmp_path: Path) -> None:
