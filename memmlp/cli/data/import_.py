@@ -43,7 +43,7 @@ def import_(
     strict: bool,
     sound: bool,
 ) -> None:
-    """Import BVH files as AMASS npz.
+    """Import BVH files, or exponential maps of the CMU layout (.txt), as AMASS npz.
 
     SOURCE is a folder or one file. The clips are brought to the 22-joint tree, and each is compared with its
     file; what looks wrong is said.

@@ -390,21 +390,3 @@ def _values(path: Path, number: int, line: bytes, width: int) -> np.ndarray:
         wrong = next((text for text in texts if not abs(_number(text)) <= LIMIT), texts[0])
         _fail(path, number, _show(wrong), f"numbers up to {LIMIT:g} in size")
     return values
-
-
-def find_bvh(source: Path) -> dict[Path, Path]:
-    """Find the BVH files of a folder, or a single one: sorted, by their path below the folder.
-
-    Raises:
-        InputError: if there is none.
-    """
-    if not source.exists():
-        raise InputError(f"{source}: no such file or folder; allowed: BVH files")
-    top = source if source.is_dir() else source.parent
-    paths = sorted(source.rglob("*")) if source.is_dir() else [source]
-    files = {
-        path.relative_to(top): path for path in paths if path.suffix.lower() == ".bvh" and path.is_file()
-    }
-    if not files:
-        raise InputError(f"{source}: no BVH file found; allowed: a .bvh file, or a folder with some in it")
-    return files

@@ -18,10 +18,10 @@ from memmlp.common.errors import InputError
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import load_rest_joints
 from memmlp.motion.clip import FRAME_RATE_RANGE, Skipped
-from memmlp.motion.formats.bvh import find_bvh, read_bvh
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.importing.convert import AUTO, convert, lowered
-from memmlp.motion.importing.rates import folder_key, true_rate
+from memmlp.motion.importing.files import find_recordings, read_recording, tells_rate
+from memmlp.motion.importing.rates import HEADER, SIDECAR, folder_key, true_rate
 from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.rest_pose import STRAIGHTEST
 from memmlp.motion.importing.skeleton import SkeletonMap, find_skeleton, is_number, load_skeleton
@@ -119,7 +119,7 @@ def import_folder(source: Path, out: Path, how: How | None = None) -> ImportRepo
             folder, clips of another import in `out`, or no file that could be imported; also if `out` cannot
             be written.
     """
-    how, files = how or How(), find_bvh(source)
+    how, files = how or How(), find_recordings(source)
     _check_import(files, out, how)
     rest, clips, skipped = load_rest_joints(how.body), [], []
     chosen = None if how.skeleton is None else load_skeleton(how.skeleton)
@@ -129,7 +129,7 @@ def import_folder(source: Path, out: Path, how: How | None = None) -> ImportRepo
     with _staging(out) as staging:
         for relative, path in progress_bar(files.items(), "import", len(files)):
             try:
-                recording = read_bvh(path)
+                recording = read_recording(path)
                 skeleton = chosen or find_skeleton(recording)
                 clips.append(_import_file(recording, relative, Path(staging), skeleton, how, rest, source))
                 maps[skeleton.name] = skeleton
@@ -139,7 +139,7 @@ def import_folder(source: Path, out: Path, how: How | None = None) -> ImportRepo
                 skipped.append(Skipped(relative.as_posix(), str(error).removeprefix(f"{path}: ")))
         if not clips:
             first = f"the first: {skipped[0].file}: {skipped[0].reason}"
-            raise InputError(f"{source}: no usable BVH file of {len(files)}; {first}")
+            raise InputError(f"{source}: no usable file of {len(files)}; {first}")
         clips = _one_floor_a_take(clips, takes, Path(staging))
         report = ImportReport(tuple(clips), tuple(_notes(clips, maps, how)), tuple(skipped))
         _publish(Path(staging), out, report, Path(how.body).name)
@@ -209,6 +209,9 @@ def _import_file(
     sha256 = hashlib.sha256(recording.path.read_bytes()).hexdigest()
     top = source if source.is_dir() else source.parent
     rate = true_rate(recording.fps, relative, sha256, top, how.fps)
+    if rate.reason == HEADER and not tells_rate(recording.path):
+        allowed = f"--fps HZ, {recording.fps:g} for the published files, or {SIDECAR}"
+        raise InputError(f"{recording.path}: this format tells no frame rate; allowed: {allowed}")
     name = relative.with_suffix("").as_posix()
     converted = convert(recording, skeleton, rest, name=name, fps=rate.fps, floor=how.floor)
     if how.sound and converted.fidelity.faults:

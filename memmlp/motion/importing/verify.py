@@ -10,10 +10,10 @@ from pathlib import Path
 from memmlp.common.errors import InputError
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import load_rest_joints
-from memmlp.motion.formats.bvh import find_bvh, read_bvh
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.importing.convert import AUTO, convert
 from memmlp.motion.importing.fidelity import Fidelity, compare
+from memmlp.motion.importing.files import find_recordings, read_recording
 from memmlp.motion.importing.skeleton import find_skeleton, load_skeleton
 
 
@@ -50,7 +50,7 @@ def verify(
     Raises:
         InputError: if the file is damaged or fits no map.
     """
-    recording, rest = read_bvh(path), load_rest_joints(body)
+    recording, rest = read_recording(path), load_rest_joints(body)
     chosen = load_skeleton(skeleton) if skeleton else find_skeleton(recording)
     converted = convert(recording, chosen, rest, name=name or path.name, floor=floor)
     with tempfile.TemporaryDirectory() as folder:
@@ -62,12 +62,12 @@ def verify(
 def verify_folder(
     source: Path, *, skeleton: str | None = None, body: str = "builtin", floor: str | float = AUTO
 ) -> Iterator[Fidelity | Unusable]:
-    """Verify each BVH file of a folder, or a single one.
+    """Verify each file of a folder, or a single one.
 
     Raises:
         InputError: if there is no file, or no such skeleton or body.
     """
-    files = find_bvh(source)
+    files = find_recordings(source)
     load_rest_joints(body)
     if skeleton is not None:
         load_skeleton(skeleton)

@@ -167,7 +167,7 @@ def test_nothing_to_import_is_refused(tmp_path: Path) -> None:
             import_folder(source, tmp_path / "out")
     for name in ("a", "b"):
         write(tmp_path / "bad", "HIERARCHY", f"{name}.bvh")
-    with pytest.raises(InputError, match=r"no usable BVH file of 2; the first: a\.bvh"):
+    with pytest.raises(InputError, match=r"no usable file of 2; the first: a\.bvh"):
         import_folder(tmp_path / "bad", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
