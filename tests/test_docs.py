@@ -39,6 +39,7 @@ def ids(lines: list[Line]) -> list[str]:
     return [f"{line.page}:{line.number}" for line in lines]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", LINES, ids=ids(LINES))
 def test_a_command_line_is_taken(line: Line, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
@@ -67,12 +68,14 @@ def checks(text: str) -> None:
         assert program in ("git", "cd", "source") or words[:2] == ["pip", "install"], text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", MENTIONS, ids=ids(MENTIONS))
 def test_a_command_in_a_sentence_is_one(line: Line, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     takes(line.text, whole=False)
 
 
+@pytest.mark.slow
 def test_what_is_wrong_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The checks above can fail: an option, a key, a value, a command, an arm, a target that are none."""
     monkeypatch.chdir(tmp_path)
@@ -144,6 +147,7 @@ def reference(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("reference")
 
 
+@pytest.mark.slow
 def test_the_reference_has_every_key(reference: ModuleType):
     page = reference.config_page()
     memories = [f"memory={path.stem}" for path in sorted((ROOT / "conf/memory").glob("*.yaml"))]
@@ -180,6 +184,7 @@ def test_the_component_of_the_guide_works(tmp_path: Path, monkeypatch: pytest.Mo
     assert type(loss.hand).__name__ == "FeetPosition"
 
 
+@pytest.mark.slow
 def test_the_sweep_of_the_guide_loads(tmp_path: Path):
     path = tmp_path / "mine.yaml"
     path.write_text(examples("sweeps", "yaml")[0])

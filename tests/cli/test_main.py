@@ -160,6 +160,7 @@ def test_cfg_job_prints_the_config(memmlp: Memmlp, jobs: list[DictConfig]):
     assert jobs == []
 
 
+@pytest.mark.slow
 def test_help_says_what_can_be_chosen(memmlp: Memmlp):
     assert "memory: gru, lstm, no_codes, none, vq, vq_joint" in memmlp("train", "--help").out
 

@@ -173,6 +173,7 @@ def test_the_same_arm_again_is_no_different(home):
     assert differences(trained(overrides), train_and_stream(composed(overrides))) == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", BUILT)
 def test_every_value_builds_streams_and_changes_the_network(axis):
     """Its weights' shapes, or else what it makes of a clip with the same random weights."""

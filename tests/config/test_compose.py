@@ -44,6 +44,7 @@ def test_every_option_composes_and_passes(option: str, needed: dict[str, list[st
     assert isinstance(composed([option, *needed.get(option, [])]), DictConfig)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("profile", GROUPS["profile"])
 @pytest.mark.parametrize("memory", GROUPS["memory"])
 def test_a_profiles_sizes_reach_every_group(profile: str, memory: str):
@@ -256,6 +257,7 @@ def test_a_bad_command_line_is_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments", [["model.width=abc"], ["-m", "seed=0,-1"], ["+typo=1"], ["a b"], ["--nope"]]
 )

@@ -44,6 +44,7 @@ def solve(motion: Tensor, iterations: int = 15) -> Tensor:
     return LBFGS(iterations).solutions(NORMALIZER, motion, SPARSE[: len(motion)])["combined"]
 
 
+@pytest.mark.slow
 def test_reachable_targets_are_reached():
     motion = perturbed(0.1)
     assert float(distance(motion).mean()) > 30

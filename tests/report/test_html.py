@@ -232,6 +232,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("memmlp.config.plan_sweep.planned", plan)
 
 
+@pytest.mark.slow
 def test_command_writes_the_page(memmlp: Memmlp, planned: None):
     ran = memmlp("report", "5", "table06", "data=mocap", "--out", "here/page.html")
     assert (ran.code, ran.out) == (0, "here/page.html\n")

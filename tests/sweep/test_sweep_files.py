@@ -198,6 +198,7 @@ def test_the_backbone_is_agrols_mlp_of_ten_blocks():
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arm", DECOMPOSITION.arms, ids=lambda arm: arm.label)
 def test_an_arm_of_the_decomposition_trains(arm: Arm):
     """A step of each arm changes the weights, under the loss that its label names."""

@@ -200,6 +200,7 @@ def test_a_run_that_kills_its_workers_fails_at_last(tmp_path: Path):
     assert run.status == "done"
 
 
+@pytest.mark.slow
 def test_many_workers_perform_each_task_exactly_once(tmp_path: Path):
     tasks = [RunTask(f"{n:016x}", "memmlp", {}, CODES.id if n % 2 else None) for n in range(12)]
     path = saved(tmp_path, CODES, *tasks)
