@@ -13,6 +13,7 @@ import command_line
 import processes
 import pytest
 from filelock import FileLock
+from hypothesis import HealthCheck, settings
 from remembered import remember
 
 
@@ -43,6 +44,12 @@ class Ran(NamedTuple):
 
 
 processes.mark()
+
+# The same examples each time, and no complaint that a busy machine is slow.
+settings.register_profile(
+    "memmlp", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("memmlp")
 
 # Networks are tiny and test processes many: more threads only wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -172,7 +172,7 @@ VALUES = st.recursive(
 )
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=300)
 @given(st.dictionaries(KEYS, VALUES, max_size=6))
 def test_whatever_stands_in_it_is_a_sweep_or_one_line(content):
     try:
