@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
+from memmlp.common.errors import InputError
+from memmlp.motion.body import load_rest_joints
+from memmlp.motion.clip import Skipped
+from memmlp.motion.formats.npz import read_clip
+from memmlp.motion.importing.fidelity import pose
+from memmlp.motion.preparing.find import clip_name, find_clips
 from memmlp.render.raster import Camera, draw
 from memmlp.render.sheet import Sheet
 
@@ -13,6 +20,36 @@ WIDTH, HEIGHT, LABEL, COLUMNS = 150, 220, 26, 12  # pixels; panels a row
 SCALE = 100.0  # pixels a metre
 LENS = 1.0  # metres above the floor that the camera looks at
 ASKEW = np.deg2rad(35)  # the camera stands beside the person's front
+
+
+def some_clips(
+    source: Path, count: int, body: str = "builtin"
+) -> tuple[list[tuple[str, np.ndarray]], list[Skipped], int]:
+    """Read a clip, or so many of a folder's npz files, evenly spread in the order of their names.
+
+    Returns:
+        Name and global joint positions (N, 22, 3), metres, world, of each clip; the files of these that hold
+        none; and how many files there are.
+
+    Raises:
+        InputError: if there are no npz files, or no clip in those that were read.
+    """
+    rest = load_rest_joints(body)
+    files = find_clips(source).files if source.is_dir() else [source.name]
+    top = source if source.is_dir() else source.parent
+    clips, skipped = [], []
+    for index in np.unique(np.linspace(0, len(files) - 1, min(count, len(files))).round().astype(int)):
+        file = files[index]
+        try:
+            clip = read_clip(top / file, clip_name(file))
+        except InputError as error:
+            skipped.append(Skipped(file, str(error).removeprefix(f"{top / file}: ")))
+        else:
+            clips.append((clip.name, pose(clip, rest)[1]))
+    if not clips:
+        first = f"{skipped[0].file}: {skipped[0].reason}"
+        raise InputError(f"{source}: no clip in {len(skipped)} files, the first: {first}")
+    return clips, skipped, len(files)
 
 
 def clip_sheet(clips: Sequence[tuple[str, np.ndarray]], moments: int = 3) -> np.ndarray:

@@ -12,13 +12,13 @@ from memmlp.render.take import Take
 SUFFIXES = (".png", ".gif", ".mp4")
 
 
-def check_picture(path: Path, key: str = "path") -> None:
+def check_picture(path: Path, key: str = "path", suffixes: tuple[str, ...] = SUFFIXES) -> None:
     """Raise InputError for what is wrong with a picture's file before any of it is made.
 
-    key: what the path was given as.
+    key: what the path was given as. suffixes: of the kinds of picture that can be made.
     """
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{key} {path}: no such kind of picture; allowed are {', '.join(SUFFIXES)}")
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"{key} {path}: no such kind of picture; allowed are {', '.join(suffixes)}")
     if not path.parent.is_dir():
         raise InputError(f"{key} {path}: there is no folder {path.parent}")
     if path.suffix.lower() == ".mp4":

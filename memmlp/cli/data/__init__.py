@@ -8,14 +8,16 @@ from memmlp.cli.data.export import export
 from memmlp.cli.data.import_ import import_
 from memmlp.cli.data.inspect import inspect
 from memmlp.cli.data.prepare import prepare
+from memmlp.cli.data.sheet import show
+from memmlp.cli.data.skeleton import skeleton
 from memmlp.cli.data.synth import synth
 from memmlp.cli.data.verify import verify
 
 
 @click.group("data")
 def data() -> None:
-    """Make, import, prepare, inspect and export motion data."""
+    """Make, import, look at, prepare and export motion data."""
 
 
-for command in (synth, import_, verify, prepare, inspect, export):
+for command in (synth, import_, skeleton, verify, show, prepare, inspect, export):
     data.add_command(command)

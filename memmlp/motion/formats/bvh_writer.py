@@ -1,6 +1,7 @@
 """Writes clips as BVH: 22 joints and their end sites, centimetres, Y up, the body's T-pose as zero pose.
 
-`importing/skeletons/memmlp.yaml` is the joint map with which `memmlp data import` reads such a file again.
+`memmlp data import` knows the joints (`importing/skeletons/smpl_words.yaml`); `memmlp.yaml` there tells the
+axes as well, for clips in which nobody stands up.
 """
 
 from __future__ import annotations

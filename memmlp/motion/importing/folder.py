@@ -130,7 +130,7 @@ def import_folder(source: Path, out: Path, how: How | None = None) -> ImportRepo
         for relative, path in progress_bar(files.items(), "import", len(files)):
             try:
                 recording = read_recording(path)
-                skeleton = chosen or find_skeleton(recording)
+                skeleton = find_skeleton(recording, chosen)
                 clips.append(_import_file(recording, relative, Path(staging), skeleton, how, rest, source))
                 maps[skeleton.name] = skeleton
             except InputError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ import yaml
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS
+from memmlp.motion.importing.names import find_nodes
 
 if TYPE_CHECKING:
     from memmlp.motion.importing.recording import Recording
@@ -79,16 +80,23 @@ def load_skeleton(which: str) -> SkeletonMap:
     return _parsed(path, content)
 
 
-def find_skeleton(recording: Recording) -> SkeletonMap:
+def find_skeleton(recording: Recording, chosen: SkeletonMap | None = None) -> SkeletonMap:
     """Find the shipped map all of whose nodes the file has; of several, the one with the most nodes.
+
+    Of as many nodes, the one that presumes less: that finds unit and up axis in the file.
+
+    Spellings and namespaces may differ (`names.find_nodes`); the map has the file's own. A map that was
+    chosen by a person is returned spelt like that, and as it is where the file lacks some of its nodes.
 
     Raises:
         InputError: if there is none, or none has more than all others.
     """
+    if chosen is not None:
+        return spelt_as_in(chosen, recording) or chosen
     maps = [load_skeleton(name) for name in shipped_skeletons()]
-    fitting = [skeleton for skeleton in maps if set(skeleton.joints.values()) <= set(recording.nodes)]
-    most = max((len(skeleton.joints) for skeleton in fitting), default=0)
-    fitting = [skeleton for skeleton in fitting if len(skeleton.joints) == most]
+    fitting = [fitted for skeleton in maps if (fitted := spelt_as_in(skeleton, recording)) is not None]
+    best = max(map(_rank, fitting), default=(0, 0))
+    fitting = [skeleton for skeleton in fitting if _rank(skeleton) == best]
     if len(fitting) == 1:
         return fitting[0]
     state = "fits more than one skeleton" if fitting else "has an unknown skeleton"
@@ -98,6 +106,25 @@ def find_skeleton(recording: Recording) -> SkeletonMap:
     raise InputError(
         f"{recording.path}: {state} with the joints {listed}; allowed: {known}, or a map by skeleton="
     )
+
+
+def _rank(skeleton: SkeletonMap) -> tuple[int, int]:
+    """Return how good a map is among those that fit a file."""
+    return len(skeleton.joints), (skeleton.unit, skeleton.up).count(None)
+
+
+def spelt_as_in(skeleton: SkeletonMap, recording: Recording) -> SkeletonMap | None:
+    """Return a map with its nodes spelt as in the file, with the namespace that they have there.
+
+    None if the file lacks one of them.
+    """
+    told = skeleton.rest if isinstance(skeleton.rest, dict) else {}
+    nodes = find_nodes(recording.nodes, sorted({*skeleton.joints.values(), *told}))
+    if nodes is None:
+        return None
+    joints = {joint: nodes[node] for joint, node in skeleton.joints.items()}
+    rest = {nodes[node]: turns for node, turns in told.items()} or skeleton.rest
+    return replace(skeleton, joints=joints, rest=rest)
 
 
 class _StrictLoader(yaml.SafeLoader):

@@ -51,7 +51,7 @@ def verify(
         InputError: if the file is damaged or fits no map.
     """
     recording, rest = read_recording(path), load_rest_joints(body)
-    chosen = load_skeleton(skeleton) if skeleton else find_skeleton(recording)
+    chosen = find_skeleton(recording, load_skeleton(skeleton) if skeleton else None)
     converted = convert(recording, chosen, rest, name=name or path.name, floor=floor)
     with tempfile.TemporaryDirectory() as folder:
         write_clip(Path(folder) / "clip.npz", converted.clip)

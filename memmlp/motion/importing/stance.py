@@ -1,0 +1,83 @@
+"""The stance from which a file's skeleton is read, with all of its nodes, and the body as it stands alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from memmlp.motion.body import JOINTS, PARENTS
+from memmlp.motion.importing import anatomy
+from memmlp.motion.importing.axes import settle
+from memmlp.motion.importing.recording import Performance, Recording, perform
+from memmlp.motion.importing.rest_pose import RestPose, find_rest_pose
+from memmlp.motion.importing.retarget import fit
+from memmlp.motion.importing.skeleton import SkeletonMap
+
+
+@dataclass(frozen=True)
+class Stance:
+    """A person who stands and faces +Z, Y up, left on +X, in metres; the root's place is that of the file.
+
+    Attributes:
+        nodes: the nodes' names; parents: the index of each node's parent, -1 for the root.
+        positions: the nodes' positions (nodes, 3).
+        mapped: body joint -> index of its node.
+        body: the body's joints (22, 3) as it stands alike, the pelvis at the origin.
+        source: what pose it is, in words.
+    """
+
+    nodes: tuple[str, ...]
+    parents: tuple[int, ...]
+    positions: np.ndarray
+    mapped: dict[str, int]
+    body: np.ndarray
+    source: str
+
+
+def find_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -> Stance:
+    """Return the stance that `import` reads a file's skeleton from.
+
+    Args:
+        recording: the file's motion.
+        skeleton: its map, with the nodes spelt as in the file.
+        rest: the body's rest joints (22, 3), metres.
+
+    Raises:
+        InputError: as importing does: where no person stands in the file, or the map does not fit it.
+    """
+    settled = settle(recording, skeleton)
+    performance = perform(recording, settled)
+    pose = find_rest_pose(recording, settled, performance)
+    turned = pose.rotations @ fit(recording, settled, performance, rest).corrections
+    mapped = {joint: int(performance.nodes[JOINTS.index(joint)]) for joint in skeleton.joints}
+    positions = _all_nodes(recording, settled, performance, pose)
+    return Stance(
+        recording.nodes, recording.node_parents, positions, mapped, _posed(turned, rest), pose.source
+    )
+
+
+def _all_nodes(
+    recording: Recording, skeleton: SkeletonMap, performance: Performance, pose: RestPose
+) -> np.ndarray:
+    """Return the positions (nodes, 3) of all nodes in the pose of which the mapped ones are known.
+
+    It is the one of the zero pose, the map's and the frames in which these are as high.
+    """
+    given = skeleton.rest if isinstance(skeleton.rest, dict) else {}
+    frames = recording.kinematics()[1][int(skeleton.calibration_frame) :]
+    assert skeleton.unit is not None
+    poses = np.concatenate([recording.zero_pose()[None], recording.posed(given)[1][None], frames])
+    poses = skeleton.unit * poses @ skeleton.upright.T
+    off = np.abs(poses[:, performance.nodes, 1] - pose.positions[:, 1]).max(1)
+    best = poses[off.argmin()]
+    return best @ anatomy.facing(best[performance.nodes]).T
+
+
+def _posed(rotations: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Return the joints (22, 3) of a body whose joints have these global rotations (22, 3, 3)."""
+    positions = np.zeros_like(rest)
+    for joint, parent in enumerate(PARENTS):
+        if joint:
+            positions[joint] = positions[parent] + rotations[parent] @ (rest[joint] - rest[parent])
+    return positions

@@ -1,0 +1,141 @@
+"""A skeleton's map as a picture: the stance from which a file is read with the mapped nodes, and the body."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.lines import Line2D
+
+from memmlp.common.files import atomic_write
+from memmlp.motion.importing.names import without_namespace
+from memmlp.motion.importing.skeleton import Z_UP
+from memmlp.motion.importing.stance import Stance
+from memmlp.motion.limbs import RADII
+from memmlp.render.raster import Camera, draw
+from memmlp.render.sheet import DPI, FAINT, INK, Sheet, png
+
+HEIGHT, TOP, BOTTOM = 700, 90, 50  # pixels
+NAMES, FRONT, SIDE = 250, 480, 230  # widths of a column of names, of a front view, of a side view
+WIDTH = 3 * NAMES + 2 * (FRONT + SIDE)
+TALL, WIDE = 1.95, 1.9  # metres that a view covers at least; larger people are drawn smaller
+SPACING = 21  # pixels from a name to the next
+LEFT, RIGHT, MIDDLE, BARE = "#1f6fd0", "#d0561f", "#2a8c4a", "#b4bac1"
+
+
+def skeleton_png(path: Path, stance: Stance, title: str) -> None:
+    """Write a PNG of a stance: the file's nodes from the front and from the right, and the body likewise.
+
+    All nodes are grey; those that stand for a body joint are coloured and named `body joint = node`.
+    """
+    sheet = Sheet(WIDTH, HEIGHT)
+    sheet.text(24, 28, title, 20, ha="left", weight="bold")
+    sheet.text(24, 58, f"read from {stance.source}", 15, ha="left", color=FAINT)
+    mapped = stance.positions[list(stance.mapped.values())]
+    positions, scale = stance.positions - (mapped.min(0) + mapped.max(0)) / 2, _scale(mapped)
+    front, side = NAMES + FRONT / 2, 2 * NAMES + FRONT + SIDE / 2 - 60
+    places = _place(positions, front, 0, scale), _place(positions, side, 2, scale)
+    for place, middle, width in zip(places, (front, side), (FRONT, SIDE), strict=True):
+        _bones(sheet, stance, place, np.abs(place[:, 0] - middle) < width / 2 + 20)
+    _names(sheet, stance, places[0], "right_", NAMES - 8, "right")
+    _names(sheet, stance, places[0], "left_", NAMES + FRONT + 8, "left")
+    _names(sheet, stance, places[1], "", side + SIDE / 2 + 20, "left")
+    _body(sheet, stance)
+    _legend(sheet, front, side)
+    atomic_write(path, png(sheet.pixels()))
+
+
+def _scale(positions: np.ndarray) -> float:
+    """Return the pixels a metre at which these points (n, 3) are in view."""
+    size = np.ptp(positions, axis=0)
+    room = HEIGHT - TOP - BOTTOM
+    return float(min(room / max(size[1], TALL), FRONT / max(size[0], WIDE)))
+
+
+def _place(positions: np.ndarray, middle: float, axis: int, scale: float) -> np.ndarray:
+    """Return where points (nodes, 3) are in the picture (nodes, 2), the axis to the right."""
+    height = TOP + (HEIGHT - TOP - BOTTOM) / 2
+    return np.stack([middle + scale * positions[:, axis], height - scale * positions[:, 1]], -1)
+
+
+def _line(sheet: Sheet, points: np.ndarray, **style: object) -> None:
+    """Add a line through points (n, 2) of the picture."""
+    size = sheet.figure.get_size_inches() * DPI
+    x, y = points[:, 0] / size[0], 1 - points[:, 1] / size[1]
+    sheet.figure.add_artist(Line2D(x, y, **style))  # type: ignore[arg-type]
+
+
+def _colour(joint: str) -> str:
+    return {"left": LEFT, "right": RIGHT}.get(joint.split("_")[0], MIDDLE)
+
+
+def _bones(sheet: Sheet, stance: Stance, places: np.ndarray, near: np.ndarray) -> None:
+    """Draw all nodes grey, with lines to their parents, and the mapped ones in their colours.
+
+    Nodes that are not `near` (nodes,) are left out: a root at the origin may be far from the person.
+    """
+    for node, parent in enumerate(stance.parents):
+        if parent >= 0 and near[node] and near[parent]:
+            _line(sheet, places[[parent, node]], color=BARE, lw=2, solid_capstyle="round")
+    _line(sheet, places[near], color=BARE, lw=0, marker="o", ms=4)
+    for joint, node in stance.mapped.items():
+        _line(sheet, places[[node]], color=_colour(joint), lw=0, marker="o", ms=7)
+
+
+def _names(sheet: Sheet, stance: Stance, places: np.ndarray, side: str, x: float, align: str) -> None:
+    """Write the names of one side's joints below each other, each with a line to its node."""
+    joints = [joint for joint in stance.mapped if _colour(joint) == _colour(side or "pelvis")]
+    joints.sort(key=lambda joint: places[stance.mapped[joint], 1])
+    plain = without_namespace(stance.nodes)
+    wanted = [float(places[stance.mapped[joint], 1]) for joint in joints]
+    for joint, y in zip(joints, spread(wanted, SPACING, TOP, HEIGHT - BOTTOM), strict=True):
+        node = stance.mapped[joint]
+        end = x + (4 if align == "right" else -4)
+        _line(sheet, np.array([[end, y], places[node]]), color=_colour(joint), lw=0.6, alpha=0.6)
+        sheet.text(x, y, f"{joint} = {_short(plain[node])}", 14, ha=align, color=_colour(joint))
+
+
+def _short(name: str, most: int = 20) -> str:
+    return name if len(name) <= most else "…" + name[1 - most :]
+
+
+def spread(wanted: Sequence[float], least: float, low: float, high: float) -> list[float]:
+    """Return places near the wanted ones, which rise, at least so far apart and between two bounds.
+
+    They are closer to each other only where there is no room.
+    """
+    least = min(least, (high - low) / max(1, len(wanted) - 1))
+    places: list[float] = []
+    for want in wanted:
+        places.append(max(want, places[-1] + least if places else low))
+    for index in reversed(range(len(places))):
+        bound = high if index == len(places) - 1 else places[index + 1] - least
+        places[index] = min(places[index], bound)
+    return places
+
+
+def _body(sheet: Sheet, stance: Stance) -> None:
+    """Draw the built-in body in the same stance, from the front and from the right."""
+    joints = stance.body @ Z_UP.T
+    joints = joints - [0, 0, joints[:, 2].min() - min(RADII)]
+    room = HEIGHT - TOP - BOTTOM
+    left = 3 * NAMES + FRONT + SIDE
+    for azimuth, width in ((0.0, FRONT), (-np.pi / 2, SIDE)):
+        centre = np.array([*joints[:, :2].mean(0), TALL / 2 - 0.08])
+        camera = Camera(centre, azimuth, width, room, min(room / TALL, FRONT / WIDE), np.deg2rad(4))
+        sheet.panel(left, TOP, width, room).set_data(draw(camera, joints, None, 0.0))
+        left += width
+
+
+def _legend(sheet: Sheet, front: float, side: float) -> None:
+    y = HEIGHT - 24
+    sheet.text(front, y, "the file, from the front", 15, color=INK)
+    sheet.text(side, y, "from the right", 15, color=INK)
+    body = 3 * NAMES + FRONT + SIDE
+    sheet.text(body + FRONT / 2, y, "the body in this stance", 15, color=INK)
+    sheet.text(body + FRONT + SIDE / 2, y, "from the right", 15, color=INK)
+    for index, (word, colour) in enumerate(
+        (("right", RIGHT), ("left", LEFT), ("middle", MIDDLE), ("not mapped", BARE))
+    ):
+        sheet.text(WIDTH - 440 + 100 * index, 28, f"● {word}", 15, ha="left", color=colour)

@@ -1,0 +1,103 @@
+"""Skeletons of every shipped map, with nodes that the map leaves out: fingers, eyes, folded joints."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+from bvh_samples import TREES, ZXY, Sample, own_tree, performed, random_turns, tree
+
+from memmlp.motion.formats.bvh import Bvh
+from memmlp.motion.importing.skeleton import load_skeleton
+from memmlp.motion.synthetic import synthesize_clip
+
+FINGERS = "{S}HandIndex1 {S}Hand {x}9 0 1; {S}HandIndex2 {S}HandIndex1 {x}4 0 0"
+THUMB = "{S}HandThumb1 {S}Hand {x}3 -1 3"
+TIPS = "*{S}HandIndex2 {x}3 0 0; *{S}HandThumb1 {x}3 0 2; *{S}Toe{base} 0 0 6"
+HANDS = "; ".join(
+    part.format(S=side, x=sign, base="Base")
+    for side, sign in (("Left", ""), ("Right", "-"))
+    for part in (FINGERS, THUMB, TIPS)
+)
+WRISTS = "; ".join(
+    f"{side}_Hand {side}_Wrist {x}9 0 0; *{side}_Hand {x}1 0 0" for side, x in (("L", ""), ("R", "-"))
+)
+# Node, parent, offset in centimetres; * for an end site; a > b: between the two.
+MORE = {
+    "bandai_namco": "*Head 0 10 0",
+    "cmu_daz": "rightEye head -4.1 8 8; *rightEye -1 0 0",
+    "cmu_motionbuilder": "",
+    "memmlp": "*head 0 0 0; *left_wrist 9 0 0; *right_wrist -9 0 0",
+    "lafan1": "*Head 0 0 0; *LeftToe 0 0 0; *RightToe 0 0 0; *LeftHand 0 0 0; *RightHand 0 0 0",
+    "mixamo": "HeadTop_End Head 0 19 6; *HeadTop_End 0 0 0; LeftEye Head 3 8 9; RightEye Head -3 8 9; "
+    f"{HANDS}",
+    "motorica": f"*Head 0 19 0; {HANDS}",
+    "rokoko_newton": "Spine3 Spine2 > Spine4; *Head 0 18 0; *LeftToe 0 0 6; *RightToe 0 0 6; "
+    "LeftFinger1Metacarpal LeftHand 3 0 3; RightFinger1Metacarpal RightHand -3 0 3",
+    "smpl": f"*Head 0 0 0; {WRISTS}",
+    "smpl_humanoid": f"*Head 0 12 0; {WRISTS}",
+    "smpl_words": "*Head 0 0 0; Left_palm Left_wrist 9 0 0; Right_palm Right_wrist -9 0 0",
+    "xsens_mvn": "Chest3 Chest2 > Chest4; *Head 0 17 0; *LeftToe 0 -2 7; *RightToe 0 -2 7; "
+    "*LeftWrist 19 0 0; *RightWrist -19 0 0",
+}
+FAMILIES = tuple(MORE)
+
+
+def family(name: str) -> Sample:
+    """Make the whole skeleton of a map, in a T-pose."""
+    sample = tree(name) if name in TREES else own_tree(load_skeleton(name))
+    for entry in filter(None, MORE[name].split(";")):
+        node, *rest = entry.split()
+        if node.startswith("*"):
+            sample.ends.append((sample.names.index(node[1:]), [float(number) for number in rest]))
+            continue
+        sample.names.append(node)
+        sample.parents.append(sample.names.index(rest[0]))
+        sample.channels.append(ZXY)
+        if rest[1] == ">":
+            below = sample.names.index(rest[2])
+            half = [0.5 * number for number in sample.offsets[below]]
+            sample.offsets.append(half)
+            sample.offsets[below], sample.parents[below] = half, len(sample.names) - 1
+        else:
+            sample.offsets.append([float(number) for number in rest[1:]])
+    return in_order(sample)
+
+
+def in_order(sample: Sample) -> Sample:
+    """Return a skeleton with its joints in the order in which a file has them."""
+
+    def below(joint: int) -> list[int]:
+        children = [child for child, parent in enumerate(sample.parents) if parent == joint]
+        return [joint, *(node for child in children for node in below(child))]
+
+    order = below(0)
+    return replace(
+        sample,
+        names=[sample.names[old] for old in order],
+        parents=[order.index(sample.parents[old]) if old else -1 for old in order],
+        offsets=[sample.offsets[old] for old in order],
+        ends=[(order.index(joint), offset) for joint, offset in sample.ends],
+        channels=[sample.channels[old] for old in order],
+    )
+
+
+def walking(name: str, turned: bool = False, seconds: float = 2.0) -> Sample:
+    """Make a file of a family in which a person walks, its zero pose turned at random or a T-pose."""
+    sample = family(name)
+    turns = random_turns(sample, 5) if turned else None
+    clip = synthesize_clip("walking", 1, seconds=seconds)
+    return performed(load_skeleton(name), clip, sample=sample, turns=turns)
+
+
+def renamed(bvh: Bvh, names: dict[str, str]) -> Bvh:
+    """Return a file with other names, given for its joints."""
+    ends = tuple(replace(end, name=names[bvh.names[end.parent]] + ".end") for end in bvh.ends)
+    return replace(bvh, names=tuple(names[name] for name in bvh.names), ends=ends)
+
+
+def anonymous(bvh: Bvh) -> dict[str, str]:
+    """Return names for a file's joints that say nothing, in no order."""
+    numbers = list(range(len(bvh.names)))
+    random.Random(3).shuffle(numbers)
+    return {name: f"joint_{number}" for name, number in zip(bvh.names, numbers, strict=True)}
