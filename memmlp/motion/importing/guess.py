@@ -44,8 +44,11 @@ KNOWN = frozenset(
 ) | {"hipjoint", "fingers", "thumb"}  # fmt: skip
 TOES, SKULL = 0.02, 0.17  # least lengths of a foot, and of a bone to the tip of the head, to a leg's
 FEET, KNEES = 0.3, 0.03  # least mean cosine of the feet to forward, mean sine of the knees, that tell sides
-JUMP = 10.0  # frame 0 is a calibration pose if it is so many times further from frame 1 than others are
-JUMPED = 0.05  # and by this share of the skeleton's size
+MAYBE, JUMP = (
+    1.5,
+    4.0,
+)  # frame 0 may be, and is, a calibration pose if it is so many times as far from frame 1
+JUMPED = 0.05  # as other frames are from their next, and by so much of the skeleton's size
 
 
 @dataclass(frozen=True)
@@ -69,12 +72,14 @@ def guess(recording: Recording, name: str) -> Guess:
     Raises:
         InputError: if the tree is not that of a person with two legs, two arms and a head.
     """
-    calibration = _starts_with_calibration(recording)
+    calibration = (jump := _first_step(recording)) > JUMP
     tree = read_tree(recording, calibration)
     said = [words(plain, KNOWN) for plain in without_namespace(tree.nodes)]
     limbs = find_limbs(recording.path, tree, _head_by_name(tree, said))
     by_name, by_shape = _by_name(tree, said, limbs), _by_shape(tree, limbs)
     sides, doubts = _sides(tree, said, limbs, by_shape)
+    if MAYBE < jump <= JUMP:
+        doubts.append("frame 0 is far from frame 1, and may be a calibration pose")
     joints, sources = {}, {}
     for joint in JOINTS:
         side, _, part = joint.rpartition("_")
@@ -254,15 +259,16 @@ def _same_side(tree: Tree, shape: Found, leg: int) -> int:
     return leg if (hips * shoulders).sum(-1).mean() > 0 else 1 - leg
 
 
-def _starts_with_calibration(recording: Recording) -> bool:
-    """Return whether frame 0 is a pose of its own: far from frame 1, as frames are never from each other."""
+def _first_step(recording: Recording) -> float:
+    """Return how far frame 0 is from frame 1, to what the 10 % farthest other frames are from their next."""
     if len(recording) < 4:
-        return False
+        return 0.0
     positions = recording.kinematics()[1]
     pose = positions - positions[:, :1]
     steps = np.linalg.norm(np.diff(pose, axis=0), axis=-1).max(-1)
-    size = np.linalg.norm(pose[0], axis=-1).max()
-    return bool(steps[0] > JUMP * np.quantile(steps[1:], 0.9) and steps[0] > JUMPED * size)
+    if steps[0] <= JUMPED * np.linalg.norm(pose[0], axis=-1).max():
+        return 0.0
+    return float(steps[0] / max(np.quantile(steps[1:], 0.9), 1e-9))
 
 
 # The proposal on paper, and whether it holds
