@@ -44,11 +44,8 @@ KNOWN = frozenset(
 ) | {"hipjoint", "fingers", "thumb"}  # fmt: skip
 TOES, SKULL = 0.02, 0.17  # least lengths of a foot, and of a bone to the tip of the head, to a leg's
 FEET, KNEES = 0.3, 0.03  # least mean cosine of the feet to forward, mean sine of the knees, that tell sides
-MAYBE, JUMP = (
-    1.5,
-    4.0,
-)  # frame 0 may be, and is, a calibration pose if it is so many times as far from frame 1
-JUMPED = 0.05  # as other frames are from their next, and by so much of the skeleton's size
+MAYBE, JUMP = 1.5, 4.0  # frame 0 may be, and is, a calibration pose if so many times further from frame 1
+JUMPED = 0.05  # than other frames are from their next, and by so much of the skeleton's size
 
 
 @dataclass(frozen=True)

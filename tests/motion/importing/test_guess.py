@@ -95,7 +95,7 @@ def test_a_calibration_frame_is_seen(tmp_path: Path):
 def test_a_frame_that_may_be_a_calibration_pose_is_in_doubt(tmp_path: Path):
     bvh = walks(tmp_path, "mixamo")
     values = bvh.values.copy()
-    values[0, 3:6] += [0.0, 20.0, 0.0]
+    values[0, 3:6] += [0.0, 9.0, 0.0]
     proposed = guess(replace(bvh, values=values), "mine")
     assert not proposed.skeleton.calibration_frame
     assert any("calibration pose" in doubt for doubt in proposed.doubts)
