@@ -21,6 +21,7 @@ from omegaconf.errors import (
 
 from memmlp.config.schema import unknown_key
 
+SOURCES = "data.sources"
 WORDS = {int: "an integer", float: "a number", bool: "true or false", str: "text", NoneType: "null"}
 
 
@@ -61,6 +62,8 @@ def _typed(error: OmegaConfBaseException, override: str | None) -> str:
     """Explain what the schema refused: an unknown key, a value of the wrong type, or the removal of a key."""
     name = str(error.full_key or override)
     schema = error.object_type
+    if not dataclasses.is_dataclass(schema) and ("SourceConfig" in str(error) or name.startswith(SOURCES)):
+        return f"{SOURCES}: allowed are sources in a config file of your own (docs/guides/motion.md)"
     if isinstance(error, ConfigAttributeError | ConfigKeyError) and not isinstance(
         error, InterpolationKeyError
     ):

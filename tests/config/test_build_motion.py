@@ -95,6 +95,19 @@ def test_what_does_not_go_together_is_one_line(changes, words, said):
         composed(["data=mocap", "data.root=null"])
 
 
+@pytest.mark.parametrize(
+    "word", ["+data.sources.x={root: a}", "data.sources={x: {root: a}}", "+data.sources.x.root=a"]
+)
+def test_sources_on_the_command_line_are_told_where_they_go(word):
+    with pytest.raises(InputError, match=r"^data\.sources: allowed are sources in a config file"):
+        composed(["data=mocap", "data.root=null", word])
+
+
+def test_a_wrong_key_of_a_source_is_named():
+    with pytest.raises(InputError, match=r"data\.sources\.cmu\.weigt: no such key; did you mean weight"):
+        mix(with_source(weigt=3))
+
+
 def test_weights_are_drawn_by_and_enter_the_identity_where_there_are_any():
     def identity(cfg):
         return build_experiment(cfg).identity("0" * 64).id

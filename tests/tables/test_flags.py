@@ -10,11 +10,14 @@ import pytest
 from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, runs_of, table_of
 from fake_table import cell, printed
 
+from memmlp.report.kept_results import Kept, dumps, load_kept
+from memmlp.report.markdown import origin_words
 from memmlp.runs.evaluation_file import write_report
 from memmlp.statistics import Verdict
 from memmlp.sweep.spec import Sweep
 from memmlp.tables.build_table import collect
 from memmlp.tables.formats import FORMATS
+from memmlp.tables.measured_run import load
 from memmlp.tables.table import Table
 
 
@@ -193,3 +196,20 @@ def test_runs_of_an_older_recipe_are_named(sweep: Sweep, tmp_path: Path):
     assert "made by an earlier recipe, left out and made again by the sweep: 'no | memory' seed 0 (abc)" in (
         table.flags
     )
+
+
+def test_a_part_of_a_list_is_said_wherever_its_runs_are(sweep: Sweep, tmp_path: Path):
+    part = "amass_s1, 61 % of the list (3262 of 5350 entries)"
+    arms = sweep.runnable()
+    runs = {
+        arm.label: fake_run(tmp_path, arm.label, origin={"partial": part} if arm is arms[0] else None)
+        for arm in arms
+    }
+    one = replace(sweep, seeds=(0,))
+    assert f"{part}, and no more: '{arms[0].label}'" in table_of(one, lambda arm, seed: runs[arm.label]).flags
+    measured = {arm.label: {0: load(runs[arm.label].folder)} for arm in arms}
+    path = tmp_path / "kept.json"
+    path.write_text(dumps(Kept("5", (), measured, {arm.label: () for arm in arms})))
+    kept = load_kept(path)
+    assert {run.origin.partial for run in kept.every} == {part, None}
+    assert part in origin_words(kept).replace("\\", "")  # escaped for Markdown
