@@ -113,19 +113,23 @@ def sources(folder: Path) -> dict[str, KeptTable]:
         kept = load_kept(path)
         # Verdicts of rounds are those of all clips together, and of no source alone.
         names = () if kept.rounds else kept.sources
-        by_source = tuple(titled(_table(kept.of_source(name)), name) for name in names)
+        by_source = tuple(titled(_table(kept, name), name) for name in names)
         found[path.stem] = KeptTable(kept, _table(kept), by_source)
     return found
 
 
-def _table(kept: Kept) -> Table:
-    """Compute the table of kept results, over the seeds that any of their runs has."""
+def _table(kept: Kept, source: str | None = None) -> Table:
+    """Compute the table of kept results, over the seeds that any of their runs has.
+
+    With a source's name it is that of the source's test clips alone.
+    """
     from memmlp.cli.rounds import of_another
     from memmlp.config.plan_sweep import find_sweep
-    from memmlp.tables.build_table import collect
+    from memmlp.tables.build_table import collect, on_source
     from memmlp.tables.rounds import of_json
 
     sweep = find_sweep(kept.sweep)
+    left_out: tuple[str, ...] = ()
     rounds = of_json(kept.rounds) if kept.rounds else None
     other = of_another(rounds, sweep) if rounds else None
     if rounds and not other:
@@ -134,8 +138,11 @@ def _table(kept: Kept) -> Table:
     else:
         seeds = sorted({seed for runs in kept.runs.values() for seed in runs})
         sweep = sweep.with_overrides([f"seed={','.join(map(str, seeds))}"])
-        table = collect(sweep, kept.of(sweep), command=kept.command)
-    said = [*([other] if other else []), *kept.flags, *_outdated(kept)]
+        runs = kept.of(sweep)
+        if source is not None:
+            sweep, runs, left_out = on_source(sweep, runs, source)
+        table = collect(sweep, runs, command=kept.command)
+    said = [*left_out, *([other] if other else []), *kept.flags, *_outdated(kept)]
     return replace(table, flags=(*table.flags, *said))
 
 

@@ -163,22 +163,20 @@ def gathered(
 
 def of_plan(shown: Shown, modes: Sequence[str], command: str, read: Read, source: str | None = None) -> Found:
     """Return a planned sweep's finished runs and its table, of one source's test clips where it is given."""
-    from memmlp.tables.build_table import collect, finished, titled
+    from memmlp.tables.build_table import collect, finished, on_source, titled
     from memmlp.tables.runs_of_plan import finder, older, states
 
     sweep, plan, rounds, flags = shown
     if source and rounds:
         raise InputError(f"--source {source}: allowed for a fixed number of seeds, not for --until-decided")
-    runs = finished(sweep, finder(plan, of_source(read, source) if source else read))
+    runs = finished(sweep, finder(plan, read))
+    if source:
+        sweep, runs, left_out = on_source(sweep, runs, source)
+        flags = (*left_out, *flags)
     command = f"{command} --until-decided" if rounds else command
     table = collect(sweep, runs, modes, command, states(plan), older(plan), rounds)
     table = titled(table, source) if source else table
     return Found(sweep, runs, replace(table, flags=(*table.flags, *flags)))
-
-
-def of_source(read: Read, source: str) -> Read:
-    """Return a reader of runs' results on one source's test clips alone."""
-    return lambda folder, stages: read(folder, stages).of_source(source)
 
 
 def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:

@@ -91,14 +91,6 @@ class Kept:
         """The names of the sources of the test clips; empty where there is one."""
         return tuple(sorted({source for run in self.every for source in run.sources.values()}))
 
-    def of_source(self, source: str) -> Kept:
-        """Return the results on one source's test clips. Raises InputError where a run has none of it."""
-        runs = {
-            label: {seed: run.of_source(source) for seed, run in runs.items()}
-            for label, runs in self.runs.items()
-        }
-        return replace(self, runs=runs)
-
     def of(self, sweep: Sweep) -> dict[str, Runs]:
         """Return the runs of the arms and seeds that the sweep has today.
 

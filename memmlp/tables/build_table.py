@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
+from memmlp.common.errors import InputError
 from memmlp.sweep.spec import COSTS, MODES, Arm, Sweep
 from memmlp.tables.effects import Runs, control_arm, effects, paper_effect, with_existing_branches
 from memmlp.tables.flags import Say, flags, silent
@@ -69,6 +70,48 @@ def collect(
         flags=tuple(flags(seen, sweep, runs, command or f"memmlp sweep {sweep.name}", state, older)),
         looks=tuple((look.seeds, look.level) for look in rounds.taken) if rounds else (),
     )
+
+
+class OnSource(NamedTuple):
+    """A sweep and its finished runs on the test clips of one source of motion.
+
+    Attributes:
+        sweep: the sweep without the arms whose runs have no test clip of the source.
+        runs: the runs of the arms that are left, by seed, on these clips alone.
+        flags: a line that names the arms that were left out.
+    """
+
+    sweep: Sweep
+    runs: dict[str, Runs]
+    flags: tuple[str, ...]
+
+
+def on_source(sweep: Sweep, runs: Mapping[str, Runs], source: str) -> OnSource:
+    """Restrict a sweep and its finished runs to one source's test clips.
+
+    Where the control has none of them, the first arm that has some stands in its place.
+
+    Raises:
+        InputError: if no run has a test clip of the source.
+    """
+    own: dict[str, Runs] = {
+        label: {seed: parts[source] for seed, run in seeds.items() if source in (parts := run.by_source())}
+        for label, seeds in runs.items()
+    }
+    if not any(own.values()):
+        known = sorted(
+            {name for seeds in runs.values() for run in seeds.values() for name in run.by_source()}
+        )
+        allowed = f"allowed is {', '.join(known)}" if known else "allowed with several sources"
+        raise InputError(f"--source {source}: no finished run has a test clip of it; {allowed}")
+    without = {label for label, seeds in runs.items() if seeds and not own[label]}
+    arms = [arm for arm in sweep.arms if arm.label not in without]
+    arms = [replace(arm, against=None) if arm.against in without else arm for arm in arms]
+    left = {label: seeds for label, seeds in own.items() if label not in without}
+    control = next(iter(left)) if sweep.control in without else sweep.control
+    quoted = ", ".join(f"'{arm.label}'" for arm in sweep.arms if arm.label in without)
+    flags = (f"no test clip of {source}, so left out: {quoted}",) if without else ()
+    return OnSource(replace(sweep, arms=tuple(arms), control=control), left, flags)
 
 
 def titled(table: Table, source: str) -> Table:

@@ -103,14 +103,6 @@ class Measured:
         names = sorted(set(self.sources.values()))
         return {name: self._of([clip for clip in self.clips if self.sources[clip] == name]) for name in names}
 
-    def of_source(self, source: str) -> Measured:
-        """Return the same of one source's clips alone. Raises InputError where the run has none of it."""
-        found = self.by_source()
-        if source not in found:
-            known = ", ".join(found) or "none, as its data is one folder"
-            raise InputError(f"--source {source}: run {self.id} has no test clip of it; allowed is {known}")
-        return found[source]
-
     def _of(self, clips: Sequence[str]) -> Measured:
         """Return the same of some of the clips alone."""
         means = {

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import functools
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import pytest
 from fake_runs import fake_sweep, runs_of
 from fake_table import SHIPPED, printed
 from processes import finished
 
+from memmlp.common.errors import InputError
 from memmlp.sweep.spec import Sweep, load_sweep, parse_sweep
-from memmlp.tables.build_table import without_runs
+from memmlp.tables.build_table import collect, on_source, without_runs
 from memmlp.tables.measured_run import load
 
 
@@ -44,3 +47,37 @@ def test_without_runs_the_papers_values_and_the_reason_are_shown():
     assert "nothing measured: data.root" in text
     assert "14.27" in text
     assert "missing" not in text
+
+
+def test_arms_without_a_sources_clips_are_left_out_and_named(tmp_path: Path):
+    """The control has clips of one source alone: on the other's, the next arm stands in its place."""
+    sweep = parse_sweep(
+        "mix",
+        {
+            "arms": {
+                "one": [],
+                "both": ["optim.lr=1"],
+                "more": {"overrides": ["optim.lr=2"], "against": "one"},
+            }
+        },
+    )
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
+    clips = list(next(iter(runs["one"].values())).clips)
+    halves = {clip: "old" if number % 2 else "new" for number, clip in enumerate(clips)}
+
+    def mixed(label: str) -> dict:
+        sources = dict.fromkeys(clips, "old") if label == "one" else halves
+        return {seed: replace(run, sources=sources) for seed, run in runs[label].items()}
+
+    runs = {label: mixed(label) for label in runs}
+    part = on_source(sweep, runs, "new")
+    assert (list(part.runs), part.sweep.control) == (["both", "more"], "both")
+    assert part.flags == ("no test clip of new, so left out: 'one'",)
+    table = collect(part.sweep, part.runs)
+    assert [row.label for row in table.rows] == ["both", "more"]
+    assert not any("missing" in flag for flag in table.flags)
+    old = on_source(sweep, runs, "old")
+    assert (list(old.runs), old.sweep, old.flags) == (["one", "both", "more"], sweep, ())
+    assert all(len(run.clips) == len(clips) // 2 for run in old.runs["both"].values())
+    with pytest.raises(InputError, match=r"--source third: no finished run .* allowed is new, old"):
+        on_source(sweep, runs, "third")
