@@ -161,6 +161,8 @@ def make_placeholders(words: list[str]) -> None:
         elif key == "data.body" and value != "builtin":
             Path(value).parent.mkdir(parents=True, exist_ok=True)
             Path(value).touch()
+        elif word == "mix":
+            make_placeholders(["data.root=outputs/data/cmu,outputs/data/bandai"])
         elif word == "myconf":
             Path("myconf/hand").mkdir(parents=True, exist_ok=True)
             Path("myconf/hand/feet.yaml").write_text("{name: feet, _target_: mine.FeetPosition}")
