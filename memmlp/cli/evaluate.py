@@ -48,7 +48,7 @@ def evaluate(
     """
     from rich.console import Console
 
-    from memmlp.cli.train_summary import metrics_table
+    from memmlp.cli.train_summary import metrics_table, source_tables
     from memmlp.common.files import write_json
     from memmlp.config.open_run import open_run
     from memmlp.evaluation.predictions import save_predictions as write_predictions
@@ -61,7 +61,8 @@ def evaluate(
     click.echo(f"run {found.run.id}: {said}")
     if partial := found.run.manifest.get("partial"):
         click.echo(f"on a part of the data: {partial}")
-    Console(highlight=False).print(metrics_table(results))
+    for table in (metrics_table(results), *source_tables(found.run)):
+        Console(highlight=False).print(table)
     if json_path is not None:
         write_json(json_path, {"mean": results, "clips": clip_rows(experiment, found.run)})
     if save_predictions is not None:

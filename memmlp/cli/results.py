@@ -106,11 +106,15 @@ def sources(folder: Path) -> dict[str, KeptTable]:
     """Return the tables of all results that are kept below a folder, by the stems of their files."""
     from memmlp.report.kept_results import load_kept
     from memmlp.report.markdown import KeptTable
+    from memmlp.tables.build_table import titled
 
     found = {}
     for path in sorted((folder / "data").glob("*.json")):
         kept = load_kept(path)
-        found[path.stem] = KeptTable(kept, _table(kept))
+        # Verdicts of rounds are those of all clips together, and of no source alone.
+        names = () if kept.rounds else kept.sources
+        by_source = tuple(titled(_table(kept.of_source(name)), name) for name in names)
+        found[path.stem] = KeptTable(kept, _table(kept), by_source)
     return found
 
 

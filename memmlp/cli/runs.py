@@ -67,7 +67,8 @@ def show_command(run: str, config: bool, outputs: Path) -> None:
     RUN is its id, the beginning of it, or its folder.
     """
     from memmlp.runs.identity import flatten
-    from memmlp.runs.lookup import find_run
+    from memmlp.runs.lookup import find_run, is_trained
+    from memmlp.tables.measured_run import load
 
     found = find_run(outputs, run)
     changed = ", ".join(found.verify())
@@ -78,6 +79,9 @@ def show_command(run: str, config: bool, outputs: Path) -> None:
     _console().print(_pairs(facts))
     if found.results:
         _console().print(_pairs(flatten(found.results), title="results"))
+    if is_trained(found):
+        for source, measured in load(found.folder).by_source().items():
+            _console().print(_pairs(flatten(measured.means), title=f"results on {source}"))
     if config and found.config:
         _console().print(_pairs(flatten(found.config), title="config"))
 

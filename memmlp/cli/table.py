@@ -54,6 +54,10 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
     help="Branch whose errors are shown.  [default: that of the paper's table]",
 )
 @click.option(
+    "--source",
+    help="Source whose test clips are shown, where the data has several.  [default: all together]",
+)
+@click.option(
     "--plan", is_flag=True, help="Show how many seeds it would take to see the paper's effects on this data."
 )
 @outputs_option
@@ -64,6 +68,7 @@ def table(
     out: Path | None,
     mode: str,
     branch: str | None,
+    source: str | None,
     plan: bool,
     outputs: Path,
 ) -> None:
@@ -76,7 +81,7 @@ def table(
     if plan and (form or out):
         raise InputError("--plan: goes to the screen alone, without --format and --out")
     with _uncollected():
-        found = gathered([name], overrides, outputs, SHOWN_MODES[mode], functools.cache(load), branch)
+        found = gathered([name], overrides, outputs, SHOWN_MODES[mode], functools.cache(load), branch, source)
     if plan:
         plans_on_screen(found, SHOWN_MODES[mode])
         return
@@ -119,6 +124,7 @@ def gathered(
     modes: Sequence[str],
     read: Read,
     branch: str | None = None,
+    source: str | None = None,
 ) -> list[Found]:
     """Gather the tables that some names stand for.
 
@@ -132,6 +138,7 @@ def gathered(
         modes: modes of evaluation to show.
         read: reads a run (`memmlp.tables.measured_run.load`).
         branch: shows this branch in place of the arms' own; None for theirs.
+        source: shows the test clips of this source alone; None for all.
 
     Raises:
         InputError: where none of them can be composed with the command line's overrides.
@@ -143,7 +150,8 @@ def gathered(
     for sweep, command in chosen(names, overrides):
         sweep = sweep.with_branch(branch) if branch else sweep
         try:
-            found.append(of_plan(shown(sweep, overrides, outputs.absolute()), modes, command, read))
+            known = shown(sweep, overrides, outputs.absolute())
+            found.append(of_plan(known, modes, command, read, source))
         except InputError as error:
             failures.append(error)
             table = without_runs(sweep, modes, f"nothing measured: {error}")
@@ -153,16 +161,24 @@ def gathered(
     return found
 
 
-def of_plan(shown: Shown, modes: Sequence[str], command: str, read: Read) -> Found:
-    """Return a planned sweep's finished runs and its table."""
-    from memmlp.tables.build_table import collect, finished
+def of_plan(shown: Shown, modes: Sequence[str], command: str, read: Read, source: str | None = None) -> Found:
+    """Return a planned sweep's finished runs and its table, of one source's test clips where it is given."""
+    from memmlp.tables.build_table import collect, finished, titled
     from memmlp.tables.runs_of_plan import finder, older, states
 
     sweep, plan, rounds, flags = shown
-    runs = finished(sweep, finder(plan, read))
+    if source and rounds:
+        raise InputError(f"--source {source}: allowed for a fixed number of seeds, not for --until-decided")
+    runs = finished(sweep, finder(plan, of_source(read, source) if source else read))
     command = f"{command} --until-decided" if rounds else command
     table = collect(sweep, runs, modes, command, states(plan), older(plan), rounds)
+    table = titled(table, source) if source else table
     return Found(sweep, runs, replace(table, flags=(*table.flags, *flags)))
+
+
+def of_source(read: Read, source: str) -> Read:
+    """Return a reader of runs' results on one source's test clips alone."""
+    return lambda folder, stages: read(folder, stages).of_source(source)
 
 
 def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -12,6 +11,7 @@ from rich.table import Table
 from memmlp.evaluation.units import UNITS
 from memmlp.pipeline.run_stages import Outcome
 from memmlp.runs.run import Run
+from memmlp.tables.measured_run import Errors, load
 
 STAGES = ("training", "evaluation", "deployment")
 BRANCHES = ("rotation", "position", "combined")
@@ -28,6 +28,8 @@ def show(outcome: Outcome) -> None:
     if changed := run.changed_sources:
         console.print(older_code(run, changed), style="yellow", soft_wrap=True)
     console.print(metrics_table(results))
+    for table in source_tables(run):
+        console.print(table)
     measured = results["latency"]
     console.print(
         f"a frame on one CPU core: {measured['median_ms']:.2f} ms median, {measured['p95_ms']:.2f} ms p95 "
@@ -62,12 +64,16 @@ def older_code(run: Run, changed: Sequence[str]) -> str:
     )
 
 
-def metrics_table(results: dict[str, Any]) -> Table:
+def source_tables(run: Run) -> Iterator[Table]:
+    """Yield a table of the metrics on each source's test clips, where the run's data has several sources."""
+    for source, measured in load(run.folder).by_source().items():
+        yield metrics_table(measured.means, f"test clips of {source} ({len(measured.clips)})")
+
+
+def metrics_table(results: Errors, title: str = "test clips") -> Table:
     """Make a table of the metrics on test clips, with a column for each mode and branch."""
     columns = [(mode, branch) for mode, branch in COLUMNS if branch in results.get(mode, {})]
-    table = Table(
-        title="test clips", title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0)
-    )
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column("metric")
     table.add_column("unit")
     for mode, branch in columns:

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from memmlp.common.errors import InputError
-from memmlp.config.build_motion import build_motion
+from memmlp.config.build_motion import build_motion, shares
 from memmlp.config.compose import composed
 from memmlp.config.instantiate import built
 from memmlp.config.schema import check, restored
@@ -70,6 +70,7 @@ def build_experiment(cfg: DictConfig) -> Experiment:
             rollout=built(cfg.rollout),
             optim=Optim(**config["optim"]),
             weighting=cfg.data.weighting,
+            shares=shares(cfg.data),
         ),
         evaluation=Evaluation(
             modes=list(cfg.evaluation.modes), batch=cfg.evaluation.batch, ik=build_ik(cfg), seed=cfg.seed

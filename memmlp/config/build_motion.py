@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from memmlp.config.instantiate import built
 from memmlp.motion.preparing.cache import ClipFolder
+from memmlp.motion.preparing.folders import Folders, Root
 from memmlp.motion.preparing.source import MotionSource
+from memmlp.motion.preparing.splits import MixedSplit, SeededSplit, Split
 
 
 def build_motion(cfg: DictConfig) -> MotionSource:
     """Build the source of an experiment's motion.
 
     A synthetic folder's name holds its length and seed, so that other settings never find stale files.
+
+    Raises:
+        InputError: if a list of groups can't be read, or two folders of a list have one name.
     """
-    data, root = cfg.data, Path(cfg.data.root)
+    data = cfg.data
+    root, split = _clips(data)
     generate = None
     if data.synth is not None:
-        root = root / f"{data.synth.minutes:g}min-seed{data.synth.seed}"
+        root = Path(data.root) / f"{data.synth.minutes:g}min-seed{data.synth.seed}"
         minutes, seed = data.synth.minutes, data.synth.seed
 
         def generate(folder: Path) -> None:
@@ -27,7 +36,39 @@ def build_motion(cfg: DictConfig) -> MotionSource:
 
             synthesize(folder, minutes=minutes, seed=seed)
 
-    split = built(data.split)
     source = ClipFolder(root, split, str(data.body), data.min_frames, data.strict)
     caches = Path(cfg.paths.outputs) / "cache"
     return MotionSource(source, generate, caches, partial=data.get("partial", False))
+
+
+def shares(data: DictConfig) -> Mapping[str, float] | None:
+    """Return how often a training window is of each source; None where no source has a weight."""
+    weights = {name: source.get("weight") for name, source in (data.get("sources") or {}).items()}
+    return weights if any(weights.values()) else None
+
+
+class _Clips(NamedTuple):
+    """Where the clips are, and how they are split."""
+
+    root: Root
+    split: Split
+
+
+def _clips(data: DictConfig) -> _Clips:
+    """Return the folder or folders of the clips, and the split: each source is split alike, by itself."""
+    split = built(data.split)
+    if sources := data.get("sources"):
+        folders = Folders({name: Path(source.root) for name, source in sources.items()})
+        own = {name: _own_split(split, source) for name, source in sources.items()}
+        return _Clips(folders, MixedSplit(own))
+    roots = list(data.root) if OmegaConf.is_list(data.root) else [data.root]
+    if len(roots) == 1:
+        return _Clips(Path(roots[0]), split)
+    folders = Folders.of([Path(root) for root in roots])
+    return _Clips(folders, MixedSplit(dict.fromkeys(folders.sources, split)))
+
+
+def _own_split(split: SeededSplit, source: DictConfig) -> SeededSplit:
+    """Return the split of one source, with what ties its own clips."""
+    groups = [*split.groups, *(source.get("groups") or ())]
+    return replace(split, groups=groups, groups_file=source.get("groups_file"))

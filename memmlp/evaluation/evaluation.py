@@ -42,7 +42,8 @@ class Evaluation:
         """
         torch.manual_seed(self.seed)  # a mode's result does not depend on which modes came before it
         found = modes.evaluate(model, test, [mode], self.batch, self.ik)
-        rows = [{key: row[key] for key in ("name", "group", "frames")} | row[mode] for row in found["clips"]]
+        facts = ("name", "group", "source", "frames")
+        rows = [{key: row[key] for key in facts if key in row} | row[mode] for row in found["clips"]]
         return {"mean": found["mean"][mode], "clips": rows}
 
 

@@ -121,6 +121,8 @@ def evaluate(
         {"name": name, "group": group, "frames": len(clip)}
         for name, group, clip in zip(dataset.names, dataset.groups, clips, strict=True)
     ]
+    for row, source in zip(rows, dataset.sources or (), strict=False):
+        row["source"] = source
     for mode in modes:
         for row, clip, motion in zip(rows, clips, predict(network, clips, mode, batch), strict=True):
             row[mode] = clip_report(network.normalizer, motion, clip, ik)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,12 @@ from torch import Tensor
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import FRAME_DIM
+from memmlp.motion.preparing.folders import source_of
 from memmlp.motion.preparing.manifest import Manifest
 from memmlp.motion.preparing.splits import PARTS
 
 WEIGHTINGS = ("frames", "clips")
+SHARE_STEPS = 2**52  # how finely sources' shares are kept
 
 
 class MotionDataset:
@@ -26,6 +29,7 @@ class MotionDataset:
         lengths: numbers of frames of the clips (C,), int64, on the device of `frames`.
         names: names of the clips.
         groups: group of each clip; clips that belong together share one. By default each clip is its own.
+        sources: source of each clip; None for clips of one folder.
     """
 
     def __init__(
@@ -35,9 +39,10 @@ class MotionDataset:
         lengths: Tensor,
         names: list[str],
         groups: list[str] | None = None,
+        sources: list[str] | None = None,
     ):
         self.frames, self.starts, self.lengths, self.names = frames, starts, lengths, names
-        self.groups = groups or list(names)
+        self.groups, self.sources = groups or list(names), sources
 
     @classmethod
     def open(cls, cache: Path, split: str) -> MotionDataset:
@@ -48,7 +53,8 @@ class MotionDataset:
         """
         if split not in PARTS:
             raise InputError(f"data: no split {split!r}; allowed: {', '.join(PARTS)}")
-        clips = Manifest.load(cache).part(split)
+        manifest = Manifest.load(cache)
+        clips = manifest.part(split)
         if not clips:
             raise InputError(f"{cache}: no {split} clips; prepare the data with a {split} part")
         frames = _map(cache / f"{split}.npy")
@@ -56,12 +62,14 @@ class MotionDataset:
             raise InputError(f"{cache}: {split}.npy is not the manifest's array; prepare the data again")
         starts = torch.tensor([clip.start for clip in clips])
         lengths = torch.tensor([clip.length for clip in clips])
-        return cls(frames, starts, lengths, [clip.name for clip in clips], [clip.group for clip in clips])
+        names, groups = [clip.name for clip in clips], [clip.group for clip in clips]
+        sources = [source_of(name) for name in names] if manifest.sources else None
+        return cls(frames, starts, lengths, names, groups, sources)
 
     def to(self, device: torch.device | str) -> MotionDataset:
         """Return the same dataset on a device."""
         tensors = (self.frames.to(device), self.starts.to(device), self.lengths.to(device))
-        return MotionDataset(*tensors, list(self.names), list(self.groups))
+        return MotionDataset(*tensors, list(self.names), list(self.groups), self.sources)
 
     def __len__(self) -> int:
         """Return the number of clips."""
@@ -108,12 +116,22 @@ class WindowSampler:
         seed: seed of the draws.
         weighting: "frames" if every window of the split is equally likely (reading 23), "clips" if every clip
             is.
+        shares: how often a window is of each source, relative to the others; within a source `weighting`
+            says. None draws from all clips alike.
 
     Raises:
         InputError: for another weighting.
     """
 
-    def __init__(self, frames: MotionDataset, batch: int, window: int, seed: int, weighting: str = "frames"):
+    def __init__(
+        self,
+        frames: MotionDataset,
+        batch: int,
+        window: int,
+        seed: int,
+        weighting: str = "frames",
+        shares: Mapping[str, float] | None = None,
+    ):
         if weighting not in WEIGHTINGS:
             raise InputError(f"data.weighting: {weighting!r}; allowed: {', '.join(WEIGHTINGS)}")
         self.batch, self.seed, self.device = batch, seed, frames.frames.device
@@ -121,7 +139,7 @@ class WindowSampler:
         self.first_end = np.minimum(window, lengths) - 1
         self.windows = np.maximum(lengths - window + 1, 1)
         weights = self.windows if weighting == "frames" else np.ones_like(self.windows)
-        self.bounds = np.cumsum(weights)
+        self.bounds = np.cumsum(_shared(weights, frames.sources, shares) if shares else weights)
 
     def draw(self, step: int) -> tuple[Tensor, Tensor]:
         """Draw clips (B,) and the last frames (B,) of their windows, int64, on the dataset's device."""
@@ -129,6 +147,14 @@ class WindowSampler:
         clip = np.searchsorted(self.bounds, random.integers(0, self.bounds[-1], self.batch), side="right")
         end = self.first_end[clip] + random.integers(0, self.windows[clip])
         return torch.from_numpy(clip).to(self.device), torch.from_numpy(end).to(self.device)
+
+
+def _shared(weights: np.ndarray, sources: Sequence[str] | None, shares: Mapping[str, float]) -> np.ndarray:
+    """Return clips' weights (C,), int64: as they were within a source, and a source's sum up to its share."""
+    named, scaled = np.array(sources), weights.astype(float)
+    for source, share in shares.items():
+        scaled[named == source] *= share / weights[named == source].sum()
+    return np.rint(scaled / sum(shares.values()) * SHARE_STEPS).astype(np.int64)
 
 
 def _map(path: Path) -> Tensor:

@@ -21,7 +21,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, plain
 from memmlp.sweep.spec import Sweep
 from memmlp.tables.effects import Runs
-from memmlp.tables.measured_run import Errors, Measured, Origin
+from memmlp.tables.measured_run import Errors, Measured, Origin, known_mean
 
 DIGITS = 6
 SCALES = re.compile(r"\[\s+([^\[\]{}]*?)\s+\]")  # a list of plain values, which is written on one line
@@ -85,6 +85,19 @@ class Kept:
             if label in self.arms and self.arms[label] != words:
                 before, now = ", ".join(self.arms[label]) or "none", ", ".join(words) or "none"
                 raise InputError(f"arm '{label}' was made with the overrides {before}, and has {now}")
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """The names of the sources of the test clips; empty where there is one."""
+        return tuple(sorted({source for run in self.every for source in run.sources.values()}))
+
+    def of_source(self, source: str) -> Kept:
+        """Return the results on one source's test clips. Raises InputError where a run has none of it."""
+        runs = {
+            label: {seed: run.of_source(source) for seed, run in runs.items()}
+            for label, runs in self.runs.items()
+        }
+        return replace(self, runs=runs)
 
     def of(self, sweep: Sweep) -> dict[str, Runs]:
         """Return the runs of the arms and seeds that the sweep has today.
@@ -192,8 +205,9 @@ def _record(run: Measured) -> dict[str, Any]:
 
 
 def _clips(run: Measured) -> list[list[str]]:
-    """Return the names of the test clips, each with its group."""
-    return [[name, run.group(name)] for name in run.clips]
+    """Return the names of the test clips, each with its group, and its source where there are several."""
+    sources = run.sources
+    return [[name, run.group(name), *([sources[name]] if sources else [])] for name in run.clips]
 
 
 def _clips_key(run: Measured) -> str:
@@ -202,14 +216,15 @@ def _clips_key(run: Measured) -> str:
 
 def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str]]) -> Measured:
     """Return a run from what is kept of it."""
-    names, errors = [clip for clip, _ in clips], record["errors"]
+    names, errors = [clip for clip, *_ in clips], record["errors"]
     if any(len(values) != len(names) for values in _every(errors)):
         raise ValueError(f"run {name} has not as many errors as clips")
     return Measured(
         id=name,
         means=_each(errors, _mean),
         clips={clip: _each(errors, lambda values, i=i: values[i]) for i, clip in enumerate(names)},
-        groups={clip: group for clip, group in clips},
+        groups={clip: group for clip, group, *_ in clips},
+        sources={clip: source[0] for clip, _, *source in clips if source},
         costs=record["costs"],
         origin=Origin(**record["origin"]),
     )
@@ -235,8 +250,7 @@ def _every(errors: Mapping[str, Any]) -> list[Sequence[Any]]:
 
 def _mean(values: Sequence[float | str | None]) -> float:
     """Return the mean over the clips that have a number, as the evaluation does; NaN where none has."""
-    known = [float(value) for value in values if value is not None]
-    return float(np.mean(known)) if known else math.nan
+    return known_mean(np.array([math.nan if value is None else float(value) for value in values]))
 
 
 def _short(value: float) -> float | str | None:

@@ -28,10 +28,14 @@ TURNED = {Verdict.HIGHER: Verdict.LOWER, Verdict.LOWER: Verdict.HIGHER}
 
 
 class KeptTable(NamedTuple):
-    """What a page is made of: results that were kept, and the table that is computed of them today."""
+    """What a page is made of: results that were kept, and the table that is computed of them today.
+
+    `by_source` are the tables of each source's test clips alone, where the data has several.
+    """
 
     kept: Kept
     table: Table
+    by_source: tuple[Table, ...] = ()
 
 
 def pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -> dict[str, str]:
@@ -77,7 +81,8 @@ def _filled(name: str, text: str, words: Words) -> str:
 
 
 def _table_page(source: KeptTable) -> str:
-    return f"{MARK}\n\n{markdown(source.table)}\n{origin_words(source.kept)}\n"
+    tables = "\n".join(map(markdown, (source.table, *source.by_source)))
+    return f"{MARK}\n\n{tables}\n{origin_words(source.kept)}\n"
 
 
 def origin_words(kept: Kept) -> str:

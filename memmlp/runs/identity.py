@@ -131,11 +131,17 @@ def evaluation_settings(config: Mapping[str, Any], mode: str, grouped: str | Non
     group = config.get("evaluation", {})
     ik = group.get("ik", "off")
     solver = {"ik": ik} | ({"ik_iterations": group.get("ik_iterations")} if ik != "off" else {})
-    patterns = ((config.get("data") or {}).get("split") or {}).get("groups")
-    # A report's rows say who belongs together.
-    groups = {key: value for key, value in {"groups": patterns, "groups_file": grouped}.items() if value}
+    groups = _groups(config.get("data") or {}) | ({"groups_file": grouped} if grouped else {})
     drawn = {"batch": group.get("batch")} if inference(config).get("memory.blend") == "sampled" else {}
     return {"mode": mode, **solver, **inference(config), **groups, **drawn}
+
+
+def _groups(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the patterns of clips that belong together, as a report's rows say who does."""
+    patterns = (data.get("split") or {}).get("groups")
+    sources = (data.get("sources") or {}).items()
+    own = {name: groups for name, source in sources if (groups := source.get("groups"))}
+    return {key: value for key, value in {"groups": patterns, "source_groups": own}.items() if value}
 
 
 def deployment_id(config: Mapping[str, Any]) -> str:
@@ -186,8 +192,14 @@ def trained_by(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _draws(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return how windows are drawn, the one key of the data that its digest does not cover."""
-    return {"data.weighting": config["data"].get("weighting", "frames")} if config.get("data") else {}
+    """Return how windows are drawn, which the data's digest does not cover."""
+    data = config.get("data")
+    if not data:
+        return {}
+    sources = (data.get("sources") or {}).items()
+    weights = {name: _canonical(source.get("weight")) for name, source in sources}
+    shares = {"data.sources": weights} if any(weights.values()) else {}
+    return {"data.weighting": data.get("weighting", "frames"), **shares}
 
 
 def _training(kind: str, config: Mapping[str, Any], data: str, upstream: str | None) -> dict[str, Any]:

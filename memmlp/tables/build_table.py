@@ -71,6 +71,11 @@ def collect(
     )
 
 
+def titled(table: Table, source: str) -> Table:
+    """Return a table of one source's test clips with a title that says so."""
+    return replace(table, title=f"{table.title} (test clips of {source} alone)")
+
+
 def without_runs(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
     """Make the table of a sweep whose runs can't be known: the paper's values, and the reason."""
     return replace(collect(sweep, {arm.label: {} for arm in sweep.runnable()}, modes), flags=(reason,))

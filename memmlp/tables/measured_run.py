@@ -69,6 +69,7 @@ class Measured:
             millions of parameters, MB of the ONNX file, and frames a second.
         origin: what the run was made from.
         latency: everything that was measured of its streaming step.
+        sources: the source of each clip, where the data has several.
         run: the run's folder; None where the results were kept without one.
     """
 
@@ -80,6 +81,7 @@ class Measured:
     origin: Origin
     latency: Mapping[str, Any] = field(default_factory=dict)
     run: Run | None = None
+    sources: Mapping[str, str] = field(default_factory=dict)
 
     def value(self, mode: str, branch: str, metric: str) -> float | None:
         """Return a metric's mean over clips, or a cost; None where the run has none."""
@@ -95,6 +97,30 @@ class Measured:
     def group(self, clip: str) -> str:
         """Return the group of a clip."""
         return self.groups.get(clip, clip)
+
+    def by_source(self) -> dict[str, Measured]:
+        """Return the same of each source's clips alone, by the source's name; empty where there is one."""
+        names = sorted(set(self.sources.values()))
+        return {name: self._of([clip for clip in self.clips if self.sources[clip] == name]) for name in names}
+
+    def of_source(self, source: str) -> Measured:
+        """Return the same of one source's clips alone. Raises InputError where the run has none of it."""
+        found = self.by_source()
+        if source not in found:
+            known = ", ".join(found) or "none, as its data is one folder"
+            raise InputError(f"--source {source}: run {self.id} has no test clip of it; allowed is {known}")
+        return found[source]
+
+    def _of(self, clips: Sequence[str]) -> Measured:
+        """Return the same of some of the clips alone."""
+        means = {
+            mode: {
+                branch: {metric: known_mean(self.by_clip(clips, mode, branch, metric)) for metric in metrics}
+                for branch, metrics in branches.items()
+            }
+            for mode, branches in self.means.items()
+        }
+        return replace(self, clips={clip: self.clips[clip] for clip in clips}, means=means)
 
     def has(self, branch: str) -> bool:
         """Return whether the run was evaluated in that branch."""
@@ -115,6 +141,12 @@ class Measured:
         return all(math.isclose(one, other, rel_tol=SAME) for one, other in known)
 
 
+def known_mean(values: np.ndarray) -> float:
+    """Return the mean over the clips that have a number, as the evaluation does; NaN where none has."""
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if len(known) else math.nan
+
+
 def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     """Read a finished run.
 
@@ -132,16 +164,18 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     means: dict[str, dict[str, Any]] = {}
     clips: dict[str, dict[str, Any]] = {}
     groups: dict[str, str] = {}
+    sources: dict[str, str] = {}
     reports = list(map(_read, _evaluations(run, stages)))
     for report in reports:
         means.setdefault(report["mode"], {}).update(report["mean"])
         for clip in report["clips"]:
             clips.setdefault(clip["name"], {}).setdefault(report["mode"], {}).update(clip)
             groups |= {clip["name"]: clip["group"]} if clip.get("group") else {}
+            sources |= {clip["name"]: clip["source"]} if clip.get("source") else {}
     deployments = [run.deployment(name) for name in stages or () if run.deployment(name).done]
     latency = (deployments or [run.preferred_deployment])[-1].record
     origin = _evaluated(_origin(manifest), reports)
-    return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run)
+    return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run, sources)
 
 
 def _evaluations(run: Run, stages: Sequence[str] | None) -> list[Path]:

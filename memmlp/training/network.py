@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,6 +35,7 @@ class NetworkTraining:
         rollout: makes the history that the network is trained on.
         optim: steps, learning rates and intervals.
         weighting: how training windows are drawn, "frames" or "clips" (see WindowSampler).
+        shares: how often a window is of each source (see WindowSampler).
     """
 
     seed: int
@@ -42,6 +43,7 @@ class NetworkTraining:
     rollout: Rollout
     optim: Optim
     weighting: str
+    shares: Mapping[str, float] | None = None
 
     def train(
         self,
@@ -80,6 +82,7 @@ class NetworkTraining:
             self.seed,
             validate=lambda network: modes.quick_stream(network, pieces),
             weighting=self.weighting,
+            shares=self.shares,
         )
         train(task, self.optim, run, self.seed, "network", watch)
         checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
@@ -99,10 +102,11 @@ class MotionTask:
         seed: int,
         validate: Callable[[WindowModel], dict[str, float]],
         weighting: str = "frames",
+        shares: Mapping[str, float] | None = None,
     ):
         self.model, self.loss, self.rollout, self.dataset = model, loss, rollout, dataset
         self.module: nn.Module = nn.ModuleDict({"model": model, "loss": loss, "rollout": rollout})
-        self.sampler = WindowSampler(dataset, optim.batch, model.frames, seed, weighting)
+        self.sampler = WindowSampler(dataset, optim.batch, model.frames, seed, weighting, shares)
         self.learn = torch.compile(model.learn) if optim.compile else model.learn
         self._validate = validate
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from fake_runs import ORIGIN, fake_run, fake_sweep, table_of
+from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, table_of
 
 from memmlp.common.errors import InputError
+from memmlp.common.files import read_json
+from memmlp.report.kept_results import Kept, dumps, load_kept
 from memmlp.runs.evaluation_file import write_report
 from memmlp.sweep.spec import Sweep
-from memmlp.tables.measured_run import load
+from memmlp.tables.measured_run import Measured, load
 
 
 def test_costs_have_the_tables_units(tmp_path: Path):
@@ -63,3 +66,54 @@ def test_the_evaluations_of_a_table_are_its_own(tmp_path: Path):
     assert load(run.folder, ["stream-0"]).value("stream", "combined", "MPJPE") != 1.0
     assert load(run.folder, ["stream-1"]).value("stream", "combined", "MPJPE") == 1.0
     assert load(run.folder, ["stream-1"]).value("stream", "rotation", "MPJPE") is None
+
+
+SOURCES = {clip: clip.split("/")[0] for clip in CLIPS}
+
+
+def mixed(outputs) -> Measured:
+    run = fake_run(outputs, "a")
+    for path in run.evaluations.glob("*.json"):
+        report = read_json(path)
+        for row in report["clips"]:
+            row["source"] = SOURCES[row["name"]]
+        write_report(path, {key: value for key, value in report.items() if key != "digest"})
+    return load(run.folder)
+
+
+def test_means_of_one_sources_clips(tmp_path):
+    measured = mixed(tmp_path)
+    assert measured.sources == SOURCES
+    found = measured.by_source()
+    assert list(found) == ["kicks", "salsa"]
+    assert list(found["kicks"].clips) == ["kicks/01", "kicks/02"]
+    for source, part in found.items():
+        own = [clip for clip in CLIPS if SOURCES[clip] == source]
+        expected = sum(measured.clips[clip]["stream"]["rotation"]["MPJPE"] for clip in own) / len(own)
+        assert part.value("stream", "rotation", "MPJPE") == pytest.approx(expected)
+    assert measured.of_source("salsa").value("stream", "rotation", "MPJPE") != measured.value(
+        "stream", "rotation", "MPJPE"
+    )
+    with pytest.raises(InputError, match="allowed is kicks, salsa"):
+        measured.of_source("cmu")
+
+
+def test_one_source_has_no_parts(tmp_path):
+    measured = load(fake_run(tmp_path, "a").folder)
+    assert measured.by_source() == {}
+    with pytest.raises(InputError, match="its data is one folder"):
+        measured.of_source("salsa")
+
+
+def test_sources_are_kept(tmp_path):
+    kept = Kept("5", (), {"a": {0: mixed(tmp_path)}}, {"a": ()})
+    path = tmp_path / "kept.json"
+    path.write_text(dumps(kept))
+    again = load_kept(path)
+    assert again.sources == ("kicks", "salsa")
+    assert dumps(again) == path.read_text()
+    part = again.of_source("kicks").runs["a"][0]
+    whole = kept.of_source("kicks").runs["a"][0]
+    assert math.isclose(
+        part.means["stream"]["rotation"]["MPJPE"], whole.means["stream"]["rotation"]["MPJPE"], rel_tol=1e-4
+    )

@@ -11,6 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from memmlp.common.errors import one_line
+from memmlp.motion.body import FPS
+from memmlp.motion.preparing.folders import source_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -29,6 +31,8 @@ def show_manifest(manifest: Manifest) -> None:
     for part, total in manifest.totals.items():
         table.add_row(part, f"{total['clips']:.0f}", f"{total['frames']:.0f}", f"{total['hours']:.3f}")
     Console(highlight=False).print(table)
+    for source in manifest.sources:
+        show_source(manifest, source)
     show_rates(manifest.clips)
     show_skipped([f"{file.file}: {file.reason}" for file in manifest.skipped])
     show_files(manifest.ignored, manifest.passed_over, manifest.links, manifest.unusual)
@@ -40,6 +44,14 @@ def show_manifest(manifest: Manifest) -> None:
     )
     if not manifest.coverage.whole:
         click.echo(f"{manifest.coverage}: {manifest.coverage.gaps}")
+
+
+def show_source(manifest: Manifest, source: str) -> None:
+    """Print how many clips and hours of one source are in each part."""
+    clips = [clip for clip in manifest.clips if source_of(clip.name) == source]
+    parts = [(part, [clip.length for clip in clips if clip.split == part]) for part in manifest.totals]
+    words = [f"{part} {len(lengths)} clips, {sum(lengths) / FPS / 3600:.3f} h" for part, lengths in parts]
+    click.echo(f"{source}: {'; '.join(words)}")
 
 
 def show_rates(clips: tuple[ClipRecord, ...]) -> None:

@@ -46,6 +46,10 @@ def _values(node: DictConfig, prefix: str) -> Iterator[tuple[str, Any, Any]]:
         InputError: for a key that is not in the schema.
     """
     schema: Any = OmegaConf.get_type(node)
+    if not dataclasses.is_dataclass(schema):  # a dictionary of groups
+        for name in map(str, node):
+            yield from _values(node[name], f"{prefix}{name}.")
+        return
     known = [spec.name for spec in dataclasses.fields(schema)]
     for extra in sorted(set(map(str, node)) - set(known)):
         raise InputError(unknown_key(prefix + extra, known))
@@ -108,10 +112,29 @@ def _check_combinations(cfg: DictConfig) -> None:
     if (cfg.vqvae.epochs is None) == (cfg.vqvae.steps is None):
         given = f"vqvae.epochs={cfg.vqvae.epochs}, vqvae.steps={cfg.vqvae.steps}"
         raise InputError(f"{given}: allowed is one of them, and null for the other")
+    _check_sources(cfg.data)
     split = cfg.data.split
     held_out = split.val + (split.test if isinstance(split.get("test"), float) else 0)
     if held_out >= 1:
         raise InputError(f"data.split.val={split.val}: allowed is less than what data.split.test leaves of 1")
+
+
+def _check_sources(data: DictConfig) -> None:
+    """Check that the data is one folder, a list of folders, or named sources."""
+    sources = data.get("sources") or {}
+    if (data.root is None) == (not sources):
+        raise InputError(
+            f"data.root={data.root}: allowed is a folder or a list of them, or null with data.sources"
+        )
+    if bad := [name for name in map(str, sources) if not re.fullmatch(r"[\w-]+", name)]:
+        raise InputError(f"data.sources.{bad[0]}: allowed in a name are letters, digits, - and _")
+    weights = [source.weight for source in sources.values()]
+    if any(weights) and not all(weights):
+        raise InputError("data.sources: allowed is a weight for each source or for none")
+    if (sources or OmegaConf.is_list(data.root)) and data.split.groups_file is not None:
+        raise InputError(
+            "data.split.groups_file: allowed for one folder; a source has data.sources.NAME.groups_file"
+        )
 
 
 def _is(node: DictConfig, schema: type) -> bool:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Optional
+from typing import Any, Optional
 
 from memmlp.config.schema.rules import (
     EachOf,
     Existing,
+    Folders,
     Text,
+    Within,
     at_least,
     called,
     fraction,
@@ -83,8 +85,19 @@ class SynthDataConfig(DataConfig):
 
 
 @dataclass
-class SeededDataConfig(DataConfig):
+class SourceConfig:
+    """One of several sources of motion."""
+
     root: str = key(Existing("folder"))
+    groups: list[str] = field(default_factory=list, metadata={"rule": EachOf(empty=True)})
+    groups_file: Optional[str] = optional(Existing("file"))
+    weight: Optional[float] = optional(Within(0, strict=True))
+
+
+@dataclass
+class SeededDataConfig(DataConfig):
+    root: Any = key(Folders())
+    sources: dict[str, SourceConfig] = field(default_factory=dict)
     synth: Optional[SynthConfig] = None
     split: SeededSplitConfig = field(default_factory=SeededSplitConfig)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -82,6 +83,20 @@ class Text:
 
     def __str__(self) -> str:
         return "text that is not empty"
+
+
+@dataclass(frozen=True)
+class Folders:
+    """The rule that a value is the path of an existing folder, or a list of several."""
+
+    def allows(self, value: Any) -> bool:
+        """Return whether every folder exists and none is there twice."""
+        paths = [value] if isinstance(value, str) else list(value) if isinstance(value, Iterable) else []
+        known = all(isinstance(path, str) and Path(path).is_dir() for path in paths)
+        return bool(paths) and known and len(set(map(Path, paths))) == len(paths)
+
+    def __str__(self) -> str:
+        return "an existing folder, or a list of several"
 
 
 @dataclass(frozen=True)

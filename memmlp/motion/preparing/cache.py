@@ -27,7 +27,8 @@ from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
 from memmlp.motion.clip import Clip, resample
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.preparing.duplicates import assign
-from memmlp.motion.preparing.find import clip_name, find_clips
+from memmlp.motion.preparing.find import clip_name
+from memmlp.motion.preparing.folders import Folders, Root, find_all
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest, write_manifest
 from memmlp.motion.preparing.splits import PARTS, Split
 from memmlp.motion.preparing.survey import Survey, survey
@@ -43,14 +44,14 @@ class ClipFolder:
     """What a cache is made from.
 
     Attributes:
-        root: folder of npz files, at any depth.
+        root: folder of npz files, at any depth, or several of them by name.
         split: assigns clips to train, val, test.
         body: "builtin" or the path of an SMPL-H model.npz.
         min_frames: clips with fewer frames at 60 Hz are skipped (42 leave T = 41 frames of input).
         strict: whether the first file that would be skipped raises InputError instead.
     """
 
-    root: Path
+    root: Root
     split: Split
     body: str = "builtin"
     min_frames: int = 42
@@ -64,7 +65,7 @@ def prepare(source: ClipFolder, out: Path) -> Manifest:
         InputError: for a root without usable clips, an impossible split, a bad file under `strict`, a folder
             that cannot be written, or too small a disk.
     """
-    source = ClipFolder(Path(source.root), source.split, str(source.body), source.min_frames, source.strict)
+    source = replace(source, body=str(source.body))
     if source.min_frames < 2:
         raise InputError(
             f"data.min_frames: {source.min_frames}; allowed: 2 or more (one frame has no velocity)"
@@ -98,7 +99,7 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
     names, split = [clip.name for clip in found.clips], source.split
     parts, groups, duplicates = assign(split, found.clips)
     every = [*names, *found.short, *found.damaged, *_other_names(found, parts)]
-    split.grouping.check([name for name, part in parts.items() if part], every)
+    split.check_groups([name for name, part in parts.items() if part], every)
     missing = split.missing(every)
     clips = _place(found.clips, parts, groups)
     if not any(clip.split == "train" for clip in clips):
@@ -122,6 +123,7 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
         links=found.found.links,
         unusual=found.unusual,
         passed_over=dict(found.found.passed_over),
+        sources=tuple(source.root.sources) if isinstance(source.root, Folders) else (),
     )
     _write(source, rest, manifest, out)
     return manifest
@@ -208,7 +210,7 @@ def _digest(clips: Sequence[ClipRecord], rest: np.ndarray, min_frames: int) -> s
 
 def _request(source: ClipFolder, rest: np.ndarray) -> str:
     """Return a digest of the settings and of each source's path, size and time, without opening any."""
-    files = [(file, *_stamp(source.root / file)) for file in find_clips(source.root).files]
+    files = [(file, *_stamp(source.root / file)) for file in find_all(source.root).files]
     code = [FORMAT, FRAMES, RECIPES["features"]]
     return _hash([*code, source.min_frames, rest.tolist(), source.split.describe(), files])
 
@@ -247,7 +249,7 @@ def _check_space(out: Path, needed: int) -> None:
         raise InputError(f"{out}: the cache needs {needed / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free")
 
 
-def _no_clips(root: Path, found: Survey) -> str:
+def _no_clips(root: Root, found: Survey) -> str:
     first = f"; the first: {found.skipped[0].file}: {found.skipped[0].reason}" if found.skipped else ""
     return (
         f"data.root: no usable clip below {root} ({len(found.skipped)} bad, {found.ignored} without poses"

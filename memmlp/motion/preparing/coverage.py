@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 from memmlp.common.errors import InputError
+from memmlp.motion.preparing.folders import Root
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class Coverage:
         each = [f"{name} {count} of {self.listed[name]}" for name, count in self.absent.items()]
         return f"{every - there} of {every} entries of the split's list have no clip ({', '.join(each)})"
 
-    def check(self, root: Path) -> None:
-        """Check that every entry has a clip below a folder. Raises InputError where one has none."""
+    def check(self, root: Root) -> None:
+        """Check that every entry has a clip below the data's root. Raises InputError where one has none."""
         if not self.whole:
             raise InputError(
                 f"data.root: {self.gaps} below {root}; data.partial=true takes the part there is"

@@ -75,6 +75,7 @@ class Manifest:
         links: other path of a file or folder -> the path by which it was read.
         unusual: clip -> what is odd about it, though it may be sound.
         passed_over: number of files that are no npz, by suffix.
+        sources: names of the sources, with one of which every clip's name begins; empty for one folder.
         format: format number of the cache.
     """
 
@@ -96,6 +97,7 @@ class Manifest:
     links: dict[str, str]
     unusual: dict[str, str]
     passed_over: dict[str, int]
+    sources: tuple[str, ...] = ()
     format: int = FORMAT
 
     @classmethod
@@ -113,7 +115,9 @@ class Manifest:
             data["clips"] = tuple(ClipRecord(**clip) for clip in data["clips"])
             data["skipped"] = tuple(Skipped(**file) for file in data["skipped"])
             data["rest_joints"] = tuple(map(tuple, data["rest_joints"]))
-            return cls(**{**data, **{name: tuple(data[name]) for name in ("missing", "damaged")}})
+            for name in ("missing", "damaged", "sources"):
+                data[name] = tuple(data[name])
+            return cls(**data)
         except FileNotFoundError as error:
             raise InputError(f"{out}: no finished cache; run memmlp data prepare") from error
         except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:

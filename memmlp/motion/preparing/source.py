@@ -12,7 +12,8 @@ from filelock import FileLock
 
 from memmlp.motion.preparing.cache import ClipFolder, finished, prepare
 from memmlp.motion.preparing.coverage import Coverage
-from memmlp.motion.preparing.find import Found, clip_name, find_clips
+from memmlp.motion.preparing.find import Found, clip_name
+from memmlp.motion.preparing.folders import find_all
 from memmlp.motion.preparing.manifest import Manifest
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class MotionSource:
     """A folder of clips, which is generated if it is synthetic, and its cache.
 
     Attributes:
-        source: the folder of clips, its split and body.
+        source: the folder of clips, or several, with its split and body.
         generate: makes a synthetic folder; None for the user's own.
         caches: folder of all caches.
         partial: whether a part of what the split lists will do.
@@ -68,7 +69,7 @@ class MotionSource:
     @property
     def grouped(self) -> str | None:
         """A digest of the column file that says which clips belong together; None without one."""
-        return self.source.split.grouping.digest
+        return self.source.split.grouped
 
     def prepare(self) -> Prepared:
         """Return the cache with its manifest; it is made if it is missing or out of date.
@@ -77,11 +78,8 @@ class MotionSource:
             InputError: if the cache can't be made, or if, without `partial`, an entry of the split's list has
                 no clip. A missing file is said before any is read.
         """
-        if self.generate is not None and not self.source.root.exists():
-            self.source.root.parent.mkdir(parents=True, exist_ok=True)
-            with FileLock(self.source.root.with_name(f".{self.source.root.name}.lock")):
-                if not self.source.root.exists():  # no other process made it while this one waited
-                    self._generate(self.generate)
+        if self.generate is not None:
+            _make_once(Path(str(self.source.root)), self.generate)
         if not self.partial:
             self._listed().check(self.source.root)
         found = Prepared(self.cache, prepare(self.source, self.cache))
@@ -92,7 +90,7 @@ class MotionSource:
     def _listed(self) -> Coverage:
         """Return how many entries of the split have a file, whatever is in it."""
         split = self.source.split
-        found = find_clips(self.source.root) if split.listed else Found()
+        found = find_all(self.source.root) if split.listed else Found()
         names = [clip_name(file) for file in (*found.files, *found.links)]
         return Coverage.of(split.listed, split.missing(names))
 
@@ -101,9 +99,17 @@ class MotionSource:
         manifest = finished(self.source, self.cache)
         return manifest.digest if manifest else None
 
-    def _generate(self, generate: Callable[[Path], object]) -> None:
-        """Make the clips in a temporary folder and rename it, so that a kill leaves no incomplete folder."""
-        root = self.source.root
-        unfinished = root.with_name(root.name + ".unfinished")
-        generate(unfinished)
-        unfinished.rename(root)
+
+def _make_once(root: Path, generate: Callable[[Path], object]) -> None:
+    """Make the clips of a folder that is not there yet; concurrent callers wait for one another.
+
+    They are made in a temporary folder that is renamed, so that a kill leaves no incomplete one.
+    """
+    if root.exists():
+        return
+    root.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(root.with_name(f".{root.name}.lock")):
+        if not root.exists():  # no other process made it while this one waited
+            unfinished = root.with_name(root.name + ".unfinished")
+            generate(unfinished)
+            unfinished.rename(root)

@@ -68,8 +68,12 @@ class Split(Protocol):
         ...
 
     @property
-    def grouping(self) -> Grouping:
-        """What ties clips together."""
+    def grouped(self) -> str | None:
+        """A digest of the column files that say which clips belong together; None without one."""
+        ...
+
+    def check_groups(self, names: Collection[str], files: Collection[str]) -> None:
+        """Check that column files fit the clips to be split and all files (see `Grouping.check`)."""
         ...
 
 
@@ -83,6 +87,13 @@ class _Grouped:
     def grouping(self) -> Grouping:
         """What ties clips together."""
         return Grouping.of(self.groups, self.groups_file)
+
+    @property
+    def grouped(self) -> str | None:
+        return self.grouping.digest
+
+    def check_groups(self, names: Collection[str], files: Collection[str]) -> None:
+        self.grouping.check(names, files)
 
 
 @dataclass(frozen=True)
@@ -121,6 +132,59 @@ class SeededSplit(_Grouped):
 
     def describe(self) -> dict[str, Any]:
         return {"kind": "seeded", "test": self.test, **_carving(self)}
+
+
+@dataclass(frozen=True)
+class MixedSplit:
+    """Several sources, each split by itself, so that each has all parts.
+
+    A clip's name is its source's, a `/`, and the name that it has there; the source's split sees the latter.
+
+    Args:
+        splits: source's name -> its split.
+    """
+
+    splits: Mapping[str, SeededSplit]
+
+    def assign(self, names: Sequence[str]) -> Assignment:
+        parts: dict[str, str | None] = {}
+        groups: dict[str, str] = {}
+        for source, own in self._own(names):
+            try:
+                found = self.splits[source].assign(own)
+            except InputError as error:
+                raise InputError(f"data.sources.{source}: {error}") from None
+            parts |= {f"{source}/{name}": part for name, part in found.parts.items()}
+            groups |= {f"{source}/{name}": f"{source}/{group}" for name, group in found.groups.items()}
+        return Assignment(parts, groups)
+
+    def missing(self, names: Collection[str]) -> tuple[str, ...]:
+        return ()
+
+    @property
+    def listed(self) -> Mapping[str, int]:
+        return {}
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "kind": "mixed",
+            "sources": {source: split.describe() for source, split in self.splits.items()},
+        }
+
+    @property
+    def grouped(self) -> str | None:
+        digests = {source: split.grouped for source, split in self.splits.items() if split.grouped}
+        return hashlib.sha256(json.dumps(digests, sort_keys=True).encode()).hexdigest() if digests else None
+
+    def check_groups(self, names: Collection[str], files: Collection[str]) -> None:
+        every = dict(self._own(files))
+        for source, own in self._own(names):
+            self.splits[source].check_groups(own, every[source])
+
+    def _own(self, names: Iterable[str]) -> Iterator[tuple[str, list[str]]]:
+        """Yield each source with the names that its clips have there."""
+        for source in self.splits:
+            yield source, [rest for name in names if (rest := name.removeprefix(f"{source}/")) != name]
 
 
 @dataclass(frozen=True)

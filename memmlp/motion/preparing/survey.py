@@ -15,7 +15,8 @@ from memmlp.motion.body import FPS
 from memmlp.motion.clip import Clip, Skipped, resample
 from memmlp.motion.formats.npz import NoMotion, read_clip
 from memmlp.motion.plausible import check_plausible, unusual
-from memmlp.motion.preparing.find import Found, clip_name, find_clips
+from memmlp.motion.preparing.find import Found, clip_name
+from memmlp.motion.preparing.folders import Root, find_all
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
 
 
@@ -57,7 +58,7 @@ class TooShort(InputError):
     """A sound clip has too few frames."""
 
 
-def survey(root: Path, min_frames: int = 2, strict: bool = False) -> Survey:
+def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
     """Read every npz below a folder.
 
     Raises:
@@ -65,7 +66,7 @@ def survey(root: Path, min_frames: int = 2, strict: bool = False) -> Survey:
     """
     clips: dict[str, ClipRecord] = {}
     odd: dict[str, str] = {}
-    short, ignored, found = [], 0, find_clips(root)
+    short, ignored, found = [], 0, find_all(root)
     skipped = [Skipped(folder, reason) for folder, reason in found.unreadable.items()]
     for file in progress_bar(found.files, "reading"):
         name = clip_name(file)

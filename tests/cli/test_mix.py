@@ -1,0 +1,56 @@
+"""Two sources at once, as a person trains on them and looks at each."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from command_line import run, run_apart
+
+from memmlp.motion.clip import Clip
+from memmlp.motion.formats.npz import write_clip
+from memmlp.runs.lookup import list_runs
+
+TINY = ["profile=tiny", "tracking=none", "threads=1", "optim.steps=6", "memory=none"]
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """Two folders of clips, and a sweep on both."""
+    for number, folder in enumerate(("one", "two")):
+        rng = np.random.default_rng(number)
+        for n in range(4):
+            poses = 0.05 * np.cumsum(rng.normal(size=(90, 22, 3)), 0)
+            write_clip(tmp_path / folder / f"{n}.npz", Clip("", poses, np.zeros((90, 3)), 60.0))
+    base = ["data=mocap", "data.root=[one,two]"]
+    (tmp_path / "both.yaml").write_text(yaml.safe_dump({"arms": {"none": []}, "base": base}))
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_every_command_knows_where_a_clip_is_from(home):
+    assert "none" in run_apart(home, "sweep", "both.yaml", *TINY, "--workers", "1")
+    (made,) = list_runs(home / "outputs")
+    (cache,) = (home / "outputs" / "cache").glob("*/manifest.json")
+    said = run(home, "data", "inspect", str(cache.parent))
+    assert "one: train 2 clips, 0.001 h; val 1 clips, 0.000 h; test 1 clips, 0.000 h" in said
+    report = json.loads(next(made.evaluations.glob("stream*.json")).read_text())
+    assert [row["source"] for row in report["clips"]] == ["one", "two"]
+    for command in (["runs", "show"], ["eval"]):
+        shown = run(home, *command, made.id)
+        assert "of one" in shown or "on one" in shown
+        assert "of two" in shown or "on two" in shown
+    table = run(home, "table", "both.yaml", *TINY, "--source", "two", "--format", "json")
+    shown = json.loads(table)
+    assert shown["title"].endswith("(test clips of two alone)")
+    (row,) = [row for row in report["clips"] if row["source"] == "two"]
+    assert f"{row['rotation']['MPJPE']:.4f}"[:5] in table
+    assert "allowed is one, two" in run(home, "table", "both.yaml", *TINY, "--source", "three", code=2)
+    run(home, "results", "save", "both.yaml", *TINY, "--out", "pages/data")
+    run(home, "results", "docs", "--folder", "pages")
+    page = (home / "pages" / "both.md").read_text()
+    assert "(test clips of one alone)" in page
+    assert "(test clips of two alone)" in page

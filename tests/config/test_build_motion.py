@@ -1,0 +1,123 @@
+"""The data of a config: one folder, a list of them, named sources."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+from omegaconf import OmegaConf
+
+from memmlp.common.errors import InputError
+from memmlp.config.build import build_experiment
+from memmlp.config.build_motion import build_motion
+from memmlp.config.compose import composed
+from memmlp.config.schema import restored
+from memmlp.motion.preparing.folders import Folders
+from memmlp.motion.preparing.splits import MixedSplit, SeededSplit
+
+MIX = {
+    "defaults": ["mocap", {"grouping@sources.bandai": "bandai_namco"}, "_self_"],
+    "name": "my_mix",
+    "root": None,
+    "sources": {"cmu": {"root": "a", "weight": 2}, "bandai": {"root": "b", "weight": 1}},
+}
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    for folder in ("a", "b", "x/a", "conf/data"):
+        (tmp_path / folder).mkdir(parents=True)
+    return tmp_path
+
+
+def mix(changes: dict | None = None, *words: str):
+    Path("conf/data/my_mix.yaml").write_text(yaml.safe_dump(MIX | (changes or {})))
+    return composed(["--config-dir", "conf", "data=my_mix", *words])
+
+
+def with_source(**keys) -> dict:
+    return {"sources": {**MIX["sources"], "cmu": {**MIX["sources"]["cmu"], **keys}}}
+
+
+def test_a_list_of_one_folder_is_that_folder():
+    one, listed = (build_motion(composed(["data=mocap", f"data.root={root}"])) for root in ("a", "[a]"))
+    assert one == listed
+    assert isinstance(one.source.split, SeededSplit)
+
+
+def test_a_list_of_folders_names_sources_after_them():
+    source = build_motion(composed(["data=mocap", "data.root=[b,a]", "data.split.test=0.2"])).source
+    assert source.root == Folders({"b": Path("b"), "a": Path("a")})
+    assert isinstance(source.split, MixedSplit)
+    assert {split.test for split in source.split.splits.values()} == {0.2}
+    with pytest.raises(InputError, match="two folders of one name"):
+        build_motion(composed(["data=mocap", "data.root=[a,x/a]"]))
+
+
+def test_named_sources_have_groups_of_their_own():
+    split = build_motion(mix(None, "data.split.val=0.2")).source.split
+    assert split.splits["cmu"].groups[0] == "salsa/(?:01|16)$"
+    (last,) = set(split.splits["bandai"].groups) - set(split.splits["cmu"].groups)
+    kinds = [(d, style, n) for d in (1, 2) for style in ("sad", "old") for n in (1, 2)]
+    names = [f"dataset-{d}_walk-left_{style}_00{n}" for d, style, n in kinds]
+    groups = SeededSplit(groups=[last]).assign([*names, "other"]).groups
+    assert {name: groups[name] for name in names} == {
+        name: f"dataset-1_walk-left_{name.split('_')[2]}_001" for name in names
+    }
+    Path("groups.csv").write_text("clip,group\nsalsa/01,ann\n")
+    own = build_motion(mix(with_source(groups_file="groups.csv")))
+    assert own.source.split.splits["cmu"].grouping.rows == {"salsa/01": "ann"}
+    assert own.grouped != build_motion(mix()).grouped
+
+
+@pytest.mark.parametrize(
+    ("changes", "words", "said"),
+    [
+        ({"sources": {}}, [], "data.sources.bandai.root: has no value"),
+        ({"root": "a"}, [], "data.root=a"),
+        ({"sources": {**MIX["sources"], "c/d": {"root": "a"}}}, [], "data.sources.c/d"),
+        ({"sources": {**MIX["sources"], "other": {"root": "a"}}}, [], "a weight for each source or for none"),
+        (with_source(root="nowhere"), [], "data.sources.cmu.root=nowhere"),
+        (with_source(weight=0), [], "data.sources.cmu.weight=0"),
+        (with_source(groups_file="none.csv"), [], "data.sources.cmu.groups_file=none.csv"),
+        ({}, ["data.split.groups_file=conf/data/my_mix.yaml"], "data.sources.NAME.groups_file"),
+        ({}, ["data.sources.cmu.weight=-1"], "data.sources.cmu.weight=-1"),
+    ],
+)
+def test_what_does_not_go_together_is_one_line(changes, words, said):
+    with pytest.raises(InputError, match="data") as error:
+        mix(changes, *words)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+    with pytest.raises(InputError, match=r"data.root=None: allowed is a folder or a list"):
+        composed(["data=mocap", "data.root=null"])
+
+
+def test_weights_are_drawn_by_and_enter_the_identity_where_there_are_any():
+    def identity(cfg):
+        return build_experiment(cfg).identity("0" * 64).id
+
+    weighted = mix()
+    assert build_experiment(weighted).training.shares == {"cmu": 2, "bandai": 1}
+    plain = {name: {"root": source["root"]} for name, source in MIX["sources"].items()}
+    bare = mix({"sources": plain})
+    assert build_experiment(bare).training.shares is None
+    one = composed(["data=mocap", "data.root=a"])
+    assert identity(bare) == identity(one)  # on the same data, whose digest knows the clips
+    assert len({identity(cfg) for cfg in (weighted, bare, mix(None, "data.sources.cmu.weight=3"))}) == 3
+
+
+def test_own_groups_and_column_files_enter_the_evaluation_alone():
+    Path("groups.csv").write_text("clip,group\nsalsa/01,ann\n")
+    every = [mix(), mix(with_source(groups=["x"])), mix(with_source(groups_file="groups.csv"))]
+    experiments = [build_experiment(cfg) for cfg in every]
+    assert len({experiment.evaluations["stream"] for experiment in experiments}) == 3
+    assert len({experiment.identity("0" * 64).id for experiment in experiments}) == 1
+
+
+def test_a_run_on_a_mix_is_restored():
+    cfg = mix()
+    record = OmegaConf.to_container(cfg, resolve=True)
+    assert build_motion(restored(record)) == build_motion(cfg)
