@@ -152,14 +152,21 @@ CHECKS: dict[str, Callable[[dict[str, Any]], None]] = {
 
 
 def make_placeholders(words: list[str]) -> None:
-    """Make the data folders and files that overrides name, and the config of the guide on own components."""
+    """Make the data folders and files that overrides name, and the configs of the guides."""
     for word in words:
         key, _, value = word.partition("=")
         if key in ("data.root", "data.split.folder"):
-            Path(value).mkdir(parents=True, exist_ok=True)
+            for folder in value.strip("[]").split(","):
+                Path(folder).mkdir(parents=True, exist_ok=True)
         elif key == "data.body" and value != "builtin":
             Path(value).parent.mkdir(parents=True, exist_ok=True)
             Path(value).touch()
         elif word == "myconf":
             Path("myconf/hand").mkdir(parents=True, exist_ok=True)
             Path("myconf/hand/feet.yaml").write_text("{name: feet, _target_: mine.FeetPosition}")
+        elif word == "my_configs":
+            Path("my_configs/data").mkdir(parents=True, exist_ok=True)
+            guide = (ROOT / "docs/guides/motion.md").read_text(encoding="utf-8")
+            (mix,) = (block for _, block in blocks(guide, "yaml") if "sources:" in block)
+            Path("my_configs/data/my_mix.yaml").write_text(mix)
+            make_placeholders([f"data.root={root}" for root in re.findall(r"root: ([^\s,]+),", mix)])
