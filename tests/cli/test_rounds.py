@@ -123,6 +123,7 @@ def test_the_table_shows_the_rounds(memmlp: Memmlp, runs: Runs):
     assert "seeds were spent in rounds, but not of these runs" in other
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("patience", [0, 4, 9, 11, 18])
 def test_interrupted_anywhere_it_ends_the_same(memmlp: Memmlp, runs: Runs, patience: int):
     runs.patience = patience

@@ -106,6 +106,7 @@ REFUSED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("overrides", "word"), REFUSED, ids=[" ".join(options) for options, _ in REFUSED])
 def test_what_makes_no_sense_is_refused_in_one_line(overrides, word):
     with pytest.raises(InputError) as refusal:
@@ -114,6 +115,7 @@ def test_what_makes_no_sense_is_refused_in_one_line(overrides, word):
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("profile", ["tiny", "small", "paper"])
 def test_profiles_and_the_papers_experiment_fit(name, profile):

@@ -309,6 +309,7 @@ REFUSED = [(list(pair), refused(pair)) for pair in PAIRS if refused(pair)]
 REFUSED += [(["predictor=two_branch_memory", "predictor.depth=0"], "predictor.depth=0")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("overrides", "word"), REFUSED, ids=[" ".join(options) for options, _ in REFUSED])
 def test_what_cannot_go_together_is_refused_in_one_line(overrides, word):
     rotation_only = any(option.startswith("predictor=rotation_only") for option in overrides)
@@ -332,6 +333,7 @@ def test_every_protocol_builds(name, tmp_path):
     assert build_experiment(cfg).config["data"]["name"] == f"amass_{name}"
 
 
+@pytest.mark.slow
 def test_a_joint_vqvae_is_part_of_the_runs_identity_and_its_own_stage_is_not():
     def experiment_of(*overrides: str) -> Experiment:
         return build_experiment(composed(["memory=vq_joint", *overrides]))

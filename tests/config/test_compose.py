@@ -39,6 +39,7 @@ def needed(tmp_path: Path) -> dict[str, list[str]]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", OPTIONS)
 def test_every_option_composes_and_passes(option: str, needed: dict[str, list[str]]):
     assert isinstance(composed([option, *needed.get(option, [])]), DictConfig)

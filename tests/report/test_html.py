@@ -60,6 +60,7 @@ def test_systems_of_both_tables():
     }
 
 
+@pytest.mark.slow
 def test_page_needs_nothing_else(text: str):
     """The page loads nothing by address: no scripts, styles, images or fonts."""
     assert not re.search(r"<script|<link(?! rel=\"icon\" href=\"data:)|@import|url\((?!#)|src=|<img", text)
@@ -83,6 +84,7 @@ def test_a_figures_arms_are_named():
     assert (svg.count("one arm"), svg.count("other arm")) == (1, 1)
 
 
+@pytest.mark.slow
 def test_page_has_every_table_and_figure(chapters: list[Chapter], text: str):
     for chapter in chapters:
         assert f'<section class="result" id="{chapter.sweep.name}">' in text
@@ -100,6 +102,7 @@ def test_page_has_every_table_and_figure(chapters: list[Chapter], text: str):
     assert "nothing measured: data.root" in text
 
 
+@pytest.mark.slow
 def test_ids_are_unique_and_links_lead_somewhere(text: str):
     ids = re.findall(r' id="([^"]+)"', text)
     of_page = [name for name in ids if not re.fullmatch(r"[mp][0-9a-f]{10}", name)]
@@ -129,12 +132,14 @@ def test_distributions_by_hand(tmp_path: Path):
     assert f"<td>{ours.middle:.2f}</td><td>{ours.improvement:.2f}</td>" in text
 
 
+@pytest.mark.slow
 def test_colours_are_the_pages(text: str):
     assert "#0102" not in text
     assert "var(--series0)" in text
     assert "currentColor" in text
 
 
+@pytest.mark.slow
 def test_config_differences(text: str):
     rows = re.findall(r"<tr><th scope=\"row\"><code>\w+</code></th>(.*?)</tr>", text)
     seeds = [row for row in rows if "table14: 2, 4, 6, seed 2" in row and "config" not in row]

@@ -28,6 +28,7 @@ def test_long_labels_fold_so_that_four_metrics_fit(tmp_path: Path):
     assert printed(table_of(sweep, fake_sweep(tmp_path, sweep)), 100).count("Jitter ↓") == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [80, 100])
 @pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.yaml")), ids=lambda path: path.stem)
 def test_shipped_tables_fit_the_screen(tmp_path: Path, path: Path, width: int):

@@ -57,6 +57,7 @@ def played(network: Path, clip: TrackedClip, hz: float, kind: type[Instant] = In
     return messages
 
 
+@pytest.mark.slow
 def test_frames_come_at_60_hz_whatever_the_trackers(network: Path, clip: TrackedClip):
     for hz in (60, 72, 90):
         messages = played(network, clip, hz)
