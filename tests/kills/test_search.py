@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,8 @@ from command_line import SMALL, run
 @pytest.mark.slow
 def test_every_trial_is_there_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """With two seeds a trial, so that some kills come between a trial's runs, which are short here."""
-    monkeypatch.setattr("memmlp.cli.bench.chaos.LONG_PAUSES", (2.0, 6.0))
+    chaos = importlib.import_module("memmlp.cli.bench.chaos")  # in its package the name is the command's
+    monkeypatch.setattr(chaos, "LONG_PAUSES", (2.0, 6.0))
     words = ["--trials", "2", "--kills", "3", *SMALL, "search.seeds=2"]
     said = run(tmp_path, "bench", "chaos-tune", *words)
     assert "2 trials with 3 kills" in said

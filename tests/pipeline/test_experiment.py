@@ -61,6 +61,7 @@ CHANGES: dict[str, str] = {
 UNTRIED = {
     "paths.outputs": "where results lie",
     "data.root": "where the same clips lie; another folder's are another digest",
+    "data.sources": "other folders are another digest; weights: tests/config/test_build_motion.py",
     "data.synth": "makes other clips, and so another digest: see the test below",
     "data.body": "a file of the user's; its rest pose is in the data's digest",
     "vqvae.epochs": "steps by another name: the two exclude each other (tests/config/test_compose.py)",
