@@ -26,6 +26,7 @@ from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.rest_pose import STRAIGHTEST
 from memmlp.motion.importing.skeleton import SkeletonMap, find_skeleton, is_number, load_skeleton
 from memmlp.motion.preparing.groups import Grouping
+from memmlp.motion.threads import one_thread
 
 RECORD = "import.json"
 
@@ -126,7 +127,7 @@ def import_folder(source: Path, out: Path, how: How | None = None) -> ImportRepo
     sources = [relative.as_posix() for relative in files]
     takes = Grouping(how.takes).names(dict(zip(sources, sources, strict=True)))
     maps: dict[str, SkeletonMap] = {}
-    with _staging(out) as staging:
+    with _staging(out) as staging, one_thread():
         for relative, path in progress_bar(files.items(), "import", len(files)):
             try:
                 recording = read_recording(path)

@@ -15,6 +15,7 @@ from memmlp.motion.importing.convert import AUTO, convert
 from memmlp.motion.importing.fidelity import Fidelity, compare
 from memmlp.motion.importing.files import find_recordings, read_recording
 from memmlp.motion.importing.skeleton import find_skeleton, load_skeleton
+from memmlp.motion.threads import one_thread
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,8 @@ def verify(
     """
     recording, rest = read_recording(path), load_rest_joints(body)
     chosen = find_skeleton(recording, load_skeleton(skeleton) if skeleton else None)
-    converted = convert(recording, chosen, rest, name=name or path.name, floor=floor)
+    with one_thread():
+        converted = convert(recording, chosen, rest, name=name or path.name, floor=floor)
     with tempfile.TemporaryDirectory() as folder:
         write_clip(Path(folder) / "clip.npz", converted.clip)
         clip = read_clip(Path(folder) / "clip.npz", converted.clip.name)

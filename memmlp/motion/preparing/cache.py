@@ -13,7 +13,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -32,6 +32,7 @@ from memmlp.motion.preparing.folders import Folders, Root, find_all
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest, write_manifest
 from memmlp.motion.preparing.splits import PARTS, Split
 from memmlp.motion.preparing.survey import Survey, survey
+from memmlp.motion.threads import one_thread
 from memmlp.runs.recipes import RECIPES
 
 FRAMES = 1  # number of a frame's content; a new one changes every digest, and so makes every run again
@@ -135,7 +136,7 @@ def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) 
     frames = {part: int(manifest.totals[part]["frames"]) for part in PARTS}
     _check_space(out, sum(frames.values()) * ITEM_BYTES)
     with ExitStack() as stack:
-        stack.enter_context(_one_thread())
+        stack.enter_context(one_thread())
         files = {part: stack.enter_context(open(out / f"{part}.npy.tmp", "wb")) for part in PARTS}
         for part, file in files.items():
             header = {"descr": "<f4", "fortran_order": False, "shape": (frames[part], FRAME_DIM)}
@@ -156,19 +157,6 @@ def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) 
 def _sync(file: BinaryIO) -> None:
     file.flush()
     os.fsync(file.fileno())
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Keep torch to one thread: on clips of seconds others only wait for one another, and busily at that."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def frame_blocks(clip: Clip, rest: np.ndarray) -> Iterator[np.ndarray]:
