@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -93,7 +94,7 @@ def find_skeleton(recording: Recording, chosen: SkeletonMap | None = None) -> Sk
     """
     if chosen is not None:
         return spelt_as_in(chosen, recording) or chosen
-    maps = [load_skeleton(name) for name in shipped_skeletons()]
+    maps = _shipped_maps(SKELETONS)
     fitting = [fitted for skeleton in maps if (fitted := spelt_as_in(skeleton, recording)) is not None]
     best = max(map(_rank, fitting), default=(0, 0))
     fitting = [skeleton for skeleton in fitting if _rank(skeleton) == best]
@@ -106,6 +107,12 @@ def find_skeleton(recording: Recording, chosen: SkeletonMap | None = None) -> Sk
     raise InputError(
         f"{recording.path}: {state} with the joints {listed}; allowed: {known}, or a map by skeleton="
     )
+
+
+@cache
+def _shipped_maps(folder: Path) -> tuple[SkeletonMap, ...]:
+    """Load the maps of the package's folder once: reading YAML takes longer than importing a short clip."""
+    return tuple(load_skeleton(name) for name in shipped_skeletons())
 
 
 def _rank(skeleton: SkeletonMap) -> tuple[int, int]:
