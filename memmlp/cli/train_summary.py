@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -19,7 +20,7 @@ COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHE
 
 
 def show(outcome: Outcome) -> None:
-    """Print a run's metrics in both modes, its latency and sizes, and where to look next."""
+    """Print a run's metrics in both modes, its latency and sizes where there are any, and where to look."""
     console = Console(highlight=False)
     run, results = outcome.run, outcome.results
     console.print(said(outcome), soft_wrap=True)
@@ -30,7 +31,14 @@ def show(outcome: Outcome) -> None:
     console.print(metrics_table(results))
     for table in source_tables(run):
         console.print(table)
-    measured = results["latency"]
+    if "latency" in results:
+        show_latency(console, results["latency"])
+    console.print(f"run      {run.folder}", soft_wrap=True)
+    console.print(f"picture  {run.picture}", soft_wrap=True)
+
+
+def show_latency(console: Console, measured: Mapping[str, Any]) -> None:
+    """Print what a frame takes, and how large the network is."""
     console.print(
         f"a frame on one CPU core: {measured['median_ms']:.2f} ms median, {measured['p95_ms']:.2f} ms p95 "
         f"({measured['ratio_to_yardstick']:.2f} x the yardstick)",
@@ -42,15 +50,14 @@ def show(outcome: Outcome) -> None:
         f"{measured['macs'] / 1e6:.0f} MMAC a frame, ONNX {measured['onnx_bytes'] / 1e6:.1f} MB",
         soft_wrap=True,
     )
-    console.print(f"run      {run.folder}", soft_wrap=True)
-    console.print(f"picture  {run.picture}", soft_wrap=True)
 
 
 def said(outcome: Outcome) -> str:
     """Say which stages were done now, and which were found done."""
     if not outcome.made:
         return f"run {outcome.run.id} is finished already; nothing was done (force=true does it again)"
-    found = [stage for stage in STAGES if stage not in outcome.made]
+    wanted = [stage for stage in STAGES if stage != "deployment" or "latency" in outcome.results]
+    found = [stage for stage in wanted if stage not in outcome.made]
     before = f"; {' and '.join(found)} found done" if found else ""
     return f"run {outcome.run.id}: {', '.join(outcome.made)} done{before}"
 

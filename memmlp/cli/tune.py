@@ -84,8 +84,11 @@ class Setup(NamedTuple):
     config_dir: Path | None
 
     def overrides(self, values: Mapping[str, Value]) -> list[str]:
-        """Return a trial's overrides: the search's base, the command line's, and the trial's values."""
-        return [*self.search.base, *self.words, *self.search.overrides(values)]
+        """Return a trial's overrides: the search's base, the command line's, and the trial's values.
+
+        Trials are judged on validation alone, and exported and timed only where that is asked for.
+        """
+        return ["export.graph=off", *self.search.base, *self.words, *self.search.overrides(values)]
 
 
 def prepared(words: Sequence[str], config_dir: Path | None, outputs: Path) -> Setup:

@@ -75,7 +75,7 @@ def build_experiment(cfg: DictConfig) -> Experiment:
         evaluation=Evaluation(
             modes=list(cfg.evaluation.modes), batch=cfg.evaluation.batch, ik=build_ik(cfg), seed=cfg.seed
         ),
-        deployment=Deployment(**config["export"]),
+        deployment=build_deployment(cfg),
         predictions=Path(cfg.save_predictions) if cfg.save_predictions else None,
         tracking=build_tracking(cfg),
     )
@@ -137,6 +137,11 @@ def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
     if isinstance(loss, Loss):
         return lambda branches: loss
     return partial(MotionLoss, loss, built(cfg.hand))
+
+
+def build_deployment(cfg: DictConfig) -> Deployment | None:
+    """Build how a checked config's network is exported and timed; None where it is not to be."""
+    return None if cfg.export.graph == "off" else Deployment(**cfg.export)
 
 
 def build_ik(cfg: DictConfig) -> IK:

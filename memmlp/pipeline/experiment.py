@@ -32,7 +32,7 @@ class Experiment:
         vqvae: how a frozen VQ-VAE is trained.
         training: how the network is trained.
         evaluation: how it is evaluated.
-        deployment: how it is deployed.
+        deployment: how it is exported and timed; None where it is not to be.
         predictions: folder for predictions of the test clips; None for no such files.
         tracking: shows finished runs elsewhere.
     """
@@ -46,7 +46,7 @@ class Experiment:
     vqvae: VQVAETraining
     training: NetworkTraining
     evaluation: Evaluation
-    deployment: Deployment
+    deployment: Deployment | None
     predictions: Path | None
     tracking: Tracking
 
@@ -56,14 +56,14 @@ class Experiment:
         return {mode: evaluation_id(self.config, mode, self.data.grouped) for mode in self.evaluation.modes}
 
     @property
-    def deployment_id(self) -> str:
-        """The identity of the deployment."""
-        return deployment_id(self.config)
+    def deployments(self) -> dict[str, Deployment]:
+        """The deployment by its identity; empty where none is wanted."""
+        return {deployment_id(self.config): self.deployment} if self.deployment else {}
 
     @property
     def stages(self) -> tuple[str, ...]:
         """The identities of the evaluations and the deployment."""
-        return (*self.evaluations.values(), self.deployment_id)
+        return (*self.evaluations.values(), *self.deployments)
 
     def vqvae_identity(self, data: str) -> Identity | None:
         """Return the identity of the VQ-VAE's run on data of that digest; None if the network uses none."""

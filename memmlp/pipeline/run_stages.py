@@ -105,18 +105,19 @@ def finish(experiment: Experiment, run: Run, data: Prepared) -> list[str]:
     if missing:
         evaluate_run(experiment, run, data, missing)
         made.append("evaluation")
-    if not run.has(experiment.deployment_id):
-        deploy_run(experiment, run, data)
-        made.append("deployment")
+    for name in experiment.deployments:
+        if not run.has(name):
+            deploy_run(experiment, run, data, name)
+            made.append("deployment")
     return made
 
 
 def results_of(experiment: Experiment, run: Run) -> dict[str, Any]:
     """Return the results that the experiment asks for: mode -> branch -> metric, and "latency"."""
     files = {mode: run.evaluation(name) for mode, name in experiment.evaluations.items() if run.has(name)}
-    latency = run.deployment(experiment.deployment_id).record
     means = {mode: read_json(path)["mean"] for mode, path in files.items()}
-    return means | ({"latency": latency} if latency else {})
+    records = [run.deployment(name).record for name in experiment.deployments]
+    return means | ({"latency": records[0]} if any(records) else {})
 
 
 def clip_rows(experiment: Experiment, run: Run) -> list[dict[str, Any]]:
@@ -183,16 +184,16 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
             picture(model, test, run.picture)
 
 
-def deploy_run(experiment: Experiment, run: Run, data: Prepared) -> None:
-    """Export a trained run, check the file against the network, and time it."""
+def deploy_run(experiment: Experiment, run: Run, data: Prepared, name: str) -> None:
+    """Make the deployment of that identity: export a trained run, check file against network, and time it."""
     run.attempt("deployment")
     stage_begins("deployment: export to ONNX, compare with torch, and time a frame")
     with timed(run, "export"):
         model = experiment.architecture.load(run.weights())
         clips = [data.open(split).clips() for split in ("train", "test")]
-        deployed = run.deployment(experiment.deployment_id)
+        deployed = run.deployment(name)
         deployed.latency.unlink(missing_ok=True)  # it lacks a file and is made again, from the start
-        record = experiment.deployment.deploy(model, deployed, run.id, *clips)
+        record = experiment.deployments[name].deploy(model, deployed, run.id, *clips)
         deployed.finish(
             {"run": run.manifest["id"], "settings": deployment_settings(experiment.config), **record}
         )

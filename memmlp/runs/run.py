@@ -108,8 +108,15 @@ class Run:
 
     @property
     def preferred_onnx(self) -> Path:
-        """The ONNX file to use: int8 where there is one that is accurate enough (`export.precision`)."""
+        """The ONNX file to use: int8 where there is one that is accurate enough (`export.precision`).
+
+        Raises:
+            InputError: if the run is finished and has none (`export.graph=off`).
+        """
         deployment = self.preferred_deployment
+        if self.done and not self.deployments.is_dir():
+            make = f"memmlp eval {self.folder} export.graph=auto"
+            raise InputError(f"{self.folder}: has no step.onnx; make one with {make}")
         return deployment.int8 if deployment.prefers_int8 else deployment.onnx
 
     @property

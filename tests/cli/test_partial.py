@@ -17,7 +17,15 @@ from memmlp.motion.clip import Clip
 from memmlp.motion.formats.npz import write_clip
 from memmlp.runs.lookup import list_runs
 
-TINY = ["profile=tiny", "tracking=none", "threads=1", "optim.steps=6", "memory=none", "data.split.val=0.2"]
+TINY = [
+    "profile=tiny",
+    "tracking=none",
+    "threads=1",
+    "optim.steps=6",
+    "memory=none",
+    "data.split.val=0.2",
+    "export.graph=off",
+]
 S1 = ["data=amass_s1", "data.root=amass", "data.split.folder=lists"]
 PART = "amass_s1, 87 % of the list (7 of 8 entries)"
 REFUSED = "data.root: 1 of 8 entries of the split's list have no clip (MPI_HDM05 1 of 4) below amass"

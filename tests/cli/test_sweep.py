@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from command_line import MAIN, TINY, run, run_apart
+from command_line import MAIN, run, run_apart
+from command_line import TINY as SMALLEST
 from processes import PATIENCE, ignoring_interrupts, started, until
 
 from memmlp.cli.sweep import split_executor
@@ -26,6 +27,7 @@ from memmlp.runs.recipes import RECIPES
 from memmlp.runs.run import Run
 from memmlp.sweep.board import name
 
+TINY = [*SMALLEST, "export.graph=off"]
 ARMS = {"full": [], "none": ["memory=none"], "wild": ["optim.lr=1e30"]}
 
 

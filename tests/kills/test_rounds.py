@@ -13,7 +13,13 @@ from processes import started, until
 
 from memmlp.runs.lookup import list_runs
 
-SETTINGS = ["data.synth.minutes=1", "data.split.test=0.5", "evaluation.modes=[stream]", "executor=debug"]
+SETTINGS = [
+    "data.synth.minutes=1",
+    "data.split.test=0.5",
+    "evaluation.modes=[stream]",
+    "executor=debug",
+    "export.graph=off",
+]
 WORDS = ["sweep", "trial.yaml", *TINY, *SETTINGS]
 
 

@@ -135,7 +135,7 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
         for mode in settings.modes
     }
     return Outcome(
-        {"training": identity.id, **experiment.evaluations, "deployment": experiment.deployment_id},
+        {"training": identity.id, **experiment.evaluations, "deployment": next(iter(experiment.deployments))},
         {
             "training": digest([t.tolist() for t in model.state_dict().values()]),
             **{mode: digest(rows) for mode, rows in reports.items()},

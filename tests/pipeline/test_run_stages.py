@@ -15,9 +15,11 @@ from command_line import run as command
 from conftest import INT8, one_line
 from PIL import Image
 
+from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.config.packaged import packaged
+from memmlp.live.stream import Stream
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline.run_stages import vqvae_run
 from memmlp.runs.lookup import list_runs
@@ -60,7 +62,7 @@ def test_the_same_command_finds_the_run_and_others_share_the_vqvae(home, monkeyp
     before = {run.id: run.marker.stat().st_mtime_ns for run in list_runs(home / "outputs")}
     assert "finished already" in command(home, "train", *TINY, INT8)
     assert {run.id: run.marker.stat().st_mtime_ns for run in list_runs(home / "outputs")} == before
-    command(home, "train", *TINY, "seed=1", "vqvae.seed=0", "evaluation.modes=[stream]")
+    command(home, "train", *TINY, "seed=1", "vqvae.seed=0", "evaluation.modes=[stream]", "export.graph=off")
     codes = [run.id for run in list_runs(home / "outputs") if run.manifest["kind"] == "vqvae"]
     assert len(codes) == 1
     monkeypatch.chdir(home)
@@ -109,6 +111,18 @@ def test_a_mode_a_solver_or_a_precision_is_that_stages_work_alone(home):
     assert now["stream"]["rotation"] == results["stream"]["rotation"]  # of m = 0.5, and not of the last one
     made = [path.name for path in (*run.evaluations.iterdir(), *run.deployments.iterdir())]
     assert len(made) == len(stages) + 2 + 1 + 3
+
+
+def test_without_a_graph_nothing_is_exported(home, monkeypatch):
+    """The run is whole without a deployment, and says how it gets one where one is needed."""
+    run = motion_run(home)
+    shutil.rmtree(run.deployments)
+    said = command(home, "train", *TINY, *seed_of(run), "export.graph=off")
+    assert "finished already" in said
+    assert "a frame on one CPU core" not in said
+    assert not run.deployments.exists()
+    with pytest.raises(InputError, match=r"no step\.onnx; make one with memmlp eval \S+ export\.graph=auto"):
+        Stream(run.folder)
 
 
 def seed_of(run: Run) -> list[str]:

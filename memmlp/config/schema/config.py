@@ -131,7 +131,7 @@ class ExportConfig:
     """How a trained network is exported and timed (conf/export)."""
 
     latency_steps: int = at_least(1)
-    graph: str = one_of("auto", "streaming", "naive")
+    graph: str = one_of("auto", "streaming", "naive", "off")
     precision: str = one_of("fp32", "int8")
 
 
