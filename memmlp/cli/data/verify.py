@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -28,8 +29,10 @@ def verify(source: Path, skeleton: str | None, body: str, every: bool) -> None:
     """
     from memmlp.motion.importing.verify import Unusable, verify_folder
 
-    table = Table("file", "skeleton")
-    for name in ("frames", "worst mm", "worst degrees"):
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("file", overflow="fold")
+    table.add_column("skeleton")
+    for name in ("frames", "worst\nmm", "worst\ndegrees"):
         table.add_column(name, justify="right")
     table.add_column("at")
     sound, bad, worst = 0, [], (0.0, 0.0)
@@ -42,7 +45,7 @@ def verify(source: Path, skeleton: str | None, body: str, every: bool) -> None:
         bad += [f"{row.name}: {fault}" for fault in row.faults]
         if every or row.faults or sound + len(bad) <= SHOWN:
             numbers = (str(row.frames), f"{row.mm.value:.4f}", f"{row.degrees.value:.4f}")
-            table.add_row(row.name, row.skeleton, *numbers, f"{row.mm}; {row.degrees}")
+            table.add_row(row.name, row.skeleton, *numbers, f"{row.mm}\n{row.degrees}")
     Console(highlight=False).print(table)
     for line in bad:
         click.echo(line)
