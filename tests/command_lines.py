@@ -12,7 +12,7 @@ import click
 from hydra import version
 
 from memmlp.cli.main import commands
-from memmlp.cli.sweep import split_executor
+from memmlp.cli.workers import split_executor
 from memmlp.config.compose import VERSION_BASE, composed_plain, parse, preflight
 from memmlp.config.plan_sweep import find_sweep
 from memmlp.config.schema import register

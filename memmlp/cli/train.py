@@ -105,9 +105,10 @@ def run_training(cfg: DictConfig) -> None:
 
     from memmlp.cli.train_summary import show
     from memmlp.config.build import build_experiment
-    from memmlp.pipeline.run_stages import run_experiment
+    from memmlp.pipeline.together import run_together
 
     check(cfg)
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
-    show(run_experiment(build_experiment(cfg)))
+    if outcome := run_together(build_experiment(cfg)):
+        show(outcome)
