@@ -39,10 +39,8 @@ def shares(gpus: Share, per_worker: int | None = None) -> list[Share]:
     """
     size = per_worker if per_worker is not None else min(len(gpus), 1)
     if size > len(gpus):
-        there = (
-            f"the GPUs that are visible here ({', '.join(gpus)})" if gpus else "for no GPU is visible here"
-        )
-        raise InputError(f"--gpus-per-worker {size}: allowed is up to {len(gpus)}, {there}")
+        there = f"visible here is {', '.join(gpus) or 'no GPU'}"
+        raise InputError(f"--gpus-per-worker {size}: allowed is up to {len(gpus)}; {there}")
     return [gpus[i : i + size] for i in range(0, len(gpus) - size + 1, size)] if size else []
 
 

@@ -125,7 +125,7 @@ class SlurmExecutor(submitit.SlurmExecutor):
         words = {"additional_parameters": dict(options.parameters), "srun_args": list(options.srun)}
         setup = {"setup": [options.setup]} if options.setup else {}
         # Submitit would set a wckey of its own, which clusters without such keys refuse.
-        self.update_parameters(name="memmlp", time=options.minutes, wckey=None, **words, **setup)
+        self.update_parameters(job_name="memmlp", time=options.minutes, wckey=None, **words, **setup)
 
 
 class Unsent(SlurmExecutor):
