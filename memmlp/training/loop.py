@@ -100,7 +100,7 @@ def train(
     optimiser = optim.build(task.parameter_groups())
     start = resume(task, optimiser, run)
     parallel.align(task.module)
-    with progress() as bar:
+    with progress(shown=parallel.first()) as bar:
         row = bar.add_task(description, total=optim.steps, completed=start, note="")
         for step in range(start, optim.steps):
             seed_step(seed, step)
