@@ -12,7 +12,7 @@ import click
 from hydra import version
 
 from memmlp.cli.main import commands
-from memmlp.cli.sweep import split_executor
+from memmlp.cli.workers import Workers, split_executor
 from memmlp.config.compose import VERSION_BASE, composed_plain, parse, preflight
 from memmlp.config.plan_sweep import find_sweep
 from memmlp.config.schema import register
@@ -123,7 +123,9 @@ def composes(overrides: Sequence[str]) -> None:
 
 def _sweeps(parsed: dict[str, Any]) -> None:
     """Compose the first and the last arm of a sweep with a command line's overrides."""
-    name, rest = parsed["name"] or "NAME", split_executor(parsed["overrides"])[2]
+    engine, words, rest = split_executor(parsed["overrides"])
+    Workers(engine, words)
+    name = parsed["name"] or "NAME"
     if name.isupper() or name == "all" or OWN.fullmatch(name):  # a reader's, or many
         composes([word for word in rest if not word.startswith("seed=")])
         return

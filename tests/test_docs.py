@@ -56,6 +56,9 @@ def checks(text: str) -> None:
     program, rest = words[0], words[1:]
     if program == "memmlp":
         takes(shlex.join(words))
+    elif program == "torchrun":
+        at = rest.index("-m")
+        takes(shlex.join(rest[at + 1 :]))
     elif program == "make":
         targets = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
         assert targets
@@ -83,7 +86,7 @@ def test_what_is_wrong_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         "memmlp trian", "memmlp train memry=none", "memmlp train -m seed=0,x", "memmlp sweep 14 --jobs 3",
         "memmlp sweep 14 memory.shift=day", "memmlp sweep 99", "memmlp export RUN", "memmlp runs lost",
         "memmlp table 14 --format doc", "memmlp tune search.n_trial=3", "memmlp live RUN --udp many",
-        "memmlp sweep 14 executor=slurm slurm.days=3", "make everything", "docker build --build-arg GPU=1 .",
+        "memmlp sweep 14 executor=slurm slurm.nodes=3", "make everything", "docker build --build-arg GPU=1 .",
     ):  # fmt: skip
         with pytest.raises(Exception, match=r"\S"):
             checks(wrong)

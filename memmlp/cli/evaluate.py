@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.options import outputs_option
+from memmlp.cli.options import device_option, outputs_option
 
 
 @click.command("eval")
@@ -24,13 +24,7 @@ from memmlp.cli.options import outputs_option
     help="File to write the metrics into, means and one row for each clip, as JSON.",
 )
 @click.option("--again", is_flag=True, help="Measure again what was measured before.")
-@click.option(
-    "--device",
-    default="auto",
-    type=click.Choice(["auto", "cpu", "cuda"]),
-    show_default=True,
-    help="Device to compute on; auto takes a GPU where there is one.",
-)
+@device_option
 @outputs_option
 def evaluate(
     run: str,

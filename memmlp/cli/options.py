@@ -22,6 +22,28 @@ class Finite(click.FloatRange):
         return number
 
 
+class Device(click.ParamType):
+    """The name of a device, as the key `device` takes it."""
+
+    name = "auto|cpu|cuda|cuda:INDEX|mps"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the name; whether there is such a device is seen when it is used."""
+        from memmlp.config.schema.rules import DEVICE
+
+        if not DEVICE.allows(value):
+            self.fail(f"{value}: allowed is {DEVICE}")
+        return value
+
+
+device_option = click.option(
+    "--device",
+    default="auto",
+    type=Device(),
+    show_default=True,
+    help="Device to compute on; auto takes a GPU of CUDA where there is one.",
+)
+
 outputs_option = click.option(
     "--outputs",
     type=PATH,

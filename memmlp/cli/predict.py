@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import PATH, format_option, outputs_option, strict_option
+from memmlp.cli.options import PATH, device_option, format_option, outputs_option, strict_option
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     "clip itself.  [default: combined with inverse kinematics, else rotation]",
 )  # fmt: skip
 @strict_option
-@click.option("--device", default="auto", type=click.Choice(["auto", "cpu", "cuda"]), show_default=True)
+@device_option
 @outputs_option
 def predict(
     run: str,

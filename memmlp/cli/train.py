@@ -13,8 +13,9 @@ from hydra import version
 from hydra._internal.utils import _run_hydra
 from omegaconf import DictConfig
 
+from memmlp.common import parallel
 from memmlp.common.errors import InputError, TrainingDiverged
-from memmlp.config.compose import CONFIG, VERSION_BASE, parse, preflight
+from memmlp.config.compose import CONFIG, VERSION_BASE, help_text, parse, preflight
 from memmlp.config.explain import explain
 from memmlp.config.packaged import packaged
 from memmlp.config.schema import check, register
@@ -44,8 +45,12 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
     args, parser = parse(argv)
     register()
     version.setbase(VERSION_BASE)
-    if _runs(args):
-        preflight(args)
+    if args.help:
+        click.echo(help_text(args))
+        return
+    jobs = preflight(args) if _runs(args) else []
+    if len(jobs) > 1 and parallel.size() > 1:
+        raise InputError("torchrun: several processes train one run; allowed is no multirun")
     failures: list[Exception] = []
     with _raising(args.overrides):
         _run_hydra(
@@ -105,9 +110,10 @@ def run_training(cfg: DictConfig) -> None:
 
     from memmlp.cli.train_summary import show
     from memmlp.config.build import build_experiment
-    from memmlp.pipeline.run_stages import run_experiment
+    from memmlp.pipeline.together import run_together
 
     check(cfg)
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
-    show(run_experiment(build_experiment(cfg)))
+    if outcome := run_together(build_experiment(cfg)):
+        show(outcome)

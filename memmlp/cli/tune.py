@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -13,6 +12,7 @@ import click
 from filelock import FileLock, Timeout
 
 from memmlp.cli.options import outputs_option
+from memmlp.cli.workers import Workers, hire, worker_options
 from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
@@ -24,12 +24,7 @@ if TYPE_CHECKING:
 
 @click.command("tune")
 @click.argument("overrides", nargs=-1)
-@click.option(
-    "--workers",
-    default=None,
-    type=click.IntRange(1),
-    help="How many workers run at once.  [default: one a core]",
-)
+@worker_options
 @click.option("--status", is_flag=True, help="Show how far the search is, and run nothing.")
 @click.option(
     "--config-dir",
@@ -38,7 +33,7 @@ if TYPE_CHECKING:
 )
 @outputs_option
 def tune(
-    overrides: tuple[str, ...], workers: int | None, status: bool, config_dir: Path | None, outputs: Path
+    overrides: tuple[str, ...], workers: Workers, status: bool, config_dir: Path | None, outputs: Path
 ) -> None:
     """Search the manual loss weights: the paper's first, then what Optuna proposes.
 
@@ -47,11 +42,9 @@ def tune(
     1e-4, high: 1e-2, log: true}`; `search=NAME` takes conf/search/NAME.yaml), and the executor's of `memmlp
     sweep`. Started again, it goes on where it stopped.
     """
-    from memmlp.cli.sweep import split_executor
     from memmlp.search.study import Study
 
-    engine, options, words = split_executor(overrides)
-    setup = prepared(words, config_dir, outputs.absolute())
+    setup = prepared(overrides, config_dir, outputs.absolute())
     if status:
         show(setup)
         return
@@ -59,7 +52,7 @@ def tune(
     try:
         with FileLock(setup.folder / ".lock", timeout=0):
             study = Study.own(setup.search, setup.folder.name, setup.folder)
-            search(setup, study, engine, options, workers or os.cpu_count() or 1)
+            search(setup, study, workers)
             leave(setup, study)
     except Timeout:
         raise InputError(f"search {setup.folder.name}: another process is at it; --status shows it") from None
@@ -174,7 +167,7 @@ def _experiments(setup: Setup, values: Mapping[str, Value]) -> list[Experiment]:
     first, found = cfg.seed, []
     for number in range(setup.search.seeds):
         cfg.seed = first + number
-        found.append(build_experiment(cfg))
+        found.append(build_experiment(cfg, elsewhere=True))
     return found
 
 
@@ -189,16 +182,15 @@ def show(setup: Setup) -> None:
     Console(highlight=False).print(render(study, setup.outputs) if study else "not begun")
 
 
-def search(setup: Setup, study: Study, engine: str, options: dict[str, object], workers: int) -> None:
+def search(setup: Setup, study: Study, workers: Workers) -> None:
     """Bring the study to as many trials as are wanted."""
-    from memmlp.cli.sweep import hire
     from memmlp.search.board import SearchBoard
     from memmlp.search.director import Director, direct
     from memmlp.sweep.plan import Plan
 
     plan = Plan(setup.folder.name, setup.outputs, (), (), open=True)
     director = Director(study, partial(_tasks, setup), plan)
-    path, fleet = hire(setup.folder, plan, engine, options, workers)
+    path, fleet = hire(setup.folder, plan, workers, {_experiments(setup, {})[0].config["device"]})
     direct(director, fleet, SearchBoard(setup.outputs), path)
 
 

@@ -38,8 +38,11 @@ def telling_stages(say: Callable[[str], None]) -> Iterator[None]:
         _SAY.reset(token)
 
 
-def progress() -> Progress:
-    """Make a progress display on stderr: description, bar, count, elapsed time, time left, and a note."""
+def progress(shown: bool = True) -> Progress:
+    """Make a progress display on stderr: description, bar, count, elapsed time, time left, and a note.
+
+    It is hidden where stderr is no terminal, or it is not to be `shown`.
+    """
     console = Console(stderr=True)
     return Progress(
         TextColumn("{task.description:<12}"),
@@ -50,7 +53,7 @@ def progress() -> Progress:
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
         console=console,
-        disable=not console.is_terminal,
+        disable=not (shown and console.is_terminal),
     )
 
 

@@ -35,6 +35,7 @@ from memmlp.networks.architecture import (
 from memmlp.networks.memory import Memory
 from memmlp.networks.vqvae import VQVAE
 from memmlp.networks.window_model import WindowModel
+from memmlp.pipeline.devices import device
 from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.identity import flatten
 from memmlp.runs.lookup import check_trained
@@ -48,14 +49,23 @@ from memmlp.training.vqvae import VQVAETraining
 COORDINATES: dict[str, type[World]] = {"head_relative": HeadRelative, "world": World, "heading": Heading}
 
 
-def build_experiment(cfg: DictConfig) -> Experiment:
-    """Build the experiment of a checked config."""
+def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
+    """Build the experiment of a checked config.
+
+    Args:
+        cfg: the config.
+        elsewhere: whether others will perform it, maybe on another machine, so that this one need not have
+            its device.
+
+    Raises:
+        InputError: where the config's device is not there.
+    """
     outputs = Path(cfg.paths.outputs)
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     return Experiment(
         config=config,
         outputs=outputs,
-        device=device(cfg.device),
+        device=torch.device("cpu") if elsewhere else device(cfg.device),
         force=cfg.force,
         data=build_motion(cfg),
         architecture=build_architecture(cfg),
@@ -94,13 +104,6 @@ def build_tracking(cfg: DictConfig) -> Tracking:
     """Build what shows the config's runs elsewhere, in MLflow or nowhere."""
     folder = {"outputs": Path(cfg.paths.outputs)} if "uri" in cfg.tracking else {}
     return built(cfg.tracking, **folder)
-
-
-def device(name: str) -> torch.device:
-    """Return the torch device for "auto", "cpu" or "cuda". Raises InputError where CUDA is missing."""
-    if name == "cuda" and not torch.cuda.is_available():
-        raise InputError("device=cuda: there is no CUDA device; allowed here is device=cpu or device=auto")
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 def build_architecture(cfg: DictConfig) -> Architecture:

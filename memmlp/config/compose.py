@@ -78,6 +78,31 @@ def preflight(args: argparse.Namespace) -> list[DictConfig]:
     return configs
 
 
+HELP = """memmlp train trains, evaluates, exports and times one configuration.
+
+== Configuration groups ==
+Compose your configuration from those groups (group=option)
+
+{groups}
+== Config ==
+Override anything in the config (foo.bar=value)
+
+{config}
+memmlp train --hydra-help tells the flags, such as -m for several runs and --config-dir for your own configs.
+"""
+NOT_HERE = ("hydra", "schema", "search")  # Hydra's groups, the types of ours, and what memmlp tune searches
+
+
+def help_text(args: argparse.Namespace) -> str:
+    """Return the groups with their options, and the config that the arguments compose."""
+    with _hydra(args), _explained(args.overrides):
+        hydra = GlobalHydra.instance().hydra
+        assert hydra is not None
+        groups = hydra.format_config_groups(lambda group: group.split("/")[0] not in NOT_HERE)
+        config = OmegaConf.to_yaml(compose(args.config_name or CONFIG, args.overrides), resolve=args.resolve)
+    return HELP.format(groups=groups, config=config)
+
+
 @contextmanager
 def _hydra(args: argparse.Namespace) -> Iterator[None]:
     """Initialise Hydra with the search path that the arguments ask for, the same as when the jobs run."""

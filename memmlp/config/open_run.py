@@ -10,10 +10,11 @@ from typing import NamedTuple
 from torch import Tensor
 
 from memmlp.common.errors import InputError
-from memmlp.config.build import build_experiment, config_of, device
+from memmlp.config.build import build_experiment, config_of
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.preparing.source import Prepared
 from memmlp.networks.window_model import WindowModel
+from memmlp.pipeline.devices import device
 from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.identity import trained_by
 from memmlp.runs.lookup import find_run
@@ -43,7 +44,7 @@ def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequ
     Args:
         outputs: the folder of runs and caches.
         name: the run's id, the beginning of one, or the run's folder.
-        device_name: the device to compute on: "auto", "cpu" or "cuda".
+        device_name: the device to compute on: "auto", "cpu", "cuda", "cuda:INDEX" or "mps".
         overrides: KEY=VALUE for keys of the evaluation and the export.
 
     Raises:
@@ -71,7 +72,9 @@ def data_of(run: Run, experiment: Experiment) -> Prepared:
 
 def experiment_of(run: Run, device_name: str = "cpu", overrides: Sequence[str] = ()) -> Experiment:
     """The experiment of a finished run, without its data; raises InputError as `open_run` does."""
-    experiment = replace(build_experiment(config_of(run, overrides)), device=device(device_name))
+    experiment = replace(
+        build_experiment(config_of(run, overrides), elsewhere=True), device=device(device_name)
+    )
     if trained_by(run.config) != trained_by(experiment.config):
         words = ", ".join(overrides)
         raise InputError(f"{words}: changes the training; allowed are keys of evaluation and export")

@@ -15,24 +15,48 @@ if TYPE_CHECKING:
     from memmlp.pipeline.experiment import Experiment
 
 
-def work(path: str, threads: int, controller: str) -> None:
+def work(path: str, threads: int, controller: str, gpu: bool) -> str | None:
     """Work on the tasks of the plan in that file for as long as the process of its controller lives.
 
     Args:
         path: the plan's file.
         threads: torch's threads where the config leaves them open; 0 leaves the choice to torch.
         controller: the lock file that the controller's process holds (`Presence`).
+        gpu: whether this worker is to have a GPU.
+
+    Returns:
+        A line, and nothing was done, where there is no such GPU; else None.
     """
+    if gpu and (line := missing_gpu()):
+        return line
     work_on(Path(path), partial(perform, Path(path), threads), lambda: Presence.of(Path(controller)))
+    return None
 
 
-def work_alone(path: str) -> None:
+def work_alone(path: str, gpu: bool) -> str | None:
     """Work on the tasks of the plan in that file until none is left, on a machine apart from the controller.
 
     A worker on a cluster outlives the process that started it: a closed plan (a sweep's) is worked to its
     end, an open one (a search's) while its controller still shows signs of life.
+
+    Args:
+        path: the plan's file.
+        gpu: whether this worker is to have a GPU.
+
+    Returns:
+        A line, and nothing was done, where there is no such GPU; else None.
     """
+    if gpu and (line := missing_gpu()):
+        return line
     work_on(Path(path), partial(perform, Path(path), 0), lambda: directed(Path(path)))
+    return None
+
+
+def missing_gpu() -> str | None:
+    """Return a line that says so where torch finds no GPU in a worker that is to have one."""
+    from memmlp.pipeline import devices  # it imports torch
+
+    return devices.missing_gpu()
 
 
 def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:

@@ -125,7 +125,7 @@ def _experiments(sweep: Sweep, arm: Arm, outputs: Path) -> Iterable[tuple[int, E
             raise InputError("force=true: allowed is --again, which does a sweep's finished runs again")
         for seed in sweep.seeds_of(arm):
             cfg.seed, cfg.paths.outputs = seed, str(outputs)
-            yield seed, build_experiment(cfg)
+            yield seed, build_experiment(cfg, elsewhere=True)
     except InputError as error:
         raise InputError(f"sweep {sweep.name}, arm '{arm.label}': {error}") from None
 

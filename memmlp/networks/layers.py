@@ -1,10 +1,17 @@
-"""The MLP block of the backbone and the predictor, and its two forms that take in a memory feature."""
+"""The MLP block of the backbone and the predictor, and its two forms that take in a memory feature.
+
+Also what a network's layers must be like for several processes to train it together.
+"""
 
 from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
+from torch.nn.modules.dropout import _DropoutNd
+
+from memmlp.common import parallel
 
 
 class TimeMix(nn.Module):
@@ -95,3 +102,28 @@ class PlainFusion(MLPBlock):
     def fuse(self, h: Tensor, z: Tensor) -> Tensor:
         """Map the hidden state (B, T, d) and the memory feature (B, T, k) to (B, T, d)."""
         return self.merge(torch.cat([super().forward(h), z], -1))
+
+
+class Dropout(nn.Dropout):
+    """Dropout that draws the same for a row of a batch, whether one process has it or several share it."""
+
+    def forward(self, h: Tensor) -> Tensor:
+        """Set random elements of features (B, ...) to 0 in training, and scale the others up."""
+        if not (self.training and parallel.shared()):
+            return super().forward(h)
+        return h * parallel.drawn(lambda like: F.dropout(torch.ones_like(like), self.p), h)
+
+
+def undivided(module: nn.Module) -> list[str]:
+    """Name the kinds of layers that don't do the same to a row of a batch whose other rows lie elsewhere."""
+    found = [layer for layer in module.modules() if _counts(layer) or (_draws(layer) and layer.p)]
+    found += [layer for layer in module.modules() if isinstance(layer, nn.RNNBase) and layer.dropout]
+    return sorted({type(layer).__name__ for layer in found})
+
+
+def _draws(layer: nn.Module) -> bool:
+    return isinstance(layer, _DropoutNd) and not isinstance(layer, Dropout)
+
+
+def _counts(layer: nn.Module) -> bool:
+    return isinstance(layer, _BatchNorm)

@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from memmlp.common import parallel
 from memmlp.motion.body import FRAME_DIM, ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 
@@ -81,11 +82,15 @@ class EMACodebook(Codebook):
     def learn(self, latent: Tensor) -> Quantised:
         """Quantise latents (B, width) and move the code-vectors towards them."""
         with torch.autocast(latent.device.type, enabled=False):  # running means need float32
-            codes, index = self._follow(latent.detach().float())
+            codes, index = self._follow(latent.detach().to(self.vectors.dtype))
         return Quantised(codes, index, self.commitment * F.mse_loss(latent, codes))
 
     def _follow(self, latent: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the codes and indices of latents (B, width), then update the code-vectors."""
+        """Return the codes and indices of latents (B, width), then update the code-vectors.
+
+        The running means are those of the whole batch, where several processes share it.
+        """
+        latent = parallel.whole(latent)
         if not self.started:
             self._restart(torch.ones_like(self.counts, dtype=torch.bool), latent)
             self.started.fill_(True)
@@ -95,7 +100,7 @@ class EMACodebook(Codebook):
         self.sums.lerp_(chosen.T @ latent, 1 - self.decay)
         self._restart(self.counts < self.DEAD, latent)
         self.vectors.copy_(self.sums / self.counts[:, None])
-        return codes, index
+        return parallel.own(codes), parallel.own(index)
 
     def _restart(self, dead: Tensor, latent: Tensor) -> None:
         """Put the codes that are `dead` (K,) onto random latents of the batch (B, width)."""

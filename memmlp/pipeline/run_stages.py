@@ -13,11 +13,13 @@ from typing import Any
 
 import torch
 
+from memmlp.common import parallel
 from memmlp.common.files import read_json, write_json
 from memmlp.common.progress import stage_begins
 from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
 from memmlp.motion.preparing.source import Prepared
+from memmlp.pipeline.devices import described
 from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.identity import Identity, deployment_settings, evaluation_recipes, evaluation_settings
@@ -142,6 +144,7 @@ def vqvae_run(experiment: Experiment, data: Prepared) -> Run:
         begin(experiment, run, identity, experiment.vqvae.config)
         run.write_manifest({"partial": partial_words(experiment, data)})
         stage_begins(f"VQ-VAE: train it, whose code-vectors the network's memory uses (run {run.id})")
+        parallel.of_first("vqvae")
         with timed(run, "train"):
             errors = experiment.vqvae.train(experiment.architecture, data, run, experiment.device)
         write_json(run.results_path, {"val": errors})
@@ -159,6 +162,7 @@ def train_run(
     run.write_manifest({"body": data.manifest.body, "partial": partial_words(experiment, data)})
     run.clear_stages()
     weights = codes.weights() if codes else None
+    parallel.of_first("network")
     with timed(run, "train"):
         experiment.training.train(experiment.architecture, data, weights, run, experiment.device, watch)
     run.finish(("model.safetensors",))
@@ -203,6 +207,7 @@ def begin(experiment: Experiment, run: Run, identity: Identity, config: dict[str
     """Begin a training: write its config, and into its manifest its identity and what it runs on."""
     above = identity.upstream.id if identity.upstream else None
     facts = {"recipes": identity.recipes, "what": identity.what, **machine(experiment)}
+    facts["processes"] = parallel.size()
     run.begin(identity.kind, config, data=identity.data, upstream=above, **facts)
 
 
@@ -214,10 +219,8 @@ def partial_words(experiment: Experiment, data: Prepared) -> str | None:
 
 def machine(experiment: Experiment) -> dict[str, Any]:
     """Return what can change the last digits of a result: device, GPU, threads, precision."""
-    cuda = experiment.device.type == "cuda"
     return {
-        "device": str(experiment.device),
-        "gpu": torch.cuda.get_device_name(experiment.device) if cuda else None,
+        **described(experiment.device),
         "threads": torch.get_num_threads(),
         "precision": experiment.training.optim.precision,
     }

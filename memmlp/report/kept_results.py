@@ -191,8 +191,9 @@ def _record(run: Measured) -> dict[str, Any]:
     }
     costs = {name: _short(cost) for name, cost in run.costs.items()}
     origin = plain(asdict(run.origin))
-    if run.origin.partial is None:
-        del origin["partial"]
+    for name in ("partial", "processes"):  # files from before there were these have none
+        if origin[name] == getattr(Origin, name):
+            del origin[name]
     return {"origin": origin, "clips": _clips_key(run), "costs": costs, "errors": errors}
 
 

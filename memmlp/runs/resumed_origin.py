@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-MACHINE = ("device", "gpu", "threads", "precision", "cpu")  # what can change a result's last digits
+MACHINE = ("device", "gpu", "gpu_index", "threads", "processes", "precision", "cpu")
+"""What can change a result's last digits, and which of a machine's GPUs it was."""
 
 
 def joined(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from typing import Self
 
@@ -70,8 +71,10 @@ class Board(Screen):
 
 def _change(plan: Plan, task: RunTask, state: str) -> str:
     """Say what became of a task, and why."""
-    reason = plan.run_of(task).failure if state == "failed" else None
-    return f"{name(plan, task)}: {WORDS.get(state, state)}{f', {reason}' if reason else ''}"
+    run = plan.run_of(task)
+    reason = run.failure if state == "failed" else None
+    where = f" on {device_name(run)}" if state == "done" else ""
+    return f"{name(plan, task)}: {WORDS.get(state, state)}{where}{f', {reason}' if reason else ''}"
 
 
 def name(plan: Plan, task: RunTask) -> str:
@@ -99,7 +102,7 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
         cells = {e.seed: cell(plan, tasks[e.key], states[e.key]) for e in plan.entries if e.label == label}
         table.add_row(Text(label), *(cells.get(seed, Text("-")) for seed in seeds))
     below = [_upstream(plan, task, states[task.key]) for task in plan.tasks if task.kind == "vqvae"]
-    below += [Text(_counts(states))]
+    below += [Text(_counts(states)), *map(Text, _devices(plan, states))]
     below += [
         Text(f"{name(plan, task)}: {plan.run_of(task).failure}", style="red")
         for task in plan.tasks
@@ -163,10 +166,22 @@ def time_left(log: list[Metrics], total: int) -> float | None:
     return max((total - recent[-1].step) * seconds / steps - (time.time() - recent[-1].time), 0.0)
 
 
+def _devices(plan: Plan, states: Mapping[str, str]) -> list[str]:
+    """Say, in a line if anything runs, how many runs each device has."""
+    running = [plan.run_of(task) for task in plan.tasks if states[task.key] == "running"]
+    names = Counter(name for run in running if (name := device_name(run)))
+    return [f"running on {', '.join(f'{name}: {count}' for name, count in names.items())}"] if names else []
+
+
+def device_name(run: Run) -> str:
+    """Return the device that a run was last worked on with, as text; empty where it is not known."""
+    manifest = run.manifest
+    if not manifest.get("gpu"):
+        return str(manifest.get("device") or "")
+    return f"GPU {manifest.get('gpu_index', '?')} ({manifest['gpu']})"
+
+
 def _counts(states: Mapping[str, str]) -> str:
     """Say how many runs are in which state."""
-    counts: dict[str, int] = {}
-    for state in states.values():
-        word = WORDS.get(state, state).partition(",")[0]
-        counts[word] = counts.get(word, 0) + 1
+    counts = Counter(WORDS.get(state, state).partition(",")[0] for state in states.values())
     return ", ".join(f"{count} {word}" for word, count in counts.items())

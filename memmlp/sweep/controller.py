@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from memmlp.common.errors import InputError
 from memmlp.sweep.board import Board
-from memmlp.sweep.executors import Executor, Handle
+from memmlp.sweep.executors.executor import Executor, Handle, Work
 from memmlp.sweep.plan import Plan
 from memmlp.sweep.worker import Presence
 
@@ -31,7 +31,7 @@ class Fleet:
     def __init__(
         self,
         executor: Executor,
-        work: Callable[[], None],
+        work: Work,
         size: int,
         logs: Path,
         presence: Presence | None = None,
@@ -40,6 +40,7 @@ class Fleet:
         self.presence = presence
         self.handles: list[tuple[Handle, float]] = []
         self.stillborn = 0
+        self.complaint: str | None = None
 
     def keep(self, wanted: int) -> None:
         """Start workers until `wanted` are alive, or as many as the fleet's size.
@@ -47,15 +48,24 @@ class Fleet:
         Raises:
             InputError: when workers one after another end as soon as they are started.
         """
-        ended = [started for handle, started in self.handles if not handle.alive()]
-        self.handles = [(handle, started) for handle, started in self.handles if handle.alive()]
         now = time.monotonic()
-        for started in ended:
-            self.stillborn = self.stillborn + 1 if now - started < QUICK else 0
+        self._count_stillborn(now)
         if self.stillborn >= PATIENCE * self.size:
-            raise InputError(f"workers end as soon as they are started; the reason is in {self.logs}")
-        for _ in range(min(wanted, self.size) - len(self.handles)):
-            self.handles.append((self.executor.submit(self.work), now))
+            reason = self.complaint or "the reason"
+            raise InputError(f"workers end as soon as they are started: {reason}; see {self.logs}")
+        if (missing := min(wanted, self.size) - len(self.handles)) > 0:
+            self.handles += [(handle, now) for handle in self.executor.submit(self.work, missing)]
+
+    def _count_stillborn(self, now: float) -> None:
+        """Part with the workers that ended, and count those in a row that ended as soon as they began."""
+        dead = [not handle.alive() for handle, _ in self.handles]
+        ended = list(itertools.compress(self.handles, dead))
+        self.handles = [worker for worker in self.handles if worker not in ended]
+        for handle, started in ended:
+            complaint = handle.complaint()
+            self.complaint = complaint or self.complaint
+            quick = complaint is not None or now - started < QUICK
+            self.stillborn = self.stillborn + 1 if quick else 0
 
     def cancel(self) -> None:
         """End all workers."""

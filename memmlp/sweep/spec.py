@@ -39,6 +39,7 @@ KEYS = (
     "arms", "axes",
 )  # fmt: skip
 ARM_KEYS = ("overrides", "branch", "against", "paper", "note")
+BASE = "base"  # the arm of a sweep that has only seeds
 COSTS = ("FLOPs", "MACs", "parameters", "size", "ms", "ratio", "FPS")
 """Metrics that are costs and no errors.
 
@@ -225,7 +226,9 @@ def parse_sweep(name: str, content: Any) -> Sweep:
     arms = [_arm(label, value, branch) for label, value in _labelled(content.get("arms", {})).items()]
     axes = dict(_mapping(content.get("axes", {}), "axes"))
     seeds = _seeds(axes.pop("seed", content.get("seeds", [0])), "seeds")
-    arms = list(_grid(arms, axes, branch)) if axes else arms
+    if "axes" in content and not arms:
+        arms = [Arm("" if axes else BASE, branch=branch)]  # axes of seeds alone
+    arms = list(_grid(arms, axes)) if axes else arms
     runnable = [arm.label for arm in arms if arm.overrides is not None]
     if not runnable:
         raise InputError("arms: none to run; allowed is at least one arm with overrides, or axes")
@@ -284,16 +287,16 @@ def _check_controls(arms: Sequence[Arm], runnable: Sequence[str]) -> None:
             )
 
 
-def _grid(arms: Sequence[Arm], axes: Mapping[str, Any], branch: str) -> Iterable[Arm]:
+def _grid(arms: Sequence[Arm], axes: Mapping[str, Any]) -> Iterable[Arm]:
     """Yield every arm with every combination of the axes' values.
 
-    The paper's own arms stay as they are. Without arms there is one for each combination. An arm with a
+    The paper's own arms stay as they are. An arm without a label gets that of its combination. An arm with a
     control of its own is compared with that control at the same combination.
     """
     for key, values in axes.items():
         if not isinstance(values, list) or not values:
             raise InputError(f"axes.{key}: allowed is a list of values, not empty")
-    for arm in arms or [Arm("", branch=branch)]:
+    for arm in arms:
         if arm.overrides is None:
             yield arm
             continue

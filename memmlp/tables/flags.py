@@ -17,7 +17,7 @@ BUILT_IN = "builtin"
 SMPLH = (1, 2, 3)  # the paper's tables on AMASS, on the rest joints of SMPL-H bodies
 ORIGIN = {
     "code": "code", "data": "data", "hardware": "hardware", "device": "device", "gpu": "GPU",
-    "threads": "threads", "torch": "torch", "precision": "precision",
+    "threads": "threads", "processes": "processes", "torch": "torch", "precision": "precision",
 }  # fmt: skip
 
 

@@ -30,9 +30,10 @@ class Origin:
         changed: whether the checkout had uncommitted changes.
         data: the digest of the prepared data.
         hardware: the processor.
-        device: "cpu" or "cuda".
+        device: "cpu", "cuda" or "mps".
         gpu: the GPU's name.
         threads: torch's threads on the processor.
+        processes: how many trained it together.
         torch: torch's version.
         precision: the precision of training.
         body: whose rest joints the motion is on: "builtin" or the file of a body model.
@@ -48,6 +49,7 @@ class Origin:
     device: str = UNKNOWN
     gpu: str = UNKNOWN
     threads: str = UNKNOWN
+    processes: str = "1"
     torch: str = UNKNOWN
     precision: str = UNKNOWN
     body: str = UNKNOWN
@@ -222,6 +224,7 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
         device=of("device"),
         gpu=of("gpu"),
         threads=of("threads"),
+        processes=str(manifest.get("processes") or 1),
         torch=str((manifest.get("packages") or {}).get("torch") or UNKNOWN),
         precision=of("precision"),
         body=of("body"),

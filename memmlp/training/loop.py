@@ -1,7 +1,8 @@
 """The training loop of VQ-VAEs and motion networks: steps, checkpoints, validation, log.
 
 A step's randomness comes from (seed, step) alone, so a run that was killed and resumed ends in the same
-weights, bit for bit on a CPU, as one that was not.
+weights, bit for bit on a CPU, as one that was not. Several processes may train one run together
+(memmlp.common.parallel); the first of them writes.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ import torch
 from rich.progress import Progress, TaskID
 from torch import Tensor, nn
 
-from memmlp.common.errors import TrainingDiverged
+from memmlp.common import parallel
+from memmlp.common.errors import InputError, TrainingDiverged
 from memmlp.common.progress import progress
 from memmlp.motion.dataset import MotionDataset
-from memmlp.networks import checkpoint
+from memmlp.networks import checkpoint, layers
 from memmlp.runs.run import Run
 from memmlp.training.optim import Optim
 
@@ -92,19 +94,37 @@ def train(
 
     Raises:
         TrainingDiverged: if the loss is NaN or infinite.
+        InputError: if several processes can't train the task as one would.
     """
+    check_shares(task, optim, description)
     optimiser = optim.build(task.parameter_groups())
-    start = resume(task, optimiser, run) if run.checkpoint.exists() else 0
-    with progress() as bar:
+    start = resume(task, optimiser, run)
+    parallel.align(task.module)
+    with progress(shown=parallel.first()) as bar:
         row = bar.add_task(description, total=optim.steps, completed=start, note="")
         for step in range(start, optim.steps):
             seed_step(seed, step)
             result = train_step(task, optim, optimiser, step)
-            validation = record(task, optim, run, step + 1, result, bar, row)
+            validation = record(task, optim, run, step + 1, result, bar, row) if parallel.first() else {}
             if (step + 1) % optim.checkpoint_every == 0 or step + 1 == optim.steps:
                 save(task, optimiser, run, step + 1)
             if validation:
                 watch(step + 1, validation)
+
+
+def check_shares(task: TrainingTask, optim: Optim, description: str) -> None:
+    """Raise InputError if shares of a batch, one for each process, don't add up to what one process does."""
+    count = parallel.size()
+    if optim.batch % count:
+        raise InputError(
+            f"{description}: a batch of {optim.batch} (optim.batch, vqvae.batch) on {count} processes: "
+            f"allowed is a multiple of {count}"
+        )
+    if count > 1 and (names := layers.undivided(task.module)):
+        raise InputError(
+            f"{description}: {', '.join(names)} on {count} processes: each would draw or count by itself; "
+            "allowed are layers that work row by row, and memmlp.networks.layers.Dropout"
+        )
 
 
 def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimizer, step: int) -> StepResult:
@@ -115,15 +135,26 @@ def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimize
         group["lr"] = group["initial_lr"] * optim.factor(step)
     device = task.dataset.frames.device
     mixed = torch.autocast(device.type, torch.bfloat16) if optim.precision == "bf16" else nullcontext()
-    with mixed:
+    with mixed, parallel.sharing():
         result = task.step(step)
-    check_finite(task, result, step)
+        seen = of_whole_batch(result)
+    check_finite(task, seen, step)
     optimiser.zero_grad(set_to_none=True)
     result.loss.backward()
+    parallel.average_gradients(task.module.parameters())
     if optim.clip_norm:
         torch.nn.utils.clip_grad_norm_(task.module.parameters(), optim.clip_norm)
     optimiser.step()
-    return result
+    return seen
+
+
+def of_whole_batch(result: StepResult) -> StepResult:
+    """Return the loss, terms and clips of the whole batch, of which this process may have a share."""
+    if not parallel.shared():
+        return result
+    terms = torch.stack([result.loss, *result.terms.values()])
+    loss, *means = parallel.mean(terms.detach())
+    return StepResult(loss, dict(zip(result.terms, means, strict=True)), parallel.whole(result.clips))
 
 
 def check_finite(task: TrainingTask, result: StepResult, step: int) -> None:
@@ -167,7 +198,13 @@ def record(
 
 
 def save(task: TrainingTask, optimiser: torch.optim.Optimizer, run: Run, step: int) -> None:
-    """Write a checkpoint with all that a later process needs to go on after `step` steps."""
+    """Write a checkpoint with all that a later process needs to go on after `step` steps.
+
+    Of several processes the first one writes, and the others go on with its weights.
+    """
+    parallel.align(task.module)
+    if not parallel.first():
+        return
     rates = [group["initial_lr"] for group in optimiser.param_groups]
     tensors = checkpoint.module_tensors("module", task.module) | checkpoint.optimiser_tensors(optimiser)
     tensors["rng.torch"] = torch.get_rng_state()
@@ -175,8 +212,12 @@ def save(task: TrainingTask, optimiser: torch.optim.Optimizer, run: Run, step: i
 
 
 def resume(task: TrainingTask, optimiser: torch.optim.Optimizer, run: Run) -> int:
-    """Load the run's checkpoint and return the number of finished steps."""
-    tensors, values = checkpoint.read(run.checkpoint)
+    """Load the run's checkpoint, if there is one, and return the number of finished steps."""
+    found = checkpoint.read(run.checkpoint) if parallel.first() and run.checkpoint.exists() else None
+    found = parallel.of_first(found)
+    if found is None:
+        return 0
+    tensors, values = found
     checkpoint.load_module("module", task.module, tensors)
     checkpoint.load_optimiser(optimiser, tensors)
     torch.set_rng_state(tensors["rng.torch"])

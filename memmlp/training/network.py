@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
+from memmlp.common import parallel
 from memmlp.evaluation import modes
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset, WindowSampler
@@ -85,7 +86,8 @@ class NetworkTraining:
             shares=self.shares,
         )
         train(task, self.optim, run, self.seed, "network", watch)
-        checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
+        if parallel.first():
+            checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
         return model.eval()
 
 

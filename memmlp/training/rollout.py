@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from memmlp.common import parallel
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.networks.memory import State
@@ -34,7 +35,10 @@ class Call(NamedTuple):
 
 
 class Rollout(nn.Module):
-    """The rollout slot's interface."""
+    """The rollout slot's interface.
+
+    Where several processes share a batch, each draws the call of its own rows (memmlp.common.parallel).
+    """
 
     def begin(self, model: WindowModel) -> None:
         """Make room for what is kept between the training steps of a network; here nothing is kept."""
@@ -52,7 +56,7 @@ class TeacherForcing(Rollout):
 
     def draw(self, model: WindowModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """Draw the call of a training step."""
-        clips, end = sampler.draw(step)
+        clips, end = map(parallel.own, sampler.draw(step))
         past, stride = model.length, model.stride
         segment = dataset.segments(clips, end, past + stride)
         state = model.true_state(segment[:, :past])
@@ -71,7 +75,7 @@ class OwnPredictions(Rollout):
 
     def draw(self, model: WindowModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """Draw the call of a training step, after the calls that make its history."""
-        clips, end = sampler.draw(step)
+        clips, end = map(parallel.own, sampler.draw(step))
         past, stride = model.length, model.stride
         passes = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
         segment = dataset.segments(clips, end, past + stride * (passes + 1))
@@ -126,17 +130,17 @@ class PersistentStreams(Rollout):
         self.clip[who] = torch.where(going, self.clip[who], clips)
         self.end[who] = torch.where(going, self.end[who] + model.stride, end)
         self.lives[who] = True
+        self.who, mine, going = who, parallel.own(who), parallel.own(going)
         past, stride = model.length, model.stride
-        segment = dataset.segments(self.clip[who], self.end[who], past + stride)
+        segment = dataset.segments(self.clip[mine], self.end[mine], past + stride)
         fresh = model.running_state(segment[:, :past, :SPARSE_DIM])
         state = {}
         for name, tensor in fresh.items():
-            kept = self.get_buffer(f"state_{name}")[who]
+            kept = self.get_buffer(f"state_{name}")[mine]
             state[name] = torch.where(going.view(-1, *[1] * (tensor.dim() - 1)), kept, tensor)
-        self.who = who
-        return Call(segment[:, past:, :SPARSE_DIM], state, segment[:, -model.frames :], self.clip[who])
+        return Call(segment[:, past:, :SPARSE_DIM], state, segment[:, -model.frames :], self.clip[mine])
 
     def keep(self, state: State) -> None:
         """Keep the streams' states after the trained call."""
         for name, tensor in state.items():
-            self.get_buffer(f"state_{name}")[self.who] = tensor.detach()
+            self.get_buffer(f"state_{name}")[self.who] = parallel.whole(tensor.detach())

@@ -61,6 +61,16 @@ def test_every_command_has_help(memmlp: Memmlp, name: str):
     assert ran.err == ""
 
 
+def test_help_of_train_lists_what_can_be_chosen_and_nothing_else(memmlp: Memmlp):
+    said = memmlp("train", "--help", "memory=none", "device=cpu").out
+    groups = said.partition("== Config ==")[0]
+    assert "\nmemory: gru, lstm, " in groups
+    assert "\nprofile: paper, small, tiny\n" in groups
+    for inner in ("schema", "hydra", "search"):
+        assert f"\n{inner}" not in groups
+    assert "\ndevice: cpu\n" in said
+
+
 def test_version(memmlp: Memmlp):
     assert memmlp("--version").out == f"memmlp, version {package.__version__}\n"
 

@@ -35,7 +35,7 @@ class Runs:
     def planned(self, sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
         cells = [(arm.label, seed) for arm in sweep.runnable() for seed in sweep.seeds_of(arm)]
         entries = [Entry(label, seed, self._id(label, seed)) for label, seed in cells]
-        tasks = [RunTask(entry.id, "memmlp", {"optim": {"steps": 1}}) for entry in entries]
+        tasks = [RunTask(entry.id, "memmlp", {"optim": {"steps": 1}, "device": "cpu"}) for entry in entries]
         return Plan(sweep.name, self.outputs, tuple(entries), tuple(tasks))
 
     def _id(self, label: str, seed: int) -> str:

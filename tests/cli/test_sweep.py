@@ -18,7 +18,7 @@ from command_line import MAIN, run, run_apart
 from command_line import TINY as SMALLEST
 from processes import PATIENCE, ignoring_interrupts, started, until
 
-from memmlp.cli.sweep import split_executor
+from memmlp.cli.workers import split_executor
 from memmlp.common.errors import InputError
 from memmlp.config.perform_task import perform
 from memmlp.config.plan_sweep import find_sweep, orphans, planned
@@ -61,6 +61,8 @@ def test_what_can_be_done_is_done_once(home: Path):
     assert [re.search(rf"^{arm} +(./1)", said, re.M)[1] for arm in ARMS] == ["1/1", "1/1", "0/1"]
     runs = list_runs(home / "outputs")
     assert sorted(run.manifest["kind"] for run in runs if run.done) == ["memmlp", "memmlp", "vqvae"]
+    assert {(run.manifest["device"], run.manifest["processes"]) for run in runs} == {("cpu", 1)}
+    assert "none seed 0: done on cpu" in said
     before = stamps(home)
     assert "3 of 4 runs done" in command(home, code=1)
     assert stamps(home) == before
@@ -74,12 +76,21 @@ def test_status_and_dry_run_show_and_do_nothing(home: Path):
     assert "3 done, 1 failed" in said
     forecast = command(home, "seed=0,1", "--dry-run", "--workers", "2")
     assert "4 of 8 runs to do, 2 at once: about" in forecast
-    slurm = command(
-        home, "--dry-run", "executor=slurm", "slurm.partition=gpu", "slurm.time=30", "slurm.mem_gb=8"
-    )
+    words = ("executor=slurm", "slurm.partition=gpu", "slurm.time=10:00:00", "slurm.mem_gb=8")
+    slurm = command(home, "--dry-run", *words, "--workers", "3")
+    assert "#SBATCH --array=0-2%3" in slurm
+    assert "#SBATCH --time=10:00:00" in slurm
     assert "#SBATCH --partition=gpu" in slurm
     assert "#SBATCH --mem=8GB" in slurm
     assert stamps(home) == before
+
+
+def test_a_first_dry_run_counts_the_runs_whose_data_is_not_prepared(tmp_path: Path):
+    (tmp_path / "trial.yaml").write_text("axes: {seed: [5, 6]}")
+    said = command(tmp_path, "--dry-run", "--workers", "2")
+    assert "2 runs: their data is not prepared yet; the sweep does that first" in said
+    assert "2 of 2 runs to do, and the VQ-VAEs that they need, 2 at once" in said
+    assert not list_runs(tmp_path / "outputs")
 
 
 def test_an_edited_file_adds_arms_and_lists_orphans(home: Path):
@@ -200,8 +211,17 @@ def test_an_interrupted_sweep_ends_its_workers_and_goes_on_later(tmp_path: Path)
         (["trial.yaml", "memory=nosuch"], "memory=nosuch"),
         (["trial.yaml", "executor=cloud"], "executor=cloud: allowed is local, slurm or ray"),
         (["trial.yaml", "slurm.partition=x"], "slurm.partition: goes with executor=slurm"),
-        (["trial.yaml", "executor=slurm", "slurm.nodes=2"], "slurm.nodes: no such key"),
-        (["trial.yaml", "executor=slurm", "slurm.time=1h", "--dry-run"], "slurm.time=1h: allowed is a whole"),
+        (["trial.yaml", "executor=slurm", "slurm.nodes=2"], "slurm.nodes: allowed is none"),
+        (
+            ["trial.yaml", "executor=slurm", "slurm.time=1h", "--dry-run"],
+            "slurm.time=1h: allowed are MINUTES",
+        ),
+        (["trial.yaml", "executor=ray", "ray.gpus=1"], "ray.gpus: no such key"),
+        (["trial.yaml", "executor=ray", "--gpus-per-worker", "1"], "goes with workers of this machine"),
+        (
+            ["trial.yaml", "device=cuda:x"],
+            "device=cuda:x: allowed is auto or cpu or cuda or cuda:INDEX or mps",
+        ),
         (["trial.yaml", "seed=a"], "seed: ['a']; allowed is a list of whole numbers"),
         (["trial.yaml", "data=mocap"], "arm 'full': data.root: has no value"),
     ],
@@ -222,7 +242,7 @@ def test_a_sweep_on_a_local_ray(tmp_path: Path):
 def test_executor_words_are_no_overrides_of_the_runs():
     assert split_executor(("executor=slurm", "slurm.time=5", "model.depth=8")) == (
         "slurm",
-        {"timeout_min": 5},
+        {"time": "5"},
         ("model.depth=8",),
     )
     with pytest.raises(InputError, match="executor"):

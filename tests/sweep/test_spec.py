@@ -65,6 +65,9 @@ def test_axes_are_a_grid_over_every_arm():
     printed = parse_sweep("s", {"arms": {"theirs": {"overrides": None}, "a": []}, "axes": axes})
     assert [arm.label for arm in printed.arms if arm.overrides is None] == ["theirs"]
     assert len(printed.runnable()) == 4
+    seeds = parse_sweep("s", {"axes": {"seed": [5, 6]}})
+    assert [(arm.label, arm.overrides) for arm in seeds.arms] == [("base", ())]
+    assert seeds.seeds == (5, 6)
     alone = parse_sweep("s", {"axes": {"model.frames": [11, 21]}})
     assert [arm.label for arm in alone.arms] == ["model.frames=11", "model.frames=21"]
 

@@ -1,63 +1,24 @@
 """The training loop: learning, resuming bit for bit after a kill, stopping at NaN; checkpoints."""
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import pytest
 import tiny
 import torch
+from tiny_tasks import OPTIM, ROLLOUTS, TASKS, motion_task, vqvae_task, weights
 
 from memmlp.common.errors import InputError, TrainingDiverged
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.motion.dataset import WindowSampler
 from memmlp.networks import checkpoint
-from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.run import Run
 from memmlp.training.loop import train
-from memmlp.training.losses import HandPosition, MotionLoss, Uncertainty
 from memmlp.training.network import MotionTask
-from memmlp.training.optim import SCHEDULES, Optim
-from memmlp.training.rollout import OwnPredictions, PersistentStreams, TeacherForcing
-from memmlp.training.vqvae import VQVAETask, perplexity
-
-OPTIM = Optim(steps=12, batch=4, lr=1e-3, final_lr=1e-4, schedule="cosine", checkpoint_every=5, log_every=4)
-ROLLOUTS = {
-    "forced": TeacherForcing,
-    "own": lambda: OwnPredictions(2),
-    "streams": lambda: PersistentStreams(6),
-}
-
-
-def motion_task(rollout: str = "own", optim: Optim = OPTIM, seed: int = 0) -> MotionTask:
-    model, made = tiny.model(seed=seed), ROLLOUTS[rollout]()
-    if isinstance(made, PersistentStreams):
-        made.begin(model)
-    loss = MotionLoss(Uncertainty(), HandPosition(), model.predictor.branches)
-    return MotionTask(model, loss, made, tiny.frames(), optim, seed, validate=lambda model: {"answer": 42.0})
-
-
-def baseline_task(name: str, optim: Optim = OPTIM, seed: int = 0) -> MotionTask:
-    model, loss = tiny.baseline(name, seed=seed), tiny.BASELINE_LOSSES[name]()
-    return MotionTask(model, loss, TeacherForcing(), tiny.frames(), optim, seed, validate=lambda model: {})
-
-
-def vqvae_task(optim: Optim = OPTIM) -> VQVAETask:
-    torch.manual_seed(0)
-    model = VQVAE(codes=8, width=12, encoder_depth=1)
-    return VQVAETask(model, tiny.normalizer(), tiny.frames(), tiny.frames((30,), seed=9), optim, seed=0)
-
-
-def weights(run: Run) -> dict[str, torch.Tensor]:
-    return checkpoint.read(run.checkpoint)[0]
-
-
-TASKS = {
-    **{name: partial(motion_task, name) for name in ROLLOUTS},
-    **{name: partial(baseline_task, name) for name in tiny.BASELINES},
-    "vqvae": vqvae_task,
-}
+from memmlp.training.optim import SCHEDULES
+from memmlp.training.rollout import TeacherForcing
+from memmlp.training.vqvae import perplexity
 
 
 def test_the_weighting_of_the_data_decides_which_clips_a_step_sees():

@@ -38,6 +38,7 @@ from memmlp.config.schema.network import (
     VQVAEConfig,
 )
 from memmlp.config.schema.rules import (
+    DEVICE,
     EachOf,
     OneOf,
     Text,
@@ -161,7 +162,7 @@ class Config:
     """The whole config of `memmlp train`."""
 
     seed: int = key(Within(0, 2**63 - 1))
-    device: str = one_of("auto", "cpu", "cuda")
+    device: str = key(DEVICE)
     threads: int = at_least(0)
     force: bool = key()
     save_predictions: Optional[str] = key()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -86,6 +87,21 @@ class Text:
 
 
 @dataclass(frozen=True)
+class Matching:
+    """The rule that a value is text of a pattern, which `said` tells in words."""
+
+    pattern: re.Pattern[str]
+    said: str
+
+    def allows(self, value: Any) -> bool:
+        """Return whether the whole text matches."""
+        return bool(self.pattern.fullmatch(value))
+
+    def __str__(self) -> str:
+        return self.said
+
+
+@dataclass(frozen=True)
 class Folders:
     """The rule that a value is the path of an existing folder, or a list of several."""
 
@@ -121,6 +137,9 @@ class Existing:
 def key(rule: object = None) -> Any:
     """Declare a key whose value comes from the YAML file."""
     return field(default=MISSING, metadata={"rule": rule})
+
+
+DEVICE = Matching(re.compile(r"auto|cpu|mps|cuda(:\d+)?"), "auto or cpu or cuda or cuda:INDEX or mps")
 
 
 def optional(rule: object = None) -> Any:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.layers import Dropout
 from memmlp.networks.memory import State
 from memmlp.networks.window_model import WindowModel
 
@@ -62,7 +63,7 @@ class EncoderLayer(nn.Module):
         self.attention_norm = nn.LayerNorm(width)
         self.widen, self.narrow = nn.Linear(width, feedforward), nn.Linear(feedforward, width)
         self.norm = nn.LayerNorm(width)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = Dropout(dropout)
 
     def forward(self, h: Tensor) -> Tensor:
         """Map features (B, T, d) to (B, T, d)."""

@@ -40,6 +40,10 @@ class Diffusion(nn.Module):
         self.times = [steps * (i + 1) // sampling_steps - 1 for i in reversed(range(sampling_steps))]
         self.register_buffer("signal", cosine_schedule(steps).float(), persistent=False)
 
+    def random_times(self, clean: Tensor) -> Tensor:
+        """Draw a time (B,) for each signal of a batch (B, ...)."""
+        return torch.randint(self.steps, (len(clean),), device=clean.device)
+
     def noised(self, clean: Tensor, time: Tensor, noise: Tensor) -> Tensor:
         """Mix clean signals (B, ...) with standard normal noise (B, ...) as the times (B,) demand."""
         signal = self.signal[time].view(-1, *[1] * (clean.dim() - 1))

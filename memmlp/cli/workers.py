@@ -1,0 +1,238 @@
+"""The workers of `memmlp sweep` and `memmlp tune`: which executor, how many, with which GPUs."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from uuid import uuid4
+
+import click
+
+from memmlp.common.errors import InputError
+
+if TYPE_CHECKING:
+    from memmlp.sweep.controller import Fleet
+    from memmlp.sweep.executors.executor import Executor
+    from memmlp.sweep.executors.gpus import Share
+    from memmlp.sweep.plan import Plan
+
+ENGINES = ("local", "slurm", "ray", "debug")  # the last one is for finding bugs
+WITHOUT = {"cpu", "mps"}  # devices of runs that no GPU need be given to
+SETTINGS = ("slurm", "ray")  # executors with words of their own
+
+
+@dataclass(frozen=True)
+class Workers:
+    """The workers that a command line asks for.
+
+    Attributes:
+        engine: the executor's name.
+        words: the executor's own settings, KEY -> VALUE of words like slurm.KEY=VALUE.
+        count: how many run at once; None leaves it to the machine.
+        gpus_per_worker: GPUs of a worker of this machine; None for 1 where there are any.
+        workers_per_gpu: the most workers that share a GPU of this machine; None for as many as it takes.
+    """
+
+    engine: str = "local"
+    words: dict[str, str] = field(default_factory=dict)
+    count: int | None = None
+    gpus_per_worker: int | None = None
+    workers_per_gpu: int | None = None
+
+    def __post_init__(self) -> None:
+        given = {"--gpus-per-worker": self.gpus_per_worker, "--workers-per-gpu": self.workers_per_gpu}
+        for option in (name for name, value in given.items() if value is not None and self.engine != "local"):
+            raise InputError(f"{option}: goes with workers of this machine, and not executor={self.engine}")
+        self.settings()
+
+    def settings(self) -> Any:
+        """Return the executor's own settings, checked. Raises InputError for a wrong one."""
+        if self.engine == "slurm":
+            from memmlp.sweep.executors.slurm import slurm_options
+
+            return slurm_options(self.words)
+        if self.engine == "ray":
+            from memmlp.sweep.executors.ray_cluster import ray_options
+
+            return ray_options(self.words)
+        return None
+
+    def script(self, folder: Path) -> str | None:
+        """Return the file that sbatch would be given; None for executors without one."""
+        if self.engine != "slurm":
+            return None
+        from memmlp.sweep.executors.slurm import script
+
+        return script(logs(folder), self.settings(), self.number())
+
+    def number(self, shared: list[Share] | None = None) -> int:
+        """Return how many workers run at once, given the shares of GPUs that they have on this machine."""
+        from memmlp.sweep.executors.gpus import worker_count
+
+        return worker_count(shared or [], self.count, self.workers_per_gpu)
+
+    def shares(self, devices: Iterable[str]) -> list[Share]:
+        """Return the shares of this machine's GPUs that local workers get for runs on devices of these names.
+
+        Raises:
+            InputError: where a run asks for a GPU that its worker can't have.
+        """
+        from memmlp.sweep.executors.gpus import shares, visible_gpus
+
+        wanted = [name for name in devices if name not in WITHOUT]
+        here = wanted and self.engine == "local" and self.gpus_per_worker != 0
+        gpus = visible_gpus() if here else ()
+        check_devices(wanted, gpus, self.engine)
+        return shares(gpus, self.gpus_per_worker)
+
+
+def check_devices(wanted: Iterable[str], gpus: Share, engine: str) -> None:
+    """Check that the GPUs that runs ask for can be those of workers.
+
+    Args:
+        wanted: the values of the key `device` of runs that may use a GPU.
+        gpus: the visible GPUs of this machine.
+        engine: the executor's name.
+
+    Raises:
+        InputError: naming the key.
+    """
+    for name in wanted:
+        if ":" in name:
+            raise InputError(f"device={name}: allowed is auto, cuda, cpu or mps; each worker has its own GPU")
+        if engine == "local" and name == "cuda" and not gpus:
+            raise InputError("device=cuda: no GPU is visible here; allowed here is device=cpu or device=auto")
+    if gpus and wanted:
+        from memmlp.pipeline.devices import missing_gpu
+
+        if line := missing_gpu():
+            raise InputError(line)
+
+
+def logs(folder: Path) -> Path:
+    """Return the path of the workers' logs in the folder of a sweep or search, %j for a worker's number."""
+    return folder / "workers" / "%j"
+
+
+def worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options about workers to a command, which gets what they say as `workers`, and the rest of
+    its overrides.
+    """
+    options = (
+        click.option(
+            "--workers",
+            "count",
+            type=click.IntRange(1),
+            help="How many workers run at once.  [default: one a GPU, or without GPUs one a core]",
+        ),
+        click.option(
+            "--gpus-per-worker",
+            type=click.IntRange(0),
+            help="GPUs of each worker of this machine, 0 for none.  [default: 1 where there are any]",
+        ),
+        click.option(
+            "--workers-per-gpu", type=click.IntRange(1), help="Most workers that share a GPU of this machine."
+        ),
+    )
+
+    @functools.wraps(command)
+    def wrapped(
+        overrides: tuple[str, ...],
+        count: int | None,
+        gpus_per_worker: int | None,
+        workers_per_gpu: int | None,
+        **others: Any,
+    ) -> None:
+        engine, words, rest = split_executor(overrides)
+        workers = Workers(engine, words, count, gpus_per_worker, workers_per_gpu)
+        command(overrides=rest, workers=workers, **others)
+
+    for option in reversed(options):
+        wrapped = option(wrapped)
+    return wrapped
+
+
+def split_executor(words: Iterable[str]) -> tuple[str, dict[str, str], tuple[str, ...]]:
+    """Split words into the executor's name, its own settings, and Hydra's overrides.
+
+    Raises:
+        InputError: for an unknown executor, or settings of another one.
+    """
+    engine, own, rest = "local", [], []
+    for word in words:
+        key, _, value = word.partition("=")
+        if key == "executor":
+            engine = value
+        elif key.split(".")[0] in SETTINGS and "." in key:
+            own.append((key, value))
+        else:
+            rest.append(word)
+    if engine not in ENGINES:
+        raise InputError(f"executor={engine}: allowed is local, slurm or ray")
+    for key, _ in own:
+        if key.split(".")[0] != engine:
+            raise InputError(f"{key}: goes with executor={key.split('.')[0]}")
+    return engine, {key.partition(".")[2]: value for key, value in own}, tuple(rest)
+
+
+def executor(workers: Workers, folder: Path, shared: list[Share], gpus: bool) -> Executor:
+    """Return the executor; its workers' logs lie in `folder`/workers.
+
+    Args:
+        workers: what the command line asks for.
+        folder: the folder of the sweep or search.
+        shared: the shares of this machine's GPUs for local workers.
+        gpus: whether runs may use a GPU.
+    """
+    if workers.engine == "slurm":
+        from memmlp.sweep.executors.slurm import Slurm
+
+        return Slurm(logs(folder), workers.settings())
+    if workers.engine == "ray":
+        from memmlp.sweep.executors.ray_cluster import Ray
+
+        return Ray(workers.settings(), gpus)
+    from memmlp.sweep.executors.local import Debug, Local
+
+    return Debug(logs(folder)) if workers.engine == "debug" else Local(logs(folder), shared)
+
+
+def hire(folder: Path, plan: Plan, workers: Workers, devices: Iterable[str]) -> tuple[Path, Fleet]:
+    """Save the plan in a file of this process' own, and return that file with a fleet of workers for it.
+
+    No worker is started yet. Other processes that work on the same sweep have files of their own, so that
+    nobody changes the plan under this one's workers.
+
+    Args:
+        folder: the folder of the sweep or search, where the workers' logs lie too.
+        plan: the plan to work on.
+        workers: what the command line asks for.
+        devices: the values of the key `device` of the plan's runs.
+
+    Raises:
+        InputError: where workers can't have the GPUs that are asked for.
+    """
+    from memmlp.config.perform_task import work, work_alone
+    from memmlp.sweep.controller import Fleet
+    from memmlp.sweep.worker import Presence
+
+    named = set(devices)
+    shared = workers.shares(named)
+    count = workers.number(shared)
+    made = executor(workers, folder, shared, gpus=not named <= WITHOUT)
+    own = folder / "controllers" / uuid4().hex
+    path = own.with_suffix(".json")
+    plan.save(path)
+    presence = Presence(own.with_suffix(".lock"))
+    gpu = made.gpus and not named <= WITHOUT
+    if workers.engine == "local":
+        threads = max((os.cpu_count() or 1) // count, 1)
+        task = partial(work, str(path), threads, str(presence.path), gpu)
+    else:
+        task = partial(work_alone, str(path), gpu)
+    return path, Fleet(made, task, count, folder / "workers", presence)

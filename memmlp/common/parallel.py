@@ -1,0 +1,156 @@
+"""Several processes that train one run together, as torchrun starts them: each with its share of a batch.
+
+Every process draws the whole batch of a step, from the same seed, and works on its own rows. What is learned
+from is the mean over all, so that the run is the one that a single process trains. Without torchrun there is
+one process, and nothing here does anything.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterable, Iterator
+from datetime import timedelta
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+T = TypeVar("T")
+
+PATIENCE = timedelta(days=7)  # others may wait while the first process prepares, validates or evaluates
+
+
+class _Step:
+    """Where this process is: whether it works on its share of a batch."""
+
+    shared = False
+
+
+def size() -> int:
+    """Return how many processes train the run; 1 without torchrun."""
+    return int(os.environ["WORLD_SIZE"]) if "TORCHELASTIC_RUN_ID" in os.environ else 1
+
+
+def rank() -> int:
+    """Return this process' number among all."""
+    return int(os.environ["RANK"]) if size() > 1 else 0
+
+
+def local_rank() -> int:
+    """Return this process' number among those of its machine, which is also that of its GPU."""
+    return int(os.environ["LOCAL_RANK"]) if size() > 1 else 0
+
+
+def first() -> bool:
+    """Return whether this is the process that writes."""
+    return rank() == 0
+
+
+def connect(kind: str) -> None:
+    """Join the other processes, if that was not done before; `kind` is the device's, such as "cuda"."""
+    from torch import distributed
+
+    if size() == 1 or distributed.is_initialized():
+        return
+    if kind == "cuda":
+        import torch
+
+        torch.cuda.set_device(local_rank())
+    distributed.init_process_group("nccl" if kind == "cuda" else "gloo", timeout=PATIENCE)
+
+
+def leave() -> None:
+    """Part from the other processes."""
+    if size() > 1:
+        from torch import distributed
+
+        distributed.destroy_process_group()
+
+
+def of_first(value: T) -> T:
+    """Return the first process' value in all of them."""
+    if size() == 1:
+        return value
+    from torch import distributed
+
+    carried: list[Any] = [value]
+    distributed.broadcast_object_list(carried, src=0)
+    return carried[0]
+
+
+@contextlib.contextmanager
+def sharing() -> Iterator[None]:
+    """Work on this process' share of a batch herein, where there are several processes."""
+    _Step.shared = size() > 1
+    try:
+        yield
+    finally:
+        _Step.shared = False
+
+
+def shared() -> bool:
+    """Return whether this process works on its share of a batch at this moment."""
+    return _Step.shared
+
+
+def own(batch: Tensor) -> Tensor:
+    """Return this process' rows of a whole batch (B, ...), whose B the number of processes divides."""
+    return batch.chunk(size())[rank()] if _Step.shared else batch
+
+
+def whole(rows: Tensor) -> Tensor:
+    """Return the rows (b, ...) of all processes together (B, ...), without gradients."""
+    if not _Step.shared:
+        return rows
+    import torch
+    from torch import distributed
+
+    parts = [torch.empty_like(rows, memory_format=torch.contiguous_format) for _ in range(size())]
+    distributed.all_gather(parts, rows.detach().contiguous())
+    return torch.cat(parts)
+
+
+def drawn(draw: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
+    """Return this process' rows of what is drawn for the whole batch, as a single process draws it.
+
+    Args:
+        draw: draws, given a tensor with the shape of the whole batch.
+        like: this process' rows (b, ...) of that tensor; of the others' only the shape counts.
+    """
+    if not _Step.shared:
+        return draw(like)
+    return own(draw(like.detach().repeat(size(), *[1] * (like.dim() - 1))))
+
+
+def mean(values: Tensor) -> Tensor:
+    """Return the mean over all processes of a tensor, each of which is a mean over as many rows."""
+    if size() == 1:
+        return values
+    from torch import distributed
+
+    total = values.detach().clone()
+    distributed.all_reduce(total)
+    return total / size()
+
+
+def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
+    """Replace the gradients by their means over all processes."""
+    if size() == 1:
+        return
+    import torch
+
+    found = [one.grad for one in parameters if one.grad is not None]
+    means = mean(torch.cat([grad.flatten() for grad in found]))
+    for grad, part in zip(found, means.split([grad.numel() for grad in found]), strict=True):
+        grad.copy_(part.view_as(grad))
+
+
+def align(module: nn.Module) -> None:
+    """Give the first process' parameters and buffers to all, so that they can't drift apart."""
+    if size() == 1:
+        return
+    from torch import distributed
+
+    for tensor in module.state_dict(keep_vars=False).values():
+        distributed.broadcast(tensor, src=0)

@@ -1,0 +1,68 @@
+"""The device of a run: chosen by its name, checked, and described for the run's manifest."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import torch
+
+from memmlp.common import parallel
+from memmlp.common.errors import InputError
+
+
+def device(name: str) -> torch.device:
+    """Return the torch device of a name: auto, cpu, cuda, cuda:INDEX or mps.
+
+    With auto it is a GPU of CUDA where there is one, else the CPU. Of several processes that train one run
+    together each has the GPU of its own number.
+
+    Raises:
+        InputError: where there is no such device.
+    """
+    kind, _, index = name.partition(":")
+    if kind == "mps" and not torch.backends.mps.is_available():
+        raise InputError(f"device={name}: torch finds no GPU of Apple's; allowed here is device=cpu")
+    if kind in ("mps", "cpu"):
+        return torch.device(kind)
+    if not torch.cuda.is_available():
+        if kind == "cuda":
+            raise InputError(f"device={name}: there is no CUDA device; allowed here is cpu or auto")
+        return torch.device("cpu")
+    return torch.device("cuda", _checked(name, int(index)) if index else parallel.local_rank())
+
+
+def _checked(name: str, index: int) -> int:
+    """Return the index of a GPU, checked to be there and, of several processes, to be this one's alone."""
+    count = torch.cuda.device_count()
+    if index >= count:
+        raise InputError(f"device={name}: allowed here is cuda:0{f' to cuda:{count - 1}' * (count > 1)}")
+    if parallel.size() > 1:
+        raise InputError(f"device={name}: allowed with several processes is device=cuda, one GPU for each")
+    return index
+
+
+def described(used: torch.device) -> dict[str, Any]:
+    """Return what a manifest says of a device: its kind, the GPU's name, and which GPU of the machine it is.
+
+    The last one, `gpu_index`, is the GPU's name in CUDA_VISIBLE_DEVICES where that is set, for inside the
+    process the visible ones are numbered anew.
+    """
+    if used.type != "cuda":
+        return {"device": used.type, "gpu": None, "gpu_index": None}
+    index = torch.cuda.current_device() if used.index is None else used.index
+    names = [name.strip() for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name.strip()]
+    shown = names[index] if index < len(names) else str(index)
+    return {"device": "cuda", "gpu": torch.cuda.get_device_name(used), "gpu_index": shown}
+
+
+def missing_gpu() -> str | None:
+    """Return a line that says so where torch finds no GPU in a process that was to have one."""
+    if torch.cuda.is_available():
+        return None
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    told = "is not set" if visible is None else f"is '{visible}'"
+    return (
+        f"a worker is to have a GPU; torch {torch.__version__} finds none: CUDA_VISIBLE_DEVICES {told}; "
+        "nothing is trained on the CPU instead, unless device=cpu"
+    )

@@ -1,0 +1,42 @@
+"""One run trained by several processes that torchrun started: the first leads, the others train along."""
+
+from __future__ import annotations
+
+from memmlp.common import parallel
+from memmlp.pipeline.experiment import Experiment
+from memmlp.pipeline.run_stages import Outcome, run_experiment
+from memmlp.runs.run import Run
+
+
+def run_together(experiment: Experiment) -> Outcome | None:
+    """Bring the experiment's run to its end; without torchrun that is `run_experiment`.
+
+    The first process holds the run's lock, prepares the data, writes, evaluates and deploys. It tells the
+    others which stage all of them train next.
+
+    Returns:
+        None in the processes that trained along.
+    """
+    parallel.connect(experiment.device.type)
+    if not parallel.first():
+        _train_along(experiment)
+        return None
+    outcome = run_experiment(experiment)
+    parallel.of_first("end")
+    parallel.leave()
+    return outcome
+
+
+def _train_along(experiment: Experiment) -> None:
+    """Train the stages that the first process names, until it is at the end."""
+    while (stage := parallel.of_first("")) != "end":
+        data = experiment.data.prepare()  # the first process has prepared it
+        own = experiment.identity(data.digest)
+        codes = Run.of(experiment.outputs, own.upstream.id) if own.upstream else None
+        if stage == "vqvae":
+            assert codes is not None
+            experiment.vqvae.train(experiment.architecture, data, codes, experiment.device)
+        else:
+            weights, run = codes.weights() if codes else None, Run.of(experiment.outputs, own.id)
+            experiment.training.train(experiment.architecture, data, weights, run, experiment.device)
+    parallel.leave()

@@ -1,0 +1,87 @@
+"""Workers that are processes of this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import submitit
+from submitit.local import local
+
+from memmlp.sweep.executors.executor import Work
+from memmlp.sweep.executors.gpus import Share
+from memmlp.sweep.executors.submitted import UNLIMITED, Requeued, Submitted, explained
+
+
+class LocalExecutor(submitit.LocalExecutor):
+    """Submitit's executor of processes, which by itself hides all GPUs from them.
+
+    Attributes:
+        gpus: the GPUs that the next process sees.
+    """
+
+    gpus: Share = ()
+
+    def _submit_command(self, command: str) -> local.LocalJob:
+        visible = ",".join(self.gpus)
+        process = local.start_controller(self.folder, command, cuda_devices=visible, timeout_min=UNLIMITED)
+        return local.LocalJob(self.folder, str(process.pid), process=process)
+
+
+class Local:
+    """Starts workers as processes of this machine, each with its share of the GPUs.
+
+    Args:
+        folder: the folder of the workers' logs, with %j for a worker's number.
+        shared: the shares of GPUs that workers may have; empty for workers without.
+    """
+
+    def __init__(self, folder: Path, shared: Sequence[Share] = ()):
+        with explained("local"):
+            self.executor = LocalExecutor(folder=folder)
+        self.shared = list(shared) or [()]
+        self.gpus = bool(shared)
+        self.started: list[tuple[Submitted, int]] = []
+
+    def submit(self, work: Work, count: int = 1) -> list[Submitted]:
+        """Start workers, each with the share that the fewest living workers have."""
+        return [self._start(work) for _ in range(count)]
+
+    def _start(self, work: Work) -> Submitted:
+        self.started = [(worker, number) for worker, number in self.started if worker.alive()]
+        users = [number for _, number in self.started]
+        least = min(range(len(self.shared)), key=users.count)
+        self.executor.gpus = self.shared[least]
+        with _interruptible():
+            worker = Submitted(self.executor.submit(Requeued(work)))
+        self.started.append((worker, least))
+        return worker
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """Processes started herein hear SIGINT, by which submitit cancels, where this one ignores it (nohup)."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        if before is signal.SIG_IGN:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+class Debug:
+    """Runs the work inside this process, when it is asked whether the worker lives."""
+
+    gpus = False
+
+    def __init__(self, folder: Path):
+        with explained("debug"):
+            self.executor = submitit.DebugExecutor(folder=folder)
+
+    def submit(self, work: Work, count: int = 1) -> list[Submitted]:
+        """Make workers that work when they are looked at."""
+        return [Submitted(self.executor.submit(Requeued(work))) for _ in range(count)]

@@ -1,0 +1,64 @@
+"""Workers that submitit starts: what its processes and its Slurm jobs have in common."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from memmlp.common.errors import InputError
+from memmlp.sweep.executors.executor import Work
+
+if TYPE_CHECKING:
+    import submitit
+
+UNLIMITED = 365 * 24 * 60  # minutes, where submitit wants a limit and there is none
+
+
+class Requeued:
+    """Work that a preempted Slurm job does again; its runs go on from their checkpoints."""
+
+    def __init__(self, work: Work):
+        self.work = work
+
+    def __call__(self) -> str | None:
+        """Do the work."""
+        return self.work()
+
+    def checkpoint(self) -> Any:
+        """Return what submitit puts into the queue when the job is preempted or its time is up."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self)
+
+
+class Submitted:
+    """A worker that is a job of submitit's."""
+
+    def __init__(self, job: submitit.Job):
+        self.job = job
+
+    def alive(self) -> bool:
+        """Return whether the job waits or works."""
+        return not self.job.done()
+
+    def cancel(self) -> None:
+        """End the job."""
+        self.job.cancel(check=False)
+
+    def complaint(self) -> str | None:
+        """Return the line with which a worker ended that could do nothing; None for any other end."""
+        if not self.job.paths.result_pickle.exists() or self.job.exception() is not None:
+            return None
+        return self.job.result()
+
+
+@contextlib.contextmanager
+def explained(name: str) -> Iterator[None]:
+    """Turn what submitit complains of into an InputError of one line about executor=NAME."""
+    logging.getLogger("submitit").setLevel(logging.ERROR)
+    try:
+        yield
+    except (RuntimeError, TypeError, ValueError, NameError) as error:
+        raise InputError(f"executor={name}: {' '.join(str(error).split())}") from None

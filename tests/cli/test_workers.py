@@ -1,0 +1,94 @@
+"""What the command line says of workers, and what they do without the GPU that they were to have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from memmlp.cli import workers as workers_module
+from memmlp.cli.workers import Workers, check_devices, hire
+from memmlp.common.errors import InputError
+from memmlp.config import perform_task
+from memmlp.pipeline import devices
+from memmlp.sweep.plan import Plan
+
+
+@pytest.fixture
+def found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Torch finds the GPUs of this process."""
+    monkeypatch.setattr(devices, "missing_gpu", lambda: None)
+
+
+@pytest.mark.parametrize(
+    ("visible", "options", "wanted", "shares", "number"),
+    [
+        ("0,1", {}, ["auto"], [("0",), ("1",)], 2),
+        ("0,1", {"count": 4}, ["auto", "cpu"], [("0",), ("1",)], 4),
+        ("0,1", {"workers_per_gpu": 3}, ["cuda"], [("0",), ("1",)], 6),
+        ("0,1,2", {"gpus_per_worker": 2}, ["cuda"], [("0", "1")], 1),
+        ("0,1", {"gpus_per_worker": 0, "count": 3}, ["auto"], [], 3),
+        ("0,1", {"count": 3}, ["cpu"], [], 3),
+        ("", {"count": 3}, ["auto"], [], 3),
+        ("0,1", {"engine": "slurm", "count": 3}, ["cuda"], [], 3),
+    ],
+)
+def test_gpus_of_workers(found, monkeypatch, visible, options, wanted, shares, number):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    workers = Workers(**options)
+    assert workers.shares(wanted) == shares
+    assert workers.number(shares) == number
+
+
+@pytest.mark.parametrize(
+    ("wanted", "gpus", "engine", "line"),
+    [
+        (["cuda:1"], ("0", "1"), "local", "device=cuda:1: allowed is auto, cuda, cpu or mps"),
+        (["cuda:1"], (), "slurm", "device=cuda:1: allowed is"),
+        (["cuda"], (), "local", "device=cuda: no GPU is visible here"),
+        (["auto"], ("0",), "local", "a worker is to have a GPU; torch .* finds none"),
+    ],
+)
+def test_runs_that_could_not_have_their_gpu_are_refused(monkeypatch, wanted, gpus, engine, line):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(InputError, match=line):
+        check_devices(wanted, gpus, engine)
+
+
+def test_a_cluster_has_the_gpus_that_this_machine_lacks():
+    check_devices(["cuda"], (), "slurm")
+
+
+@pytest.mark.parametrize("option", ["gpus_per_worker", "workers_per_gpu"])
+def test_options_of_local_workers_are_refused_elsewhere(option: str):
+    with pytest.raises(InputError, match=f"--{option.replace('_', '-')}: goes with workers of this machine"):
+        Workers("ray", **{option: 1})
+
+
+class Shelf:
+    """An executor that starts nothing."""
+
+    def __init__(self, gpus: bool):
+        self.gpus = gpus
+
+
+@pytest.mark.parametrize(
+    ("engine", "gives", "wanted", "gpu"),
+    [
+        ("local", True, ["auto"], True), ("local", False, ["auto"], False), ("slurm", True, ["cuda"], True),
+        ("slurm", True, ["cpu"], False), ("ray", True, ["cpu", "auto"], True),
+        ("slurm", False, ["auto"], False),
+    ],
+)  # fmt: skip
+def test_workers_know_whether_they_are_to_have_a_gpu(
+    found, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine, gives, wanted, gpu
+):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0" if gives else "")
+    monkeypatch.setattr(workers_module, "executor", lambda *_, **__: Shelf(gives))
+    path, fleet = hire(tmp_path, Plan("s", tmp_path, (), ()), Workers(engine, count=1), wanted)
+    assert fleet.work.args[-1] is gpu
+    monkeypatch.setattr(devices, "missing_gpu", lambda: "none is there")
+    monkeypatch.setattr(perform_task, "work_on", lambda *_: None)
+    assert fleet.work() == ("none is there" if gpu else None)
+    assert path.exists()

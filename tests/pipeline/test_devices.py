@@ -1,0 +1,82 @@
+"""Devices by their names, and what a manifest says of them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from memmlp.common import parallel
+from memmlp.common.errors import InputError
+from memmlp.config.schema.rules import DEVICE
+from memmlp.pipeline.devices import described, device, missing_gpu
+
+
+@pytest.fixture
+def gpus(monkeypatch: pytest.MonkeyPatch):
+    """Make torch find so many GPUs of CUDA."""
+
+    def there(count: int) -> None:
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: count > 0)
+        monkeypatch.setattr(torch.cuda, "device_count", lambda: count)
+        monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+        monkeypatch.setattr(torch.cuda, "get_device_name", lambda used: f"Card {used.index}")
+
+    return there
+
+
+@pytest.mark.parametrize("name", ["auto", "cpu", "cuda", "cuda:0", "cuda:12", "mps"])
+def test_names(name: str):
+    assert DEVICE.allows(name)
+
+
+@pytest.mark.parametrize("name", ["", "tpu", "cuda:", "cuda:-1", "cuda:a", "cpu:0", "mps:0", "CUDA"])
+def test_no_names(name: str):
+    assert not DEVICE.allows(name)
+
+
+def test_with_two_gpus(gpus):
+    gpus(2)
+    found = {name: str(device(name)) for name in ("auto", "cpu", "cuda", "cuda:1")}
+    assert found == {"auto": "cuda:0", "cpu": "cpu", "cuda": "cuda:0", "cuda:1": "cuda:1"}
+    with pytest.raises(InputError, match="device=cuda:2: allowed here is cuda:0 to cuda:1"):
+        device("cuda:2")
+    assert missing_gpu() is None
+
+
+def test_without_gpus(gpus, monkeypatch: pytest.MonkeyPatch):
+    gpus(0)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    assert str(device("auto")) == "cpu"
+    for name in ("cuda", "cuda:1", "mps"):
+        with pytest.raises(InputError, match=f"device={name}: "):
+            device(name)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
+    assert "torch" in str(missing_gpu())
+    assert "CUDA_VISIBLE_DEVICES is '3'" in str(missing_gpu())
+
+
+def test_of_several_processes_each_has_its_own(gpus, monkeypatch: pytest.MonkeyPatch):
+    gpus(2)
+    monkeypatch.setattr(parallel, "size", lambda: 2)
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    assert str(device("auto")) == "cuda:1"
+    with pytest.raises(InputError, match="device=cuda:1: allowed with several processes is device=cuda"):
+        device("cuda:1")
+
+
+@pytest.mark.parametrize(
+    ("visible", "index", "said"),
+    [("4,6", 1, "6"), ("4,6", None, "4"), (None, 1, "1"), ("GPU-8f", 0, "GPU-8f")],
+)
+def test_a_gpu_is_named_as_the_machine_knows_it(gpus, monkeypatch, visible, index, said):
+    gpus(2)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if visible:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    found = described(torch.device("cuda", index))
+    assert found == {"device": "cuda", "gpu": f"Card {index}", "gpu_index": said}
+
+
+def test_others_have_no_gpu():
+    assert described(torch.device("cpu")) == {"device": "cpu", "gpu": None, "gpu_index": None}
+    assert described(torch.device("mps"))["device"] == "mps"

@@ -1,0 +1,61 @@
+"""A process of several that train the tests' tasks together: shared_training.py FOLDER TASK... [die=TASK]
+
+Each task is trained in FOLDER/TASK, from the checkpoint that is there. In the one that is named last as
+die=TASK the second process is killed on the way.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from tiny_tasks import OPTIM, TASKS
+
+from memmlp.common import parallel
+from memmlp.runs.run import Run
+from memmlp.training.loop import TrainingTask, train
+from memmlp.training.vqvae import VQVAETask
+
+STEPS = replace(OPTIM, steps=50, checkpoint_every=20, validate_every=25)
+DEATH = 27  # the step at which the second process dies
+
+
+def precise(name: str) -> TrainingTask:
+    """A task in float64: in float32 the order of sums alone sets two trainings apart within 50 steps."""
+    task = TASKS[name](optim=STEPS)
+    task.module.double()
+    task.dataset.frames = task.dataset.frames.double()
+    if isinstance(task, VQVAETask):
+        task.normalizer.double()
+        task.validation.frames = task.validation.frames.double()
+    return task
+
+
+def main(folder: Path, names: list[str]) -> None:
+    parallel.connect("cpu")
+    for word in names:
+        name = word.removeprefix("die=")
+        task = precise(name)
+        if name != word and parallel.rank() == 1:
+            task.step = dying(task.step, partial(os.kill, os.getpid(), signal.SIGKILL))
+        train(task, STEPS, Run(folder / name), 0, name)
+
+
+def dying(step: Callable, die: Callable[[], object]) -> Callable:
+    """A step that dies at its time."""
+
+    def last(number: int) -> object:
+        if number == DEATH:
+            die()
+        return step(number)
+
+    return last
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2:])

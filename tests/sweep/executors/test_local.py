@@ -1,0 +1,77 @@
+"""Workers that are processes of this machine: they work, end, and see their own GPUs."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from collections import Counter
+from functools import partial
+from pathlib import Path
+
+import pytest
+from processes import ignoring_interrupts, until
+
+from memmlp.sweep.executors.local import Debug, Local
+from memmlp.sweep.executors.submitted import Requeued
+
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # logs stay open
+
+
+def touch(path: str) -> None:
+    Path(path).touch()
+
+
+def test_a_debug_worker_works_in_this_process(tmp_path: Path):
+    (handle,) = Debug(tmp_path / "%j").submit(partial(touch, str(tmp_path / "done")))
+    handle.job.results()  # debug jobs run when they are asked
+    assert (tmp_path / "done").exists()
+    assert handle.complaint() is None
+
+
+@pytest.mark.parametrize("around", [contextlib.nullcontext, ignoring_interrupts])
+def test_a_cancelled_local_worker_ends(tmp_path: Path, around):
+    """Also where interrupts are ignored, by which submitit cancels."""
+    with around():
+        (handle,) = Local(tmp_path / "%j").submit(partial(time.sleep, 6000))
+    assert handle.alive()
+    handle.cancel()
+    until(lambda: not handle.alive(), "the worker ends")
+    assert handle.complaint() is None
+
+
+def test_preempted_work_is_queued_again(tmp_path: Path):
+    work = Requeued(partial(touch, str(tmp_path / "again")))
+    work.checkpoint().function()
+    assert (tmp_path / "again").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="environments are read from /proc")
+def test_each_worker_sees_its_own_gpus_and_a_new_one_those_of_the_dead(tmp_path: Path):
+    """Two workers have a GPU each, four share them two by two, and without GPUs there is none."""
+    work = partial(os.getenv, "CUDA_VISIBLE_DEVICES")
+    executor = Local(tmp_path / "%j", [("0",), ("1",)])
+    workers = executor.submit(work, 4)
+    assert executor.gpus
+    assert [variable(worker) for worker in workers] == ["0", "1", "0", "1"]
+    os.kill(workers[1].job._process.pid, signal.SIGKILL)
+    until(lambda: not workers[1].alive(), "the worker is dead")
+    workers += executor.submit(work)
+    assert variable(workers[4]) == "1"
+    bare = Local(tmp_path / "%j")
+    workers += bare.submit(work)
+    assert not bare.gpus
+    assert variable(workers[5]) == ""
+    alive = [worker for worker in workers if worker is not workers[1]]
+    until(lambda: not any(worker.alive() for worker in alive), "the workers end")
+    seen = Counter(worker.complaint() for worker in alive)  # what they returned
+    assert seen == {"0": 2, "1": 2, "": 1}
+
+
+def variable(worker) -> str:
+    """What the system has for a worker's process."""
+    environment = Path(f"/proc/{worker.job._process.pid}/environ")
+    entries = until(lambda: environment.read_bytes().split(b"\0"), "the process has its environment")
+    return dict(entry.decode().split("=", 1) for entry in entries if entry)["CUDA_VISIBLE_DEVICES"]

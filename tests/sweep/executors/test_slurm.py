@@ -1,0 +1,141 @@
+"""Slurm by its sbatch file, and by a stand-in for its commands."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from memmlp.common.errors import InputError
+from memmlp.sweep.executors.slurm import Slurm, SlurmOptions, script, slurm_options
+
+
+def lines(tmp_path: Path, workers: int = 1, **words: str) -> list[str]:
+    return script(tmp_path / "%j", slurm_options(words), workers).splitlines()
+
+
+def test_options_reach_sbatch(tmp_path: Path):
+    words = {"time": "600", "mem_gb": "16", "cpus": "4", "gpus": "1", "partition": "gpu", "account": "lab"}
+    words |= {"setup": "module load cuda", "mail-user": "me@lab.org", "exclusive": "true", "gres": "disk:1"}
+    found = lines(tmp_path, **words, overcommit="false")
+    for line in (
+        "time=600", "mem=16GB", "cpus-per-task=4", "gpus-per-node=1", "partition=gpu", "account=lab",
+        "mail-user=me@lab.org", "exclusive", "gres=disk:1", "job-name=memmlp", "signal=USR2@90",
+    ):  # fmt: skip
+        assert f"#SBATCH --{line}" in found
+    assert "module load cuda" in found
+    assert f"submitit.core._submit {tmp_path}/%j" in "\n".join(found)
+    assert "overcommit" not in "\n".join(found)
+
+
+def test_nothing_is_asked_for_that_nobody_asked_for(tmp_path: Path):
+    found = "\n".join(lines(tmp_path))
+    for word in ("wckey", "time", "array", "gpus", "partition"):
+        assert f"--{word}" not in found
+    assert "#SBATCH --wckey=lab" in lines(tmp_path, wckey="lab")
+
+
+def test_workers_are_one_array(tmp_path: Path):
+    assert "#SBATCH --array=0-7%8" in lines(tmp_path, 8)
+
+
+@pytest.mark.parametrize(
+    ("text", "minutes"),
+    [
+        ("90", 90), ("90:30", 91), ("10:00:00", 600), ("1:30:01", 91), ("2-0", 2880), ("7-12:30", 10830),
+        ("1-02:03:00", 1563),
+    ],
+)  # fmt: skip
+def test_times_are_slurms(tmp_path: Path, text: str, minutes: int):
+    assert slurm_options({"time": text}).minutes == minutes
+    assert f"#SBATCH --time={text}" in lines(tmp_path, time=text)
+
+
+def test_a_container_is_srun_s(tmp_path: Path):
+    words = {"container_image": "lab/memmlp:1", "container_mounts": "/data:/data", "srun": "--mpi=none -v"}
+    found = lines(tmp_path, **words, python="python3")
+    (command,) = [line for line in found if line.startswith("srun")]
+    for word in ("--container-image=lab/memmlp:1", "--container-mounts=/data:/data", "--mpi=none", "-v"):
+        assert f" {word} " in command
+    assert " python3 -u -m submitit" in command
+    assert not [line for line in found if line.startswith("#SBATCH --container")]
+
+
+@pytest.mark.parametrize(
+    ("words", "gpu"),
+    [
+        ({"gpus": "1"}, True), ({"gpus": "a100:2"}, True), ({"gpus_per_task": "1"}, True),
+        ({"gres": "gpu:1"}, True),
+        ({"gres": "disk:1"}, False), ({"mem_per_gpu": "8G"}, False), ({}, False),
+    ],
+)  # fmt: skip
+def test_whether_a_job_is_to_have_a_gpu(words: dict[str, str], gpu: bool):
+    assert slurm_options(words).gpu is gpu
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ({"time": "1h"}, "slurm.time=1h: allowed are MINUTES"),
+        ({"comment": "a\nb"}, "allowed is the long name"),
+        ({"cpus": "0"}, "slurm.cpus=0: allowed is a whole"), ({"array": "0-3"}, "set by memmlp"),
+        ({"mem_gb": "x"}, "slurm.mem_gb=x"), ({"gpus": "-1"}, "slurm.gpus=-1"),
+        ({"nodes": "2"}, "slurm.nodes: allowed is none"), ({"ntasks-per-node": "2"}, "allowed is none"),
+        ({"Q": "x"}, "allowed is the long name"),
+        ({"comment": ""}, "allowed is the long name"),
+    ],
+)  # fmt: skip
+def test_bad_options_are_one_line(words: dict[str, str], line: str):
+    with pytest.raises(InputError, match=line) as error:
+        slurm_options(words)
+    assert "\n" not in str(error.value)
+
+
+def test_slurm_is_refused_where_it_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(InputError, match="executor=slurm"):
+        Slurm(tmp_path / "%j", SlurmOptions())
+
+
+@pytest.fixture
+def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Slurm's commands, of which sbatch keeps the files that it is given."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    keep = f'cp "$1" {folder}/given.sh; echo "x" >> {folder}/calls; echo "Submitted batch job 42"'
+    for name, line in {"sbatch": keep, "srun": "true", "sacct": "true"}.items():
+        (folder / name).write_text(f"#!/bin/sh\n{line}\n")
+        (folder / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(folder), prepend=":")
+    return folder
+
+
+def test_workers_are_submitted_at_once(tmp_path: Path, cluster: Path):
+    slurm = Slurm(tmp_path / "logs" / "%j", slurm_options({"gpus": "1", "time": "1-0"}))
+    handles = slurm.submit(partial(print, "work"), 3)
+    assert slurm.gpus
+    assert [handle.job.job_id for handle in handles] == ["42_0", "42_1", "42_2"]
+    assert (cluster / "calls").read_text() == "x\n"
+    given = (cluster / "given.sh").read_text()
+    assert "#SBATCH --array=0-2%3" in given
+    assert "#SBATCH --time=1-0" in given
+    assert "wckey" not in given
+
+
+def test_a_replaced_worker_is_a_job_without_a_time_limit_of_its_own(tmp_path: Path, cluster: Path):
+    (handle,) = Slurm(tmp_path / "logs" / "%j", SlurmOptions()).submit(partial(print, "work"))
+    assert handle.job.job_id == "42"
+    given = (cluster / "given.sh").read_text()
+    assert "--array" not in given
+    assert "--time" not in given
+    assert handle.job.submission()._timeout_min > 0  # so that submitit can compare
+
+
+def test_what_sbatch_refuses_is_one_line(tmp_path: Path, cluster: Path):
+    (cluster / "sbatch").write_text(
+        "#!/bin/sh\necho \"sbatch: unrecognized option '--patition=x'\" >&2; exit 1\n"
+    )
+    with pytest.raises(InputError, match=r"executor=slurm: .*unrecognized option '--patition=x'") as error:
+        Slurm(tmp_path / "logs" / "%j", slurm_options({"patition": "x"})).submit(print)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,37 @@
+"""The board says on which devices runs are worked on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from memmlp.sweep.board import device_name, render
+from memmlp.sweep.plan import Entry, Plan, RunTask
+
+CARD = {"device": "cuda", "gpu": "A card", "gpu_index": "1"}
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> Plan:
+    """Three runs on a GPU and one on the CPU, of which the last one is done."""
+    tasks = tuple(RunTask(str(number) * 16, "memmlp", {"optim": {"steps": 9}}) for number in range(4))
+    made = Plan("trial", tmp_path, tuple(Entry("arm", n, t.id) for n, t in enumerate(tasks)), tasks)
+    for task, facts in zip(tasks, (CARD, CARD, {"device": "cpu", "gpu": None}, CARD), strict=True):
+        made.run_of(task).folder.mkdir(parents=True)
+        made.run_of(task).write_manifest(facts)
+    return made
+
+
+def test_running_runs_are_counted_by_device(plan: Plan, capsys: pytest.CaptureFixture):
+    states = dict(zip([task.key for task in plan.tasks], ["running"] * 3 + ["done"], strict=True))
+    Console(width=200).print(render(plan, states))
+    assert "running on GPU 1 (A card): 2, cpu: 1" in capsys.readouterr().out
+    Console(width=200).print(render(plan, dict.fromkeys(states, "done")))
+    assert "running on" not in capsys.readouterr().out
+
+
+def test_names(plan: Plan):
+    assert [device_name(plan.run_of(task)) for task in plan.tasks[1:3]] == ["GPU 1 (A card)", "cpu"]
+    assert device_name(plan.run_of(RunTask("f" * 16, "memmlp", {}))) == ""

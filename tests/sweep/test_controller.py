@@ -1,0 +1,103 @@
+"""The controller: a fleet replaces what dies, is no larger than the work, and says why nothing lives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from memmlp.common.errors import InputError
+from memmlp.sweep import controller
+from memmlp.sweep.board import Board
+from memmlp.sweep.controller import PATIENCE, Fleet
+from memmlp.sweep.plan import Plan, RunTask
+
+
+class Dead:
+    said: str | None = None
+
+    def alive(self) -> bool:
+        return False
+
+    def cancel(self) -> None:
+        raise AssertionError
+
+    def complaint(self) -> str | None:
+        return self.said
+
+
+class Unfit(Dead):
+    said = "a worker is to have a GPU; torch finds none"
+
+
+class Living(Dead):
+    def __init__(self):
+        self.cancelled = False
+
+    def alive(self) -> bool:
+        return not self.cancelled
+
+    def cancel(self) -> None:
+        self.cancelled = True
+
+
+class Shelf:
+    """An executor whose workers are objects of a given class; it remembers them."""
+
+    gpus = False
+
+    def __init__(self, kind):
+        self.kind, self.handles, self.batches = kind, [], []
+
+    def submit(self, work, count=1):
+        self.batches.append(count)
+        self.handles += [self.kind() for _ in range(count)]
+        return self.handles[-count:]
+
+
+def test_a_fleet_replaces_the_dead_and_is_no_larger_than_the_work(tmp_path: Path):
+    shelf = Shelf(Living)
+    fleet = Fleet(shelf, lambda: None, 3, tmp_path)
+    fleet.keep(2)
+    assert len(shelf.handles) == 2
+    fleet.keep(9)
+    assert len(shelf.handles) == 3
+    shelf.handles[0].cancelled = True
+    fleet.keep(9)
+    assert len(shelf.handles) == 4
+    assert shelf.batches == [2, 1, 1]  # those that start at once are started together
+    fleet.cancel()
+    assert not any(handle.alive() for handle in shelf.handles)
+
+
+@pytest.mark.parametrize("fail_fast", [True, False])
+def test_the_first_failure_ends_the_workers_where_that_is_wanted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fail_fast: bool
+):
+    monkeypatch.setattr(controller, "LOOK", 0)
+    one, two = (RunTask(name * 16, "memmlp", {}) for name in "12")
+    plan = Plan("trial", tmp_path, (), (one, two), fail_fast=fail_fast)
+    shelf = Shelf(Living)
+
+    class Looks(Board):
+        """One run fails at the second look, the other one at the third."""
+
+        def update(self, plan: Plan) -> None:
+            looked.append(len(plan.left()))
+            for task in plan.tasks[: len(looked) - 1]:
+                plan.run_of(task).folder.mkdir(parents=True, exist_ok=True)
+                plan.run_of(task).fail("the loss is nan")
+
+    looked: list[int] = []
+    controller.oversee(plan, Fleet(shelf, lambda: None, 2, tmp_path), Looks())
+    assert len(looked) == (2 if fail_fast else 3)
+    assert [handle.cancelled for handle in shelf.handles] == [fail_fast] * 2
+
+
+@pytest.mark.parametrize(("kind", "line"), [(Dead, "the reason"), (Unfit, Unfit.said)])
+def test_workers_that_never_live_end_the_sweep(tmp_path: Path, kind: type[Dead], line: str):
+    fleet = Fleet(Shelf(kind), lambda: None, 2, tmp_path)
+    for _ in range(PATIENCE):
+        fleet.keep(5)
+    with pytest.raises(InputError, match=f"end as soon as they are started: {line}; see"):
+        fleet.keep(5)

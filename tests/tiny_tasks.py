@@ -1,0 +1,56 @@
+"""Tiny training tasks of every kind that the tests share, and how they are optimised."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import tiny
+import torch
+
+from memmlp.networks import checkpoint
+from memmlp.networks.memory import JointCodeMemory
+from memmlp.networks.vqvae import VQVAE
+from memmlp.runs.run import Run
+from memmlp.training.losses import HandPosition, MotionLoss, Uncertainty
+from memmlp.training.network import MotionTask
+from memmlp.training.optim import Optim
+from memmlp.training.rollout import OwnPredictions, PersistentStreams, TeacherForcing
+from memmlp.training.vqvae import VQVAETask
+
+OPTIM = Optim(steps=12, batch=4, lr=1e-3, final_lr=1e-4, schedule="cosine", checkpoint_every=5, log_every=4)
+ROLLOUTS = {
+    "forced": TeacherForcing,
+    "own": lambda: OwnPredictions(2),
+    "streams": lambda: PersistentStreams(6),
+}
+
+
+def motion_task(rollout: str = "own", optim: Optim = OPTIM, seed: int = 0, **changes) -> MotionTask:
+    model, made = tiny.model(seed=seed, **changes), ROLLOUTS[rollout]()
+    if isinstance(made, PersistentStreams):
+        made.begin(model)
+    loss = MotionLoss(Uncertainty(), HandPosition(), model.predictor.branches)
+    return MotionTask(model, loss, made, tiny.frames(), optim, seed, validate=lambda model: {"answer": 42.0})
+
+
+def baseline_task(name: str, optim: Optim = OPTIM, seed: int = 0) -> MotionTask:
+    model, loss = tiny.baseline(name, seed=seed), tiny.BASELINE_LOSSES[name]()
+    return MotionTask(model, loss, TeacherForcing(), tiny.frames(), optim, seed, validate=lambda model: {})
+
+
+def vqvae_task(optim: Optim = OPTIM) -> VQVAETask:
+    torch.manual_seed(0)
+    model = VQVAE(codes=8, width=12, encoder_depth=1)
+    return VQVAETask(model, tiny.normalizer(), tiny.frames(), tiny.frames((30,), seed=9), optim, seed=0)
+
+
+def weights(run: Run) -> dict[str, torch.Tensor]:
+    return checkpoint.read(run.checkpoint)[0]
+
+
+TASKS = {
+    **{name: partial(motion_task, name) for name in ROLLOUTS},
+    **{name: partial(baseline_task, name) for name in tiny.BASELINES},
+    "vqvae": vqvae_task,
+    "joint": partial(motion_task, kind=JointCodeMemory),
+}

@@ -1,0 +1,160 @@
+"""A run trained by several processes is the run that one process trains with the same whole batch."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import sys
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from processes import PATIENCE, started
+from shared_training import STEPS, dying, precise
+from tiny_tasks import motion_task, weights
+from torch import nn
+
+from memmlp.common import parallel
+from memmlp.common.errors import InputError
+from memmlp.networks import checkpoint, layers
+from memmlp.runs.run import Run
+from memmlp.training.loop import check_shares, train
+
+NAMES = ("streams", "joint", "avatar_poser", "agrol_diffusion", "vqvae")
+"""Tasks with all that could differ: states, blends, passes, codes that restart, dropout, noise."""
+PROGRAM = Path(__file__).parent.with_name("shared_training.py")
+
+
+class Kill(Exception):
+    """Raised where a process is killed."""
+
+
+def kill() -> None:
+    raise Kill
+
+
+def train_alone(name: str, folder: Path, die: bool = False) -> Run:
+    """Train a task in this process alone."""
+    run, task = Run(folder / name), precise(name)
+    run.folder.mkdir(parents=True, exist_ok=True)
+    if die:
+        task.step = dying(task.step, kill)
+    train(task, STEPS, run, 0, name)
+    return run
+
+
+def train_together(folder: Path, *names: str) -> list[int]:
+    """Train tasks in two processes, and return their exit codes."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    for name in names:
+        (folder / name.removeprefix("die=")).mkdir(parents=True, exist_ok=True)
+    shared = {"TORCHELASTIC_RUN_ID": "tests", "WORLD_SIZE": "2", "OMP_NUM_THREADS": "1"}
+    shared |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    line = [sys.executable, str(PROGRAM), str(folder), *names]
+    with ExitStack() as stack:
+        both = [
+            stack.enter_context(started(line, env={**os.environ, **shared, "RANK": rank, "LOCAL_RANK": rank}))
+            for rank in "01"
+        ]
+        return [process.wait(PATIENCE) for process in both]
+
+
+def difference(one: Run, other: Run) -> float:
+    """Return the largest difference between two checkpoints' weights, statistics and moments."""
+    ours, theirs = weights(one), weights(other)
+    assert ours.keys() == theirs.keys()
+    pairs = [(ours[name].double(), theirs[name].double()) for name in ours if ours[name].numel()]
+    return max(float((a - b).abs().max()) for a, b in pairs)
+
+
+@pytest.mark.slow
+def test_two_processes_train_the_weights_of_one_and_take_over_from_each_other(tmp_path: Path):
+    alone = {name: train_alone(name, tmp_path / "alone") for name in NAMES}
+    pair, one_begins, two_begin = tmp_path / "pair", "vqvae", "streams"
+    with pytest.raises(Kill):
+        train_alone(one_begins, pair, die=True)
+    codes = train_together(pair, *(name for name in NAMES if name != two_begin), f"die={two_begin}")
+    assert codes[1] == -signal.SIGKILL
+    assert codes[0] not in (0, -signal.SIGKILL)
+    shutil.copytree(pair / two_begin, tmp_path / "one" / two_begin)
+    assert checkpoint.read(pair / two_begin / "checkpoint.safetensors")[1]["step"] == 20
+    again = train_alone(two_begin, tmp_path / "one")
+    assert train_together(pair, two_begin) == [0, 0]
+    found = {name: difference(run, Run(pair / name)) for name, run in alone.items()}
+    found["one after two"] = difference(alone[two_begin], again)
+    assert {name for name, worst in found.items() if worst > 1e-9} == set(), found
+    for name, run in alone.items():
+        assert [m.step for m in run.metrics()] == [m.step for m in Run(pair / name).metrics()]
+
+
+@pytest.fixture
+def two(monkeypatch: pytest.MonkeyPatch) -> None:
+    """This process is the second of two, which are not connected."""
+    monkeypatch.setattr(parallel, "size", lambda: 2)
+    monkeypatch.setattr(parallel, "rank", lambda: 1)
+
+
+def test_rows_and_draws_of_the_second_of_two(two: None):
+    batch = torch.arange(8.0).reshape(4, 2)
+    assert torch.equal(parallel.own(batch), batch)  # outside of a step
+    with parallel.sharing():
+        assert torch.equal(parallel.own(batch), batch[2:])
+        torch.manual_seed(3)
+        rows = parallel.drawn(torch.rand_like, batch[2:])
+    torch.manual_seed(3)
+    assert torch.equal(rows, torch.rand_like(batch)[2:])
+    assert torch.equal(parallel.own(batch), batch)
+
+
+def test_dropout_is_that_of_the_whole_batch(two: None):
+    layer, batch = layers.Dropout(0.5), torch.rand(6, 3)
+    torch.manual_seed(1)
+    expected = layer(batch)
+    torch.manual_seed(1)
+    with parallel.sharing():
+        assert torch.equal(layer(batch[3:]), expected[3:])
+        assert torch.equal(layer.eval()(batch), batch)
+
+
+def test_a_batch_that_cannot_be_shared_is_refused(two: None):
+    task = motion_task()
+    with pytest.raises(InputError, match=r"network: a batch of 5 .* on 2 .*: allowed is a multiple of 2"):
+        check_shares(task, replace(STEPS, batch=5), "network")
+    check_shares(task, STEPS, "network")
+
+
+@pytest.mark.parametrize(
+    ("layer", "name"),
+    [
+        (nn.Dropout(0.1), "Dropout"), (nn.BatchNorm1d(3), "BatchNorm1d"),
+        (nn.LSTM(3, 3, num_layers=2, dropout=0.1), "LSTM"),
+    ],
+)  # fmt: skip
+def test_layers_that_would_draw_or_count_by_themselves_are_refused(two: None, layer: nn.Module, name: str):
+    task = motion_task()
+    task.module.add_module("own", layer)
+    with pytest.raises(InputError, match=f"{name} on 2 processes"):
+        check_shares(task, STEPS, "network")
+
+
+def test_layers_that_draw_for_the_whole_batch_or_nothing_are_not():
+    assert layers.undivided(nn.Sequential(layers.Dropout(0.1), nn.Dropout(0.0), nn.LSTM(3, 3))) == []
+
+
+def test_one_process_shares_nothing(monkeypatch: pytest.MonkeyPatch):
+    """Variables that a cluster sets for its own jobs are none of torchrun's."""
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    monkeypatch.delenv("TORCHELASTIC_RUN_ID", raising=False)
+    assert (parallel.size(), parallel.rank(), parallel.first()) == (1, 0, True)
+    value = torch.rand(3)
+    with parallel.sharing():
+        assert parallel.own(value) is value
+        assert parallel.whole(value) is value
+        assert parallel.mean(value) is value
+    assert parallel.of_first("a") == "a"
