@@ -203,7 +203,7 @@ def hire(
     own = folder / "controllers" / uuid4().hex
     path = own.with_suffix(".json")
     plan.save(path)
-    presence = Presence(own.with_suffix(".lock"))
+    presence = Presence(own.with_suffix(".process"))
     threads = max((os.cpu_count() or 1) // workers, 1) if engine == "local" else 0
     local = partial(work, str(path), threads, str(presence.path))
     task = local if engine == "local" else partial(work_alone, str(path))
