@@ -58,9 +58,12 @@ class Claim(NamedTuple):
 
     @property
     def owner(self) -> dict[str, Any] | None:
-        """The process that made the claim; empty for nobody, None where its maker died while writing it."""
+        """The process that made the claim; empty for nobody, None where that cannot be read.
+
+        An empty file is nobody's: if somebody is about to write it, the fence stops who is too late.
+        """
         try:
-            found = json.loads(self.text)
+            found = json.loads(self.text or "{}")
         except ValueError:
             return None
         return found if isinstance(found, dict) else None
@@ -106,14 +109,14 @@ class Claims:
         with open(self.path(number), encoding="utf-8") as file:  # on NFS opening it asks the server
             return Claim(number, file.read(), os.fstat(file.fileno()).st_mtime_ns)
 
-    def make(self, number: int, owner: dict[str, Any]) -> bool:
-        """Make a claim, and return whether it could be made: nobody else may have made that one."""
+    def make(self, number: int, owner: dict[str, Any] | None = None) -> bool:
+        """Make a claim, by default nobody's, and return whether nobody else had made that one."""
         try:
             handle = os.open(self.path(number), os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
         except FileExistsError:
             return False
         try:
-            os.write(handle, json.dumps(owner).encode())
+            os.write(handle, json.dumps(owner).encode() if owner else b"")
         finally:
             os.close(handle)
         return True
@@ -178,7 +181,7 @@ class Lease:
     def _release(self) -> None:
         """Claim the folder for nobody. Where the disk refuses it, the claim expires instead."""
         with contextlib.suppress(OSError):
-            if not self.lost and self.claims.make(self.number + 1, {}):
+            if not self.lost and self.claims.make(self.number + 1):
                 self.claims.path(self.number).unlink(missing_ok=True)
 
 
@@ -299,8 +302,7 @@ class Lock:
             self.claims.path(number).unlink(missing_ok=True)
             return None
         self.claims.remove_below(number)
-        if last and not last.free:
-            sweep(self._held_folder, number)
+        sweep(self._held_folder, number)
         return Lease(self.claims, number, self._what)
 
     def _take_kernels(self, stack: ExitStack) -> bool:

@@ -21,7 +21,7 @@ from memmlp.common.files import atomic_write, file_digest, now, read_json, sync_
 from memmlp.common.lease import Lease, Lock
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import changes, environment, host, sources
-from memmlp.runs.evaluation_file import current, intact
+from memmlp.runs.evaluation_file import current, intact, read_report
 from memmlp.runs.identity import belongs, used_as_configured
 from memmlp.runs.metrics_log import Metrics, MetricsLog
 from memmlp.runs.resumed_origin import joined
@@ -236,9 +236,12 @@ class Run:
 
         A VQ-VAE's run has its own results instead. Where a branch was evaluated by inverse kinematics with
         several numbers of iterations, the last evaluation counts; tables ask for theirs by its identity.
+
+        Raises:
+            InputError: if the file of an evaluation is damaged.
         """
         found = read_json(self.results_path)
-        for report in map(read_json, self.own_evaluations):
+        for report in map(read_report, self.own_evaluations):
             found[report["mode"]] = {**found.get(report["mode"], {}), **report["mean"]}
         latency = self.preferred_deployment.record
         return found | ({"latency": latency} if latency else {})

@@ -196,9 +196,15 @@ def validations(run: Run) -> list[Metrics]:
 
 
 def objectives(wanted: Sequence[Objective], run: Run) -> list[float]:
-    """Return the objectives' values at a finished run's last validation."""
-    last = validations(run)[-1].values
-    return [objective.value(last) for objective in wanted]
+    """Return the objectives' values at a finished run's last validation.
+
+    Raises:
+        InputError: where that is missing in the log, which was damaged since.
+    """
+    found, steps = validations(run), run.config["optim"]["steps"]
+    if not found or found[-1].step != steps:
+        raise InputError(f"{run.metrics_path}: lacks the validation at step {steps}; do the run again")
+    return [objective.value(found[-1].values) for objective in wanted]
 
 
 def direct(director: Director, fleet: Fleet, board: SearchBoard, path: Path) -> None:

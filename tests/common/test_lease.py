@@ -6,7 +6,6 @@ import contextlib
 import errno
 import fcntl
 import itertools
-import json
 import os
 import random
 import subprocess
@@ -240,8 +239,14 @@ def test_a_claim_that_was_decided_on_long_ago_is_given_up(tmp_path: Path, clock:
     assert [path.name for path in tmp_path.glob(".lease-*")] == [".lease-3"]
 
 
-def test_a_claim_whose_maker_died_while_writing_it_expires(tmp_path: Path, clock: Clock):
+def test_a_claim_whose_maker_died_before_it_wrote_it_is_nobodys(tmp_path: Path, clock: Clock):
     (tmp_path / ".lease-4").touch()
+    assert Holder("two", tmp_path).take().number == 5
+
+
+@pytest.mark.parametrize("text", ['{"pid": 1', "[]", "7"])
+def test_a_claim_that_cannot_be_read_expires(tmp_path: Path, clock: Clock, text: str):
+    (tmp_path / ".lease-4").write_text(text)
     two = Holder("two", tmp_path)
     assert two.take() is None
     clock.now += LEASE + 1
@@ -351,4 +356,3 @@ def test_whatever_the_order_nothing_is_published_by_an_earlier_owner(tmp_path, c
     assert published
     assert all(owner == newest for owner, newest in published)
     assert not list(tmp_path.glob(".*.tmp"))
-    assert json.loads((tmp_path / f".lease-{Lock(tmp_path).claims.numbers()[-1]}").read_text()) is not None

@@ -10,10 +10,11 @@ import subprocess
 import sys
 import threading
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from machines import Clock, without_locks
+from machines import Clock, apart, without_locks
 from processes import PATIENCE, started, until
 
 from memmlp.common import lease
@@ -280,8 +281,10 @@ def test_a_worker_that_is_stopped_for_longer_than_its_lease_goes_on_elsewhere(tm
     assert set(Plan.load(path).states().values()) == {"done"}
 
 
-def test_workers_do_each_task_once_where_locks_do_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    without_locks(monkeypatch)
+@pytest.mark.parametrize("where", [without_locks, apart])
+def test_workers_do_each_task_once_where_locks_do_nothing(tmp_path: Path, monkeypatch, where: Callable):
+    """On one machine, and on several that share the folder."""
+    where(monkeypatch)
     monkeypatch.setattr(worker, "PAUSE", 0.001)
     tasks = [RunTask(f"{n:016x}", "memmlp", {}, CODES.id if n % 2 else None) for n in range(6)]
     path, seen = saved(tmp_path, CODES, *tasks), []
