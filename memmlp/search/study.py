@@ -20,7 +20,7 @@ import numpy as np
 import optuna
 from optuna.exceptions import ExperimentalWarning
 from optuna.storages import BaseStorage, JournalStorage, get_storage
-from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
+from optuna.storages.journal import JournalFileBackend
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
 
@@ -146,24 +146,20 @@ class Study:
 
 
 class FencedJournal(JournalFileBackend):
-    """A journal to which only the present owner of its folder appends."""
+    """A journal to which the present owner of its folder alone appends, so that it needs no lock."""
 
     def __init__(self, path: Path):
-        self.path, self.lock = path, JournalFileSymlinkLock(str(path))
-        super().__init__(str(path), self.lock)
+        super().__init__(str(path))
+        self.path = path
 
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
         """Append lines to the journal. Raises LeaseLost if its folder has another owner by now."""
         lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
-        self.lock.acquire()
-        try:
-            with open(self.path, "ab") as file:
-                fences.check(self.path)  # after opening: `mend` gave a later owner another file
-                file.write(lines.encode())
-                file.flush()
-                os.fsync(file.fileno())
-        finally:
-            self.lock.release()
+        with open(self.path, "ab") as file:
+            fences.check(self.path)  # after opening: `mend` gave a later owner another file
+            file.write(lines.encode())
+            file.flush()
+            os.fsync(file.fileno())
 
 
 def storage(search: Search, folder: Path) -> BaseStorage:
@@ -197,9 +193,9 @@ def journal(folder: Path) -> Path:
 def mend(path: Path) -> None:
     """Replace a journal by a copy without an incomplete last line, and remove its locks; only for the owner.
 
-    A process that was killed may leave both behind. Optuna takes a line appended to an incomplete one for
-    damage, and waits half a minute for a dead owner's lock. What an owner of before appends, who was frozen
-    with the journal open, is lost with the file that it had open.
+    A process that was killed may leave both behind (locks if it was of an earlier version). Optuna takes a
+    line appended to an incomplete one for damage. What an owner of before appends, who was frozen with the
+    journal open, is lost with the file that it had open.
     """
     check_journal(path)
     for left in path.parent.glob(f"{path.name}.lock*"):

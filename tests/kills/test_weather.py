@@ -6,7 +6,6 @@ Nothing is lost, nothing is half there, and a person reads one line.
 from __future__ import annotations
 
 import errno
-import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -165,20 +164,6 @@ def test_a_plan_cut_at_every_byte_is_refused(plan: Plan, tmp_path: Path):
     plan.save(path)
     size = len(path.read_bytes())
     assert at_every_byte(path, lambda: Plan.load(path)) >= size - 1
-
-
-def test_a_metrics_log_cut_at_every_byte_goes_on(plan: Plan, tmp_path: Path):
-    run = plan.run_of(TASK)
-    run.folder.mkdir(parents=True)
-    for step in range(1, STEPS + 1):
-        run.log(step, {"loss": math.inf if step == 1 else 1 / step})
-    content = run.metrics_path.read_bytes()
-    for size in range(len(content)):
-        run.metrics_path.write_bytes(content[:size])
-        again, lines = Run(run.folder), content[:size].count(b"\n")
-        assert [entry.step for entry in again.metrics()] == list(range(1, lines + 1))
-        again.log(STEPS + 1, {"loss": 0.0})
-        assert [entry.step for entry in again.metrics()] == [*range(1, lines + 1), STEPS + 1]
 
 
 def test_a_search_refuses_a_log_that_lacks_its_last_validation(tmp_path: Path):
