@@ -87,6 +87,7 @@ def plan(tmp_path: Path) -> Plan:
     return Plan("trial", tmp_path, (Entry("arm", 0, TASK.id, TASK.stages),), (TASK,))
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_at_any_write(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(lease, "LEASE", 0.0)  # a claim that could not be let go, as by a process that ended
     run = plan.run_of(TASK)
@@ -111,6 +112,7 @@ def test_a_disk_that_is_full_at_any_write(plan: Plan, tmp_path: Path, monkeypatc
     assert full == disk.writes + 1 > 30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [["train"], ["sweep", "14", "executor=debug"], ["tune"]])
 def test_outputs_that_are_read_only(memmlp: Memmlp, tmp_path: Path, monkeypatch, words: list[str]):
     Disk(monkeypatch, tmp_path, errno.EROFS, 0)
@@ -141,6 +143,7 @@ def at_every_byte(path: Path, look: Callable[[], object], whole_from: int = 1) -
     return refused
 
 
+@pytest.mark.slow
 def test_the_marker_the_manifest_and_the_config_cut_at_every_byte(tmp_path: Path):
     run = complete(tmp_path)
     assert at_every_byte(run.marker, lambda: run.status) == 0  # then it is not done
@@ -152,6 +155,7 @@ def test_the_marker_the_manifest_and_the_config_cut_at_every_byte(tmp_path: Path
     at_every_byte(run.config_path, lambda: run.config, whole_from=len(run.config_path.read_bytes()))
 
 
+@pytest.mark.slow
 def test_an_evaluation_cut_at_every_byte_is_in_no_table(tmp_path: Path):
     run = fake_run(tmp_path, "arm", clips=("salsa/01",), branches=("rotation",))
     path = run.evaluation("stream-0")
