@@ -14,7 +14,7 @@ import click
 
 import memmlp
 from memmlp.common import parallel
-from memmlp.common.errors import InputError, TrainingDiverged
+from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 
 
 class Command(NamedTuple):
@@ -54,11 +54,10 @@ REFUSED = {
     errno.EISDIR,
     errno.ENOENT,
     errno.ENAMETOOLONG,
+    errno.ENOSPC,
+    errno.EDQUOT,
 }
-"""Errors of the operating system that blame a path which a person gave, so that they count as bad input.
-
-Others, such as a full disk, end a run that had begun, and count as its failure.
-"""
+"""Errors of the operating system that blame a path which a person gave, or the disk that it is on."""
 
 
 class Commands(click.Group):
@@ -135,7 +134,7 @@ def _exit_code(error: Exception) -> int | None:
         return error.exit_code
     if isinstance(error, OSError) and error.strerror:
         return 2 if error.errno in REFUSED else 1
-    return {InputError: 2, TrainingDiverged: 1}.get(type(error))
+    return {InputError: 2, TrainingDiverged: 1, LeaseLost: 1}.get(type(error))
 
 
 def _line(error: Exception) -> str:

@@ -113,17 +113,15 @@ def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
 
     Another process may have taken a look in the meantime; its rounds are returned then.
     """
-    from filelock import FileLock
-
     from memmlp.common.files import write_json
+    from memmlp.common.lease import Lock
     from memmlp.tables.build_table import finished
     from memmlp.tables.measured_run import load
     from memmlp.tables.rounds import advanced, as_json
     from memmlp.tables.runs_of_plan import finder
 
     path = record(sweep, outputs)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(path.with_name(".rounds.lock")):
+    with Lock(path.parent).hold():
         kept = read(path)
         if kept is not None and len(kept.taken) > len(rounds.taken):
             return kept

@@ -14,7 +14,7 @@ from hydra._internal.utils import _run_hydra
 from omegaconf import DictConfig
 
 from memmlp.common import parallel
-from memmlp.common.errors import InputError, TrainingDiverged
+from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.config.compose import CONFIG, VERSION_BASE, help_text, parse, preflight
 from memmlp.config.explain import explain
 from memmlp.config.packaged import packaged
@@ -98,7 +98,7 @@ def _collecting(
     def task(cfg: DictConfig) -> None:
         try:
             job(cfg)
-        except (InputError, TrainingDiverged, OSError) as failure:
+        except (InputError, TrainingDiverged, LeaseLost, OSError) as failure:
             failures.append(failure)
 
     return task

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
-from filelock import FileLock, Timeout
 
 from memmlp.cli.options import outputs_option
 from memmlp.cli.workers import Workers, hire, worker_options
 from memmlp.common.errors import InputError
+from memmlp.common.lease import Lock
 
 if TYPE_CHECKING:
     from memmlp.pipeline.experiment import Experiment
@@ -48,14 +48,14 @@ def tune(
     if status:
         show(setup)
         return
-    setup.folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(setup.folder / ".lock", timeout=0):
-            study = Study.own(setup.search, setup.folder.name, setup.folder)
-            search(setup, study, workers)
-            leave(setup, study)
-    except Timeout:
-        raise InputError(f"search {setup.folder.name}: another process is at it; --status shows it") from None
+    lock = Lock(setup.folder)
+    lock.settle()
+    with lock.hold(wait=False) as mine:
+        if not mine:
+            raise InputError(f"search {setup.folder.name}: another process is at it; --status shows it")
+        study = Study.own(setup.search, setup.folder.name, setup.folder)
+        search(setup, study, workers)
+        leave(setup, study)
     summary(setup, study)
 
 

@@ -228,7 +228,7 @@ def hire(folder: Path, plan: Plan, workers: Workers, devices: Iterable[str]) -> 
     own = folder / "controllers" / uuid4().hex
     path = own.with_suffix(".json")
     plan.save(path)
-    presence = Presence(own.with_suffix(".lock"))
+    presence = Presence(own.with_suffix(".process"))
     gpu = made.gpus and not named <= WITHOUT
     if workers.engine == "local":
         threads = max((os.cpu_count() or 1) // count, 1)

@@ -26,3 +26,10 @@ class TrainingDiverged(RuntimeError):
 
     The message is one line with the step, the loss term and the batch's clips. The exit code is 1.
     """
+
+
+class LeaseLost(RuntimeError):
+    """Another process took over what this one held, because it stood still for too long.
+
+    What was to be written is not written. The message is one line; the exit code is 1.
+    """

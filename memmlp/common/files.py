@@ -5,6 +5,7 @@ JSON has no word for NaN and infinities: they are stored as the strings "nan", "
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
@@ -13,6 +14,8 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+
+from memmlp.common.fences import publish, temporary
 
 
 def now() -> str:
@@ -36,16 +39,21 @@ def plain(value: Any) -> Any:
 
 
 def atomic_write(path: Path, content: bytes | str) -> None:
-    """Write a file whole or not at all, even if the machine stops: temporary file, fsync, rename."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    """Write a file whole or not at all, even if the machine stops: temporary file, fsync, rename.
+
+    Raises:
+        LeaseLost: if this process held the file's folder and has lost it (memmlp.common.fences).
+    """
+    unfinished = temporary(path)
     try:
-        with open(temporary, "wb") as file:
+        with open(unfinished, "wb") as file:
             file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, path)
+        publish(unfinished, path)
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # the disk may refuse this, too; the first error tells why
+            unfinished.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
 

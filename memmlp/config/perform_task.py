@@ -21,7 +21,7 @@ def work(path: str, threads: int, controller: str, gpu: bool) -> str | None:
     Args:
         path: the plan's file.
         threads: torch's threads where the config leaves them open; 0 leaves the choice to torch.
-        controller: the lock file that the controller's process holds (`Presence`).
+        controller: the file that says which process the controller is (`Presence`).
         gpu: whether this worker is to have a GPU.
 
     Returns:

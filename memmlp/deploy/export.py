@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from memmlp import __version__
+from memmlp.common.fences import publish, temporary
 from memmlp.deploy.parity import deterministic
 from memmlp.motion.body import FEATURES, FPS, JOINTS, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.networks.streaming import StreamingGraph
@@ -94,9 +95,12 @@ def save(
     assert program is not None
     graph = program.model_proto
     onnx.helper.set_model_props(graph, meta)
-    temporary = path.with_name(path.name + ".tmp")
-    onnx.save(graph, temporary)
-    temporary.replace(path)
+    unfinished = temporary(path)
+    try:
+        onnx.save(graph, unfinished)
+        publish(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def metadata(model: WindowModel | StreamingGraph, run_id: str) -> dict[str, str]:

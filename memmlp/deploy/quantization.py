@@ -18,6 +18,7 @@ import onnx
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 from torch import Tensor
 
+from memmlp.common.fences import publish, temporary
 from memmlp.deploy.parity import streamed
 from memmlp.deploy.session import OnnxStream
 from memmlp.evaluation.modes import rotations_report
@@ -64,13 +65,13 @@ def quantise(source: Path, path: Path, ends: Sequence[str], clips: Sequence[Tens
         ends: names of the graph's modules that stay in float32.
         clips: training clips (N, 252), from which the activations' ranges are found.
     """
-    temporary, quiet = path.with_name(path.name + ".tmp"), logging.getLogger()
+    unfinished, quiet = temporary(path), logging.getLogger()
     level = quiet.level
     quiet.setLevel(logging.ERROR)  # it advises to prepare the graph, which torch's exporter has done already
     try:
         quantize_static(
             source,
-            temporary,
+            unfinished,
             Calibration(source, clips),
             quant_format=QuantFormat.QDQ,
             nodes_to_quantize=_inner_layers(onnx.load(source), ends),
@@ -81,10 +82,10 @@ def quantise(source: Path, path: Path, ends: Sequence[str], clips: Sequence[Tens
             weight_type=QuantType.QInt8,
             extra_options={"OpTypesToExcludeOutputQuantization": ["Gemm", "MatMul"]},
         )
-        temporary.replace(path)
+        publish(unfinished, path)
     finally:
         quiet.setLevel(level)
-        temporary.unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)
 
 
 def _inner_layers(graph: onnx.ModelProto, ends: Sequence[str]) -> list[str]:

@@ -14,14 +14,14 @@ from typing import Any
 import torch
 
 from memmlp.common import parallel
-from memmlp.common.files import read_json, write_json
+from memmlp.common.files import write_json
 from memmlp.common.progress import stage_begins
 from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
 from memmlp.motion.preparing.source import Prepared
 from memmlp.pipeline.devices import described
 from memmlp.pipeline.experiment import Experiment
-from memmlp.runs.evaluation_file import write_report
+from memmlp.runs.evaluation_file import read_report, write_report
 from memmlp.runs.identity import Identity, deployment_settings, evaluation_recipes, evaluation_settings
 from memmlp.runs.mlflow_tracking import project_safely
 from memmlp.runs.run import Run
@@ -117,7 +117,7 @@ def finish(experiment: Experiment, run: Run, data: Prepared) -> list[str]:
 def results_of(experiment: Experiment, run: Run) -> dict[str, Any]:
     """Return the results that the experiment asks for: mode -> branch -> metric, and "latency"."""
     files = {mode: run.evaluation(name) for mode, name in experiment.evaluations.items() if run.has(name)}
-    means = {mode: read_json(path)["mean"] for mode, path in files.items()}
+    means = {mode: read_report(path)["mean"] for mode, path in files.items()}
     records = [run.deployment(name).record for name in experiment.deployments]
     return means | ({"latency": records[0]} if any(records) else {})
 
@@ -126,7 +126,7 @@ def clip_rows(experiment: Experiment, run: Run) -> list[dict[str, Any]]:
     """Return for each test clip its name, frames, and the metrics by mode and branch that are asked for."""
     rows: dict[str, dict[str, Any]] = {}
     for mode, name in experiment.evaluations.items():
-        for clip in read_json(run.evaluation(name))["clips"]:
+        for clip in read_report(run.evaluation(name))["clips"]:
             facts = {key: value for key, value in clip.items() if not isinstance(value, dict)}
             branches = {key: value for key, value in clip.items() if isinstance(value, dict)}
             rows.setdefault(clip["name"], facts)[mode] = branches

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from memmlp.common.errors import InputError
 from memmlp.common.files import now, plain, read_json, write_json
 from memmlp.runs.environment import environment
 from memmlp.runs.identity import belongs, evaluation_name
@@ -18,6 +19,14 @@ def write_report(path: Path, report: Mapping[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     content = plain({**report, "made": now(), "made_by": environment()})
     write_json(path, content | {"digest": _content_digest(content)})
+
+
+def read_report(path: Path) -> dict[str, Any]:
+    """Read the file of an evaluation. Raises InputError where it is damaged."""
+    found = read_json(path)
+    if not {"mode", "mean", "clips"} <= found.keys():
+        raise InputError(f"{path}: cannot be read; remove it, and the run's command makes it again")
+    return found
 
 
 def intact(path: Path) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import time
@@ -9,8 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from memmlp.common import fences
 from memmlp.common.errors import InputError
-from memmlp.common.files import plain
+from memmlp.common.files import atomic_write, plain
 
 
 class Metrics(NamedTuple):
@@ -37,21 +39,33 @@ class MetricsLog:
         self._whole = False
 
     def append(self, step: int, values: Mapping[str, float], phase: str) -> None:
-        """Append one line, in one write: a kill damages at most that line."""
+        """Append one line, in one write: a kill damages at most that line.
+
+        Raises:
+            LeaseLost: if the run has another owner by now.
+            OSError: if the disk is full; the log is as it was.
+        """
+        fences.check(self.path)
         if not self._whole:
             self.repair()
-            self._whole = True
         entry = {"step": step, "phase": phase, "time": round(time.time(), 3), "values": dict(values)}
+        line = json.dumps(plain(entry), allow_nan=False).encode() + b"\n"
         with open(self.path, "ab", buffering=0) as file:
-            file.write(json.dumps(plain(entry), allow_nan=False).encode() + b"\n")
+            fences.check(self.path)  # who is frozen from here on writes to a file that `repair` replaced
+            self._whole = False
+            if file.write(line) < len(line):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
+            self._whole = True
 
     def repair(self) -> None:
-        """Cut off a last line that was not written whole."""
+        """Put in the log's place a copy of it, without a last line that was not written whole.
+
+        What an earlier owner of the run writes, who had the log open, is then lost with that file.
+        """
         if self.path.exists():
             content = self.path.read_bytes()
-            whole = content.rfind(b"\n") + 1
-            if whole < len(content):
-                os.truncate(self.path, whole)
+            atomic_write(self.path, content[: content.rfind(b"\n") + 1])
+        self._whole = True
 
     def read(self) -> list[Metrics]:
         """Read all records, leaving out a last line that was not written whole.

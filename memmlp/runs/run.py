@@ -15,13 +15,14 @@ from typing import Any
 
 import yaml
 
+from memmlp.common import fences
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, file_digest, now, read_json, sync_folder, write_json
+from memmlp.common.lease import Lease, Lock
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import changes, environment, host, sources
-from memmlp.runs.evaluation_file import current, intact
+from memmlp.runs.evaluation_file import current, intact, read_report
 from memmlp.runs.identity import belongs, used_as_configured
-from memmlp.runs.lock import Lock
 from memmlp.runs.metrics_log import Metrics, MetricsLog
 from memmlp.runs.resumed_origin import joined
 
@@ -129,12 +130,14 @@ class Run:
 
     def lock(
         self, say: Callable[[str], None] | None = None, wait: bool = True
-    ) -> AbstractContextManager[bool]:
-        """Hold the run for this process, which may hold it already; yields whether it does.
+    ) -> AbstractContextManager[Lease | None]:
+        """Hold the run for this process, which may hold it already; yields the lease.
+
+        Once another process took the run over, whatever this one would write to it raises LeaseLost.
 
         Args:
             say: told in one line whom this process waits for; by default the line goes to stderr.
-            wait: whether to wait while another process holds the run; otherwise False is yielded.
+            wait: whether to wait while another process holds the run; otherwise None is yielded.
         """
         return self._lock.hold(say, wait)
 
@@ -169,6 +172,7 @@ class Run:
         attempts = self.manifest.get("attempts", [])
         if self.failure and attempts:
             self.write_manifest({"forgiven": len(attempts)})
+        fences.check(self.folder)
         (self.folder / "FAILED").unlink(missing_ok=True)
 
     def begin(
@@ -232,9 +236,12 @@ class Run:
 
         A VQ-VAE's run has its own results instead. Where a branch was evaluated by inverse kinematics with
         several numbers of iterations, the last evaluation counts; tables ask for theirs by its identity.
+
+        Raises:
+            InputError: if the file of an evaluation is damaged.
         """
         found = read_json(self.results_path)
-        for report in map(read_json, self.own_evaluations):
+        for report in map(read_report, self.own_evaluations):
             found[report["mode"]] = {**found.get(report["mode"], {}), **report["mean"]}
         latency = self.preferred_deployment.record
         return found | ({"latency": latency} if latency else {})
@@ -313,6 +320,7 @@ class Run:
         """Remove the run's own files, the marker first, and nothing else."""
         if not self.folder.exists():
             return
+        fences.check(self.folder)
         self.marker.unlink(missing_ok=True)
         sync_folder(self.folder)
         self._remove((*self.FILES, self.marker.name))
@@ -322,6 +330,7 @@ class Run:
         self._remove(self.STAGES)
 
     def _remove(self, names: Iterable[str]) -> None:
+        fences.check(self.folder)
         for name in names:
             temporary = str(Path(name).with_name(f".{Path(name).name}.*.tmp"))
             for path in (*self.folder.glob(name), *self.folder.glob(temporary)):

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from optuna.trial import Trial, TrialState
 
+from memmlp.common import fences
 from memmlp.common.errors import InputError
 from memmlp.runs.identity import inference
 from memmlp.runs.metrics_log import Metrics
@@ -195,9 +196,15 @@ def validations(run: Run) -> list[Metrics]:
 
 
 def objectives(wanted: Sequence[Objective], run: Run) -> list[float]:
-    """Return the objectives' values at a finished run's last validation."""
-    last = validations(run)[-1].values
-    return [objective.value(last) for objective in wanted]
+    """Return the objectives' values at a finished run's last validation.
+
+    Raises:
+        InputError: where that is missing in the log, which was damaged since.
+    """
+    found, steps = validations(run), run.config["optim"]["steps"]
+    if not found or found[-1].step != steps:
+        raise InputError(f"{run.metrics_path}: lacks the validation at step {steps}; do the run again")
+    return [objective.value(found[-1].values) for objective in wanted]
 
 
 def direct(director: Director, fleet: Fleet, board: SearchBoard, path: Path) -> None:
@@ -210,6 +217,7 @@ def direct(director: Director, fleet: Fleet, board: SearchBoard, path: Path) -> 
     try:
         with board:
             while plan is None or director.going:
+                fences.check(path)
                 before, plan = plan, director.look(fleet.size)
                 if plan != before:
                     plan.save(path)

@@ -8,6 +8,7 @@ running, and goes on with the running ones under their numbers.
 
 from __future__ import annotations
 
+import json
 import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,8 +24,9 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
 
+from memmlp.common import fences
 from memmlp.common.errors import InputError
-from memmlp.common.files import sync_folder
+from memmlp.common.files import atomic_write
 from memmlp.search.spec import Range, Search, Value
 
 BEGINNING = b'{"op_code":'  # how every line of a journal begins
@@ -143,6 +145,23 @@ class Study:
         return sorted(self.study.best_trials, key=lambda trial: trial.values)
 
 
+class FencedJournal(JournalFileBackend):
+    """A journal to which the present owner of its folder alone appends, so that it needs no lock."""
+
+    def __init__(self, path: Path):
+        super().__init__(str(path))
+        self.path = path
+
+    def append_logs(self, logs: list[dict[str, Any]]) -> None:
+        """Append lines to the journal. Raises LeaseLost if its folder has another owner by now."""
+        lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
+        with open(self.path, "ab") as file:
+            fences.check(self.path)  # after opening: `mend` gave a later owner another file
+            file.write(lines.encode())
+            file.flush()
+            os.fsync(file.fileno())
+
+
 def storage(search: Search, folder: Path) -> BaseStorage:
     """Return the journal in a folder, or the storage of the search's URL.
 
@@ -161,7 +180,7 @@ def storage(search: Search, folder: Path) -> BaseStorage:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ExperimentalWarning)
-            return JournalStorage(JournalFileBackend(str(path)))
+            return JournalStorage(FencedJournal(path))
     except (ValueError, KeyError, TypeError) as error:
         raise _damaged(path, error) from None
 
@@ -172,20 +191,18 @@ def journal(folder: Path) -> Path:
 
 
 def mend(path: Path) -> None:
-    """Cut an incomplete last line off a journal and remove its locks; only for the owner of the study.
+    """Replace a journal by a copy without an incomplete last line, and remove its locks; only for the owner.
 
-    A process that was killed may leave both behind. Optuna takes a line appended to an incomplete one for
-    damage, and waits half a minute for a dead owner's lock.
+    A process that was killed may leave both behind (locks if it was of an earlier version). Optuna takes a
+    line appended to an incomplete one for damage. What an owner of before appends, who was frozen with the
+    journal open, is lost with the file that it had open.
     """
     check_journal(path)
     for left in path.parent.glob(f"{path.name}.lock*"):
         left.unlink(missing_ok=True)
     if path.exists():
         content = path.read_bytes()
-        whole = content.rfind(b"\n") + 1
-        if whole < len(content):
-            os.truncate(path, whole)
-            sync_folder(path.parent)
+        atomic_write(path, content[: content.rfind(b"\n") + 1])
 
 
 def check_journal(path: Path) -> None:

@@ -1,26 +1,31 @@
-"""A worker takes a plan's tasks, one after another, each under its run's lock, until none is left.
+"""A worker takes a plan's tasks, one after another, each under its run's lease, until none is left.
 
 Any number of workers, on any machines that share the outputs folder, may work on the same runs. A run is
-brought to its end by one of them. When a worker is killed, another takes its run over from the last
-checkpoint.
+brought to its end by one of them. When a worker is killed, or stands still for longer than its lease, another
+takes its run over from the last checkpoint.
 """
 
 from __future__ import annotations
 
+import errno
+import sys
 import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
-from memmlp.common.errors import InputError, TrainingDiverged
+from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
+from memmlp.common.files import read_json, write_json
+from memmlp.common.liveness import Changes, lives, myself
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask
 
 PAUSE = 0.5  # seconds before another look at a plan whose tasks others are at
 ABANDONED = 600.0  # seconds without a sign of life after which an open plan's controller counts as dead
 DEATHS = 10  # workers that died at the same step of a run before it counts as failed
+FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}  # errors of a disk, which are no run's fault
+
+_changes = Changes()
 
 Perform = Callable[[Plan, RunTask], None]
 
@@ -52,9 +57,12 @@ def work(path: Path, perform: Perform, wanted: Callable[[], bool] = lambda: True
 def directed(path: Path) -> bool:
     """Return whether the plan of that file is closed, or open with a controller that lives.
 
-    A living controller touches the file all the time.
+    A living controller touches the file all the time. What counts is how long this process has seen it
+    untouched, for the controller's machine may have another time.
     """
-    return not Plan.load(path).open or time.time() - path.stat().st_mtime < ABANDONED
+    if not Plan.load(path).open:
+        return True
+    return _changes.unchanged(path, lambda: path.stat().st_mtime_ns) < ABANDONED
 
 
 def attempt(plan: Plan, task: RunTask, perform: Perform) -> bool:
@@ -69,24 +77,41 @@ def attempt(plan: Plan, task: RunTask, perform: Perform) -> bool:
     with run.lock(wait=False) as mine:
         if not mine:
             return False
-        if plan.complete(task) or run.failure:
-            return True  # somebody else ended it since the plan was looked at
-        if deaths(run) >= DEATHS:
-            run.fail(f"{DEATHS} processes died at step {run.step} of it, one after another")
-            return True
-        _perform(plan, task, run, perform)
+        try:
+            _bring_to_end(plan, task, run, perform)
+        except LeaseLost as lost:
+            print(f"memmlp: {lost}", file=sys.stderr, flush=True)
     return True
 
 
+def _bring_to_end(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
+    """Perform the task, unless somebody else ended it since the plan was looked at."""
+    if plan.complete(task) or run.failure:
+        return
+    if deaths(run) >= DEATHS:
+        run.fail(f"{DEATHS} processes died at step {run.step} of it, one after another")
+        return
+    _perform(plan, task, run, perform)
+
+
 def _perform(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
-    """Perform the task. A failure is recorded with the run, for it does not concern the other tasks."""
+    """Perform the task. A failure is recorded with the run, for it does not concern the other tasks.
+
+    Raises:
+        LeaseLost: when another worker took the run over.
+        OSError: when the disk is full or read-only, which concerns every task.
+    """
     try:
         perform(plan, task)
     except Cancelled:
         pass
+    except LeaseLost:
+        raise
     except (InputError, TrainingDiverged) as error:
         run.fail(str(error))
     except Exception as error:
+        if isinstance(error, OSError) and error.errno in FULL:
+            raise
         run.fail(f"{type(error).__name__}: {error}", traceback.format_exc())
 
 
@@ -104,21 +129,15 @@ def deaths(run: Run) -> int:
 
 
 class Presence:
-    """A sign that the process that made it lives: a lock, which is freed even by the process's death."""
+    """A sign that the process that made it lives: a file that says which process of this machine it is."""
 
     def __init__(self, path: Path):
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
-        self._lock = FileLock(path)
-        self._lock.acquire()
+        write_json(path, myself())
 
     @staticmethod
     def of(path: Path) -> bool:
-        """Return whether the process with that lock file lives."""
-        probe = FileLock(path)
-        try:
-            probe.acquire(timeout=0)
-        except Timeout:
-            return True
-        probe.release()
-        return False
+        """Return whether the process that made that file lives, or may live on another machine."""
+        process = read_json(path)
+        return bool(process) and lives(process) is not False

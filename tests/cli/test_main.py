@@ -14,7 +14,7 @@ from processes import finished
 
 import memmlp as package
 from memmlp.cli.main import COMMANDS, main
-from memmlp.common.errors import InputError, TrainingDiverged
+from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.config.packaged import packaged
 
 
@@ -101,9 +101,10 @@ def test_bad_usage_is_one_line(memmlp: Memmlp, arguments: list[str], words: list
     [
         (InputError("a\nb"), 2),
         (TrainingDiverged("a b"), 1),
+        (LeaseLost("a b"), 1),
         (KeyboardInterrupt(), 130),
         (NotADirectoryError(errno.ENOTDIR, "Not a directory", "/dev/null/runs"), 2),
-        (OSError(errno.ENOSPC, "No space left on device", "checkpoint.safetensors"), 1),
+        (OSError(errno.ENOSPC, "No space left on device", "checkpoint.safetensors"), 2),
     ],
 )
 def test_exit_codes(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int):

@@ -14,7 +14,8 @@ from fake_search import (
     to_the_end,
 )
 
-from memmlp.common.errors import InputError
+from memmlp.common.errors import InputError, LeaseLost
+from memmlp.common.fences import fenced
 from memmlp.search.study import Study, journal, mend
 
 
@@ -59,6 +60,34 @@ def test_a_torn_line_and_a_dead_owners_lock_are_mended(tmp_path: Path, monkeypat
     to_the_end(open_study(tmp_path), tmp_path)
     again = open_study(tmp_path)
     assert [trial.number for trial in again.trials] == list(range(6))
+
+
+class Superseded:
+    """The fence of an owner of a search that another one follows before a check, or right after the first."""
+
+    number = 1
+
+    def __init__(self, path: Path, frozen_after: bool):
+        self.path, self.lost, self.mending = path, not frozen_after, False
+
+    def check(self) -> None:
+        if self.mending:
+            return  # that is the next owner, in this process
+        if self.lost:
+            raise LeaseLost("lost")
+        self.lost = self.mending = True
+        mend(self.path)
+        self.mending = False
+
+
+@pytest.mark.parametrize("frozen_after", [False, True])
+def test_an_owner_that_wakes_up_superseded_tells_the_study_nothing(tmp_path: Path, frozen_after: bool):
+    study = open_study(tmp_path)
+    before = journal(tmp_path).read_bytes()
+    with fenced(tmp_path, Superseded(journal(tmp_path), frozen_after)), pytest.raises((LeaseLost, KeyError)):
+        study.ask()
+    assert journal(tmp_path).read_bytes() == before
+    assert open_study(tmp_path).trials == []
 
 
 def test_mending_leaves_a_whole_journal_alone(tmp_path: Path):

@@ -3,26 +3,36 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
+import signal
 import subprocess
 import sys
 import threading
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from machines import Clock, apart, without_locks
 from processes import PATIENCE, started, until
 
+from memmlp.common import lease
 from memmlp.common.errors import InputError, TrainingDiverged
+from memmlp.common.lease import Lock
+from memmlp.common.liveness import Changes
 from memmlp.config.perform_task import check_wanted
 from memmlp.runs.run import Run
 from memmlp.sweep import worker
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
-from memmlp.sweep.worker import Cancelled, Presence, attempt, work
+from memmlp.sweep.worker import Cancelled, Presence, attempt, directed, work
 
 CODES = RunTask("c" * 16, "vqvae", {})
 ONE, TWO, ALONE = (
     RunTask(str(n) * 16, "memmlp", {}, above) for n, above in ((1, CODES.id), (2, CODES.id), (3, None))
 )
+
+WITHOUT_LOCKS = "import fcntl; fcntl.flock = lambda *_: None\n"
 
 
 def plan(outputs: Path, *tasks: RunTask, **changes) -> Plan:
@@ -202,6 +212,7 @@ def test_a_run_that_kills_its_workers_fails_at_last(tmp_path: Path):
 
 @pytest.mark.slow
 def test_many_workers_perform_each_task_exactly_once(tmp_path: Path):
+    """Some with the kernel's locks, some with such that do nothing."""
     tasks = [RunTask(f"{n:016x}", "memmlp", {}, CODES.id if n % 2 else None) for n in range(12)]
     path = saved(tmp_path, CODES, *tasks)
     code = (
@@ -216,11 +227,106 @@ def test_many_workers_perform_each_task_exactly_once(tmp_path: Path):
     )
     log = tmp_path / "log"
     with contextlib.ExitStack() as stack:
-        line = [sys.executable, "-c", code, str(path), str(log)]
-        workers = [stack.enter_context(started(line)) for _ in range(4)]
+        codes = [code, code, WITHOUT_LOCKS + code, WITHOUT_LOCKS + code]
+        lines = [[sys.executable, "-c", one, str(path), str(log)] for one in codes]
+        workers = [stack.enter_context(started(line)) for line in lines]
         assert [process.wait(PATIENCE) for process in workers] == [0] * 4
     assert Counter(log.read_text().split()) == Counter([CODES.id, *(task.id for task in tasks)])
-    assert not list(tmp_path.glob("runs/*/.holder"))
+    assert not any(Lock(folder).held for folder in tmp_path.glob("runs/*"))
+
+
+FREEZING = """
+import sys, time
+from pathlib import Path
+from memmlp.common import lease
+from memmlp.sweep.worker import work
+
+lease.BEAT, stop = 0.01, sys.argv[2]
+
+def perform(plan, task):
+    run = plan.run_of(task)
+    run.begin(task.kind, {}, data="d", upstream=None)
+    print(f"at {task.id[0]}", flush=True)
+    if task.id[0] == stop:
+        sys.stdin.readline()
+    run.log(1, {"loss": 0.5})
+    run.results_path.write_text("{}")
+    run.finish(["results.json"])
+
+work(Path(sys.argv[1]), perform)
+"""
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_stopped_for_longer_than_its_lease_goes_on_elsewhere(tmp_path: Path, monkeypatch):
+    """By SIGSTOP, while it has the kernel's lock; another worker does its run meanwhile, and does it once."""
+    path = saved(tmp_path, ALONE, ONE, CODES)
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with started([sys.executable, "-c", FREEZING, str(path), "3"], **pipes) as frozen:
+        assert frozen.stdout.readline() == b"at 3\n"
+        frozen.send_signal(signal.SIGSTOP)
+        assert not attempt(Plan.load(path), ALONE, finish)
+        monkeypatch.setattr(lease, "LEASE", 0.2)
+        until(lambda: attempt(Plan.load(path), ALONE, finish), "its lease is over", frozen)
+        run = Plan.load(path).run_of(ALONE)
+        assert run.done
+        before = {file: file.read_bytes() for file in run.folder.iterdir()}
+        frozen.send_signal(signal.SIGCONT)
+        said, why = frozen.communicate(b"go on\n", PATIENCE)
+    assert said == b"at c\nat 1\n"  # the other tasks
+    assert f"run {ALONE.id}: another process took it over".encode() in why
+    assert frozen.returncode == 0
+    assert {file: file.read_bytes() for file in run.folder.iterdir()} == before
+    assert len(run.manifest["attempts"]) == 2
+    assert set(Plan.load(path).states().values()) == {"done"}
+
+
+@pytest.mark.parametrize("where", [without_locks, apart])
+def test_workers_do_each_task_once_where_locks_do_nothing(tmp_path: Path, monkeypatch, where: Callable):
+    """On one machine, and on several that share the folder."""
+    where(monkeypatch)
+    monkeypatch.setattr(worker, "PAUSE", 0.001)
+    tasks = [RunTask(f"{n:016x}", "memmlp", {}, CODES.id if n % 2 else None) for n in range(6)]
+    path, seen = saved(tmp_path, CODES, *tasks), []
+
+    def perform(plan: Plan, task: RunTask) -> None:
+        seen.append(task.id)
+        finish(plan, task)
+
+    threads = [threading.Thread(target=work, args=(path, perform)) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert Counter(seen) == Counter([CODES.id, *(task.id for task in tasks)])
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS])
+def test_a_full_disk_is_no_runs_failure(tmp_path: Path, code: int):
+    def perform(plan: Plan, task: RunTask) -> None:
+        raise OSError(code, os.strerror(code), "checkpoint.safetensors")
+
+    path = saved(tmp_path, ALONE)
+    with pytest.raises(OSError, match=os.strerror(code)):
+        work(path, perform)
+    assert Plan.load(path).states() == {ALONE.id: "new"}
+    work(path, finish)
+    assert Plan.load(path).states() == {ALONE.id: "done"}
+
+
+def test_a_controller_elsewhere_is_dead_once_it_has_not_been_seen_for_long(tmp_path: Path, monkeypatch):
+    """Whatever its machine's clock says."""
+    clock = Clock()
+    monkeypatch.setattr(worker, "_changes", Changes(clock))
+    path = saved(tmp_path, open=True)
+    for moment in (0.0, 2e9, 1e9):
+        os.utime(path, (moment, moment))
+        assert directed(path)
+        clock.now += worker.ABANDONED - 1
+        assert directed(path)
+    clock.now += 1
+    assert not directed(path)
+    assert directed(saved(tmp_path))
 
 
 def test_presence_ends_with_its_process(tmp_path: Path):

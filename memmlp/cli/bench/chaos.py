@@ -6,7 +6,6 @@ They must end as undisturbed ones do.
 from __future__ import annotations
 
 import csv
-import json
 import os
 import random
 import signal
@@ -24,12 +23,16 @@ import click
 import yaml
 
 from memmlp.common.files import file_digest
+from memmlp.common.lease import Lock
+from memmlp.common.liveness import lives
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
 
 OVERRIDES = ["profile=tiny", "data.synth.minutes=1", "tracking=none", "threads=1"]
 PAUSES = (0.5, 3.0)  # seconds between kills of a sweep's processes
 LONG_PAUSES = (3.0, 9.0)  # of a search's, whose one controller has to start again in between
+
+SEARCH_SHARE = 0.25  # of all kills
 
 ENDS = ("complete", "pruned")  # how a trial may end whose runs can't fail
 
@@ -53,15 +56,36 @@ Launch = Callable[[], subprocess.Popen[bytes]]
     help="How many memmlp sweep processes work at the same time.",
 )
 @click.option(
+    "--trials",
+    default=10,
+    show_default=True,
+    help="How many trials the search has that follows, with a quarter of the kills; 0 for no search.",
+)
+@click.option(
     "--seed", default=0, show_default=True, help="Seed of the random choice of what is killed, and when."
 )
 @click.argument("overrides", nargs=-1)
-def chaos(runs: int, kills: int, controllers: int, seed: int, overrides: tuple[str, ...]) -> None:
-    """Run a sweep under random SIGKILLs.
+def chaos(
+    runs: int, kills: int, controllers: int, trials: int, seed: int, overrides: tuple[str, ...]
+) -> None:
+    """Run a sweep, then a search, under random SIGKILLs.
 
-    Several controllers work on it, beside an undisturbed sweep. Every run must be finished exactly once, with
-    bit-identical weights. Exits with 1 where one isn't.
+    Several controllers work on each. The sweep is compared with an undisturbed one: every run must be
+    finished exactly once, with bit-identical weights. The search must end with exactly the trials it should
+    have, none repeated, none lost. Exits with 1 otherwise.
     """
+    of_search = round(SEARCH_SHARE * kills) if trials else 0
+    dice = random.Random(seed)
+    problems = sweep_storm(runs, kills - of_search, controllers, dice, overrides)
+    if trials:
+        problems += search_storm(trials, of_search, controllers, dice, overrides)
+    judge(problems, f"{kills} kills: as undisturbed")
+
+
+def sweep_storm(
+    runs: int, kills: int, controllers: int, dice: random.Random, overrides: Sequence[str]
+) -> list[str]:
+    """Run a sweep of two arms under kills, and list how it differs from an undisturbed one."""
     with tempfile.TemporaryDirectory() as folder:
         sweep = Path(folder) / "chaos.yaml"
         arms = {"vq": [], "none": ["memory=none"]}
@@ -73,10 +97,9 @@ def chaos(runs: int, kills: int, controllers: int, seed: int, overrides: tuple[s
         click.echo(f"undisturbed: {time.monotonic() - started:.0f} s")
         started = time.monotonic()
         launch = partial(start, words, stormy, workers=1)
-        killed = storm([launch] * controllers, stormy, kills, PAUSES, random.Random(seed))
+        killed = storm([launch] * controllers, stormy, kills, PAUSES, dice)
         click.echo(f"with {killed} kills: {time.monotonic() - started:.0f} s")
-        problems = compare(calm, stormy)
-    judge(problems, "as undisturbed")
+        return compare(calm, stormy)
 
 
 @click.command("chaos-tune")
@@ -97,15 +120,25 @@ def chaos_tune(trials: int, kills: int, seed: int, overrides: tuple[str, ...]) -
     Its controller and workers are killed. It must end with exactly the trials it should have, none repeated,
     none lost. Exits with 1 otherwise.
     """
+    problems = search_storm(trials, kills, 1, random.Random(seed), overrides)
+    judge(problems, "all trials as they should be")
+
+
+def search_storm(
+    trials: int, kills: int, controllers: int, dice: random.Random, overrides: Sequence[str]
+) -> list[str]:
+    """Run a search under kills, and list what is not as it should be.
+
+    Of several controllers one directs the search; the others are refused, and started again until they can.
+    """
     with tempfile.TemporaryDirectory() as folder:
         outputs = Path(folder) / "outputs"
         words = ["tune", *OVERRIDES, f"search.n_trials={trials}", "search.prune_after=3", *overrides]
         started = time.monotonic()
         launch = partial(start, words, outputs, workers=2)
-        killed = storm([launch], outputs, kills, LONG_PAUSES, random.Random(seed))
+        killed = storm([launch] * controllers, outputs, kills, LONG_PAUSES, dice)
         click.echo(f"{trials} trials with {killed} kills: {time.monotonic() - started:.0f} s")
-        problems = examine(outputs, trials)
-    judge(problems, "all trials as they should be")
+        return examine(outputs, trials)
 
 
 def judge(problems: Sequence[str], what: str) -> None:
@@ -150,22 +183,10 @@ def storm(
 
 def choose(processes: Sequence[subprocess.Popen[bytes]], outputs: Path, dice: random.Random) -> int | None:
     """Choose a process to kill: a controller, or a worker that holds a run. None where there is none."""
-    victims = [process.pid for process in processes if process.poll() is None]
-    for holder in outputs.glob("runs/*/.holder"):
-        try:
-            victims.append(int(json.loads(holder.read_bytes())["pid"]))
-        except (OSError, ValueError):
-            continue
-    victims = [pid for pid in victims if _exists(pid)]
+    owners = [Lock(folder).owner for folder in sorted(outputs.glob("runs/*/"))]
+    workers = [int(owner["pid"]) for owner in owners if owner and lives(owner)]
+    victims = [*(process.pid for process in processes if process.poll() is None), *workers]
     return dice.choice(victims) if victims else None
-
-
-def _exists(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except OSError:
-        return False
-    return True
 
 
 def compare(calm: Path, stormy: Path) -> list[str]:
@@ -191,8 +212,8 @@ def check(folder: Path) -> list[str]:
     begun = [attempt["started"] for attempt in attempts if attempt["stage"] == "training"]
     if max(begun) > run.manifest["finished"]:
         problems.append("begun again after it was finished")
-    if (folder / ".holder").exists():
-        problems.append("a holder is left")
+    if Lock(folder).held:
+        problems.append("is held still")
     return problems
 
 

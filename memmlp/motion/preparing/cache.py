@@ -19,9 +19,10 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from filelock import FileLock
 
 from memmlp.common.errors import InputError
+from memmlp.common.fences import check, publish, temporary
+from memmlp.common.lease import Lock
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
 from memmlp.motion.clip import Clip, resample
@@ -74,7 +75,7 @@ def prepare(source: ClipFolder, out: Path) -> Manifest:
     rest = load_rest_joints(source.body)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        with FileLock(out / ".lock"):
+        with Lock(out).hold():
             request = _request(source, rest)
             found = _finished(out, request)
             if found and not (source.strict and found.skipped):
@@ -132,12 +133,31 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
 
 def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) -> None:
     """Write the arrays under temporary names, then rename them, then write the manifest."""
+    check(out)
     (out / MANIFEST).unlink(missing_ok=True)
     frames = {part: int(manifest.totals[part]["frames"]) for part in PARTS}
     _check_space(out, sum(frames.values()) * ITEM_BYTES)
+    unfinished = {part: temporary(out / f"{part}.npy") for part in PARTS}
+    try:
+        _write_frames(source, rest, manifest, unfinished)
+        if _request(source, rest) != manifest.request:
+            raise InputError(f"{source.root}: data.root changed while it was being prepared; run it again")
+        for part, path in unfinished.items():
+            publish(path, out / f"{part}.npy")
+    finally:
+        for path in unfinished.values():
+            path.unlink(missing_ok=True)
+    write_manifest(manifest, out)
+
+
+def _write_frames(
+    source: ClipFolder, rest: np.ndarray, manifest: Manifest, paths: Mapping[str, Path]
+) -> None:
+    """Write the frames of each part into its file."""
+    frames = {part: int(manifest.totals[part]["frames"]) for part in PARTS}
     with ExitStack() as stack:
         stack.enter_context(one_thread())
-        files = {part: stack.enter_context(open(out / f"{part}.npy.tmp", "wb")) for part in PARTS}
+        files = {part: stack.enter_context(open(path, "wb")) for part, path in paths.items()}
         for part, file in files.items():
             header = {"descr": "<f4", "fortran_order": False, "shape": (frames[part], FRAME_DIM)}
             np.lib.format.write_array_header_1_0(file, header)
@@ -147,11 +167,6 @@ def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) 
                 files[record.split].write(block.tobytes())
         for file in files.values():
             _sync(file)
-    if _request(source, rest) != manifest.request:
-        raise InputError(f"{source.root}: data.root changed while it was being prepared; run it again")
-    for part in PARTS:
-        os.replace(out / f"{part}.npy.tmp", out / f"{part}.npy")
-    write_manifest(manifest, out)
 
 
 def _sync(file: BinaryIO) -> None:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from filelock import FileLock
-
+from memmlp.common.fences import publish, temporary
+from memmlp.common.lease import Lock
 from memmlp.motion.preparing.cache import ClipFolder, finished, prepare
 from memmlp.motion.preparing.coverage import Coverage
 from memmlp.motion.preparing.find import Found, clip_name
@@ -108,8 +108,8 @@ def _make_once(root: Path, generate: Callable[[Path], object]) -> None:
     if root.exists():
         return
     root.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(root.with_name(f".{root.name}.lock")):
+    with Lock(root.parent, root.name).hold():
         if not root.exists():  # no other process made it while this one waited
-            unfinished = root.with_name(root.name + ".unfinished")
+            unfinished = temporary(root)
             generate(unfinished)
-            unfinished.rename(root)
+            publish(unfinished, root)

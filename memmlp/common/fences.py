@@ -1,0 +1,103 @@
+"""Fences: what a process writes below a folder that it holds by a lease, it writes as the lease's owner.
+
+A lease has a number, and the next owner's is higher (memmlp.common.lease). Files are made under a temporary
+name that has the number, checked, and renamed. The next owner removes temporary files of lower numbers before
+it begins. So a process that wakes up after it was superseded, even between check and rename, finds that its
+file is gone, and publishes nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Protocol
+
+FENCED = re.compile(r"^\..*\.lease-(\d+)\.[0-9a-f]+\.tmp$")
+
+
+class Fence(Protocol):
+    """What stands between a process and a folder that it may have lost."""
+
+    number: int
+
+    def check(self) -> None:
+        """Raise LeaseLost if the folder has another owner by now."""
+
+
+_FENCES: dict[Path, Fence] = {}
+
+
+@contextlib.contextmanager
+def fenced(folder: Path, fence: Fence) -> Iterator[None]:
+    """Let this process write below the folder only while the fence's check passes."""
+    key = _real(folder)
+    _FENCES[key] = fence
+    try:
+        yield
+    finally:
+        del _FENCES[key]
+
+
+def fence_of(path: Path) -> Fence | None:
+    """Return the fence of the folder that the path lies in; None where this process holds none."""
+    real = _real(path)
+    return next((_FENCES[folder] for folder in (real, *real.parents) if folder in _FENCES), None)
+
+
+def check(path: Path) -> None:
+    """Raise LeaseLost if this process held the path's folder and has lost it.
+
+    To be called before a file is appended to or removed. A freeze after the check is not noticed there.
+    """
+    if fence := fence_of(path):
+        fence.check()
+
+
+def temporary(path: Path) -> Path:
+    """Return a name for the unfinished form of a file, beside it and used by nobody else."""
+    fence = fence_of(path)
+    owner = f"lease-{fence.number}." if fence else ""
+    return path.with_name(f".{path.name}.{owner}{uuid.uuid4().hex[:12]}.tmp")
+
+
+def publish(unfinished: Path, path: Path) -> None:
+    """Give a finished file, or folder, its name.
+
+    Args:
+        unfinished: its name so far, from `temporary`.
+        path: its name.
+
+    Raises:
+        LeaseLost: if this process held the path's folder and has lost it.
+    """
+    check(path)
+    try:
+        os.replace(unfinished, path)
+    except FileNotFoundError:
+        check(path)  # the next owner removed it
+        raise
+
+
+def sweep(folder: Path, number: int) -> None:
+    """Remove what owners with lower numbers left unfinished of a folder, and below it."""
+    for path in [*folder.rglob(".*.tmp"), *folder.parent.glob(f".{folder.name}.*.tmp")]:
+        found = FENCED.match(path.name)
+        if found and int(found[1]) < number:
+            _remove(path)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _real(path: Path) -> Path:
+    """Return the path with the links in its folder resolved; its last part stays as it is."""
+    return Path(os.path.realpath(path.parent)) / path.name

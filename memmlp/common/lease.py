@@ -1,0 +1,341 @@
+"""Leases: a folder belongs to one process at a time, whether or not the file system knows locks.
+
+Whoever wants the folder makes the file of the next number, `.lease-N`, which only one can make. The highest
+number is the owner's; the owner touches its file every few seconds. A folder is let go by a claim of nobody
+with the next number, so that numbers only grow. Who may make the next claim:
+
+- anybody where the last one is nobody's, or of a process of this machine that is dead;
+- who has seen the last claim unchanged for longer than LEASE, by a clock of its own.
+
+The kernel's lock (`.lock`) is taken where it can be had. If another process has it, a claim counts only as
+over once its lease has expired. That nobody has it proves nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import re
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from filelock import FileLock, Timeout
+
+from memmlp.common.errors import LeaseLost
+from memmlp.common.fences import fenced, sweep
+from memmlp.common.files import now
+from memmlp.common.liveness import Changes, lives, myself, place
+
+LEASE = 60.0  # seconds without a sign of life, as another process sees it, after which a claim is over
+BEAT = 5.0  # seconds between an owner's signs of life
+PAUSE = 0.2  # seconds between looks at a folder that is waited for
+NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP}
+"""Errors of file systems that know no locks."""
+
+_changes = Changes()
+_held: dict[tuple[int, int, str], Lease] = {}
+
+
+class Claim(NamedTuple):
+    """A claim on a folder as it was seen.
+
+    Attributes:
+        number: its number.
+        text: what the claim's file holds.
+        touched: when it was touched last, nanoseconds of the file system's clock.
+    """
+
+    number: int
+    text: str
+    touched: int
+
+    @property
+    def owner(self) -> dict[str, Any] | None:
+        """The process that made the claim; empty for nobody, None where that cannot be read.
+
+        An empty file is nobody's: if somebody is about to write it, the fence stops who is too late.
+        """
+        try:
+            found = json.loads(self.text or "{}")
+        except ValueError:
+            return None
+        return found if isinstance(found, dict) else None
+
+    @property
+    def free(self) -> bool:
+        """Whether the claim is nobody's."""
+        return self.owner == {}
+
+    @property
+    def lives(self) -> bool | None:
+        """Whether its owner is a living process of this machine; None if it is of another, or not known."""
+        return lives(self.owner) if self.owner else None
+
+
+class Claims:
+    """The claims on a folder: files whose names begin with `prefix` and end with a number."""
+
+    def __init__(self, folder: Path, prefix: str):
+        self.folder, self.prefix = folder, prefix
+        self.pattern = re.compile(re.escape(prefix) + r"(\d+)$")
+
+    def path(self, number: int) -> Path:
+        """Return the file of a claim."""
+        return self.folder / f"{self.prefix}{number}"
+
+    def numbers(self) -> list[int]:
+        """Return the numbers of all claims, in ascending order."""
+        try:
+            found = map(self.pattern.match, os.listdir(self.folder))
+        except FileNotFoundError:
+            return []
+        return sorted(int(match[1]) for match in found if match)
+
+    def last(self) -> Claim | None:
+        """Return the claim that counts, the last one; None where there was never any."""
+        while numbers := self.numbers():
+            with contextlib.suppress(FileNotFoundError):  # it has been superseded meanwhile
+                return self._read(numbers[-1])
+        return None
+
+    def _read(self, number: int) -> Claim:
+        with open(self.path(number), encoding="utf-8") as file:  # on NFS opening it asks the server
+            return Claim(number, file.read(), os.fstat(file.fileno()).st_mtime_ns)
+
+    def make(self, number: int, owner: dict[str, Any] | None = None) -> bool:
+        """Make a claim, by default nobody's, and return whether nobody else had made that one."""
+        try:
+            handle = os.open(self.path(number), os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+        except FileExistsError:
+            return False
+        try:
+            os.write(handle, json.dumps(owner).encode() if owner else b"")
+        finally:
+            os.close(handle)
+        return True
+
+    def remove_below(self, number: int) -> None:
+        """Remove the claims that were superseded, in ascending order, so that no earlier one seems last."""
+        for old in self.numbers():
+            if old < number:
+                self.path(old).unlink(missing_ok=True)
+
+
+class Lease:
+    """This process' claim on a folder.
+
+    Attributes:
+        number: the claim's number, higher than those of all owners before.
+    """
+
+    def __init__(self, claims: Claims, number: int, what: str):
+        self.claims, self.number, self.what = claims, number, what
+        self.lost = False
+
+    def check(self) -> None:
+        """Raise LeaseLost if another process made a later claim."""
+        if not self.lost:
+            self._look()
+        if self.lost:
+            raise LeaseLost(
+                f"{self.what}: another process took it over, for this one stood still for longer than "
+                f"{LEASE:.0f} s; it writes nothing more there"
+            )
+
+    def _look(self) -> None:
+        """Touch the claim, which asks the server where folders are shared, and look for later claims."""
+        try:
+            os.utime(self.claims.path(self.number))
+        except OSError as error:
+            if error.errno not in (errno.ENOENT, errno.ESTALE):
+                raise
+            self.lost = True
+        self.lost = self.lost or self.claims.numbers()[-1:] != [self.number]
+
+    @contextlib.contextmanager
+    def kept(self) -> Iterator[None]:
+        """Show signs of life for the time of the context, then let the folder go."""
+        ended = threading.Event()
+        thread = threading.Thread(target=self._beat, args=(ended,), daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+            self._release()
+
+    def _beat(self, ended: threading.Event) -> None:
+        """Look after the claim until it is lost or `ended` is set."""
+        while not (self.lost or ended.wait(BEAT)):
+            with contextlib.suppress(OSError):
+                self._look()
+
+    def _release(self) -> None:
+        """Claim the folder for nobody. Where the disk refuses it, the claim expires instead."""
+        with contextlib.suppress(OSError):
+            if not self.lost and self.claims.make(self.number + 1):
+                self.claims.path(self.number).unlink(missing_ok=True)
+
+
+class Lock:
+    """The lock of a folder, by leases; a thread may hold it several times.
+
+    Args:
+        folder: the folder in which claims are made.
+        name: the folder inside it that is held; by default it is `folder` itself.
+    """
+
+    def __init__(self, folder: Path, name: str = ""):
+        self.folder, self.name = folder, name
+        dot = f".{name}" if name else ""
+        self.kernel, self.claims = folder / f"{dot}.lock", Claims(folder, f"{dot}.lease-")
+
+    @contextlib.contextmanager
+    def hold(self, say: Callable[[str], None] | None = None, wait: bool = True) -> Iterator[Lease | None]:
+        """Hold the lock, and yield the lease; None if another process has it.
+
+        Inside, everything that this process publishes below the folder is fenced: once another process took
+        the folder over, LeaseLost is raised instead.
+
+        Args:
+            say: told in one line whom this process waits for; by default the line goes to stderr.
+            wait: whether to wait while another process has the lock.
+        """
+        key = (os.getpid(), threading.get_ident(), os.path.realpath(self.kernel))
+        if key in _held:
+            yield _held[key]
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with ExitStack() as stack:
+            lease = self._take(stack)
+            if lease is None and wait:
+                (say or _say)(f"{self._what} is in the hands of {self._who()}; waiting for it")
+                lease = self._wait(stack)
+            if lease is not None:
+                stack.enter_context(lease.kept())
+                stack.enter_context(fenced(self._held_folder, lease))
+                stack.callback(_held.pop, key)
+                _held[key] = lease
+            yield lease
+
+    @property
+    def owner(self) -> dict[str, Any] | None:
+        """What is known of the process that holds the lock; None if none does."""
+        last = self.claims.last()
+        return last.owner if last else None
+
+    @property
+    def held(self) -> bool | None:
+        """Whether the process that holds the lock lives, as far as is known; None if no process holds it.
+
+        A process of another machine counts as living until its signs of life have stayed away for LEASE.
+        """
+        last, idle = self._look()
+        if last is None or last.free:
+            return None
+        return last.lives or _open(last, idle)
+
+    def settle(self, say: Callable[[str], None] | None = None) -> None:
+        """Watch the process that holds the lock until it is known whether it lives.
+
+        That takes up to LEASE where it is of another machine, and no time otherwise.
+
+        Args:
+            say: told in one line that it takes time; by default the line goes to stderr.
+        """
+        first, idle = self._look()
+        last = first
+        if _open(first, idle):
+            (say or _say)(f"{self._what}: looking whether {self._who()} lives, for up to {LEASE:.0f} s")
+        while last == first and _open(last, idle):
+            time.sleep(PAUSE)
+            last, idle = self._look()
+
+    def _look(self) -> tuple[Claim | None, float]:
+        """Return the last claim, and for how many seconds this process has seen it unchanged."""
+        seen: list[Claim | None] = []
+
+        def look() -> Claim | None:
+            seen.append(self.claims.last())
+            return seen[-1]
+
+        idle = _changes.unchanged(self.kernel, look)
+        return seen[-1], idle
+
+    def _wait(self, stack: ExitStack) -> Lease:
+        while (lease := self._take(stack)) is None:
+            time.sleep(PAUSE)
+        return lease
+
+    def _take(self, stack: ExitStack) -> Lease | None:
+        """Make the next claim if the last one is over, and return the lease; None if it is not.
+
+        What is to be undone afterwards goes on the stack.
+        """
+        last, idle = self._look()
+        over = last is None or last.free or last.lives is False
+        expired = last is not None and idle > LEASE
+        if not (over or expired):
+            return None
+        with ExitStack() as own:
+            if not (self._take_kernels(own) or expired):
+                return None
+            lease = self._claim(last)
+            if lease is not None:
+                stack.enter_context(own.pop_all())
+            return lease
+
+    def _claim(self, last: Claim | None) -> Lease | None:
+        """Make the claim after `last`; None where somebody else did, be it long ago."""
+        number = last.number + 1 if last else 1
+        if not self.claims.make(number, {**myself(), "since": now()}):
+            return None
+        if self.claims.numbers()[-1:] != [number]:  # `last` was seen before this process was frozen
+            self.claims.path(number).unlink(missing_ok=True)
+            return None
+        self.claims.remove_below(number)
+        sweep(self._held_folder, number)
+        return Lease(self.claims, number, self._what)
+
+    def _take_kernels(self, stack: ExitStack) -> bool:
+        """Take the kernel's lock, and return whether no other process has it."""
+        try:
+            stack.enter_context(FileLock(self.kernel, timeout=0, fallback_to_soft=False))
+        except Timeout:
+            return False
+        except OSError as error:
+            if error.errno not in NO_LOCKS:
+                raise
+        return True
+
+    @property
+    def _held_folder(self) -> Path:
+        return self.folder / self.name
+
+    @property
+    def _what(self) -> str:
+        return f"{self._held_folder.parent.name.removesuffix('s')} {self._held_folder.name}"
+
+    def _who(self) -> str:
+        owner = self.owner
+        if not owner:
+            return "another process"
+        where = "" if owner["place"] == place() else " of another machine"
+        return f"process {owner['pid']}{where} since {owner['since']}"
+
+
+def _open(claim: Claim | None, idle: float) -> bool:
+    """Return whether only time will tell if the claim's owner lives, after `idle` seconds without a sign."""
+    return claim is not None and not claim.free and claim.lives is None and idle <= LEASE
+
+
+def _say(line: str) -> None:
+    print(f"memmlp: {line}", file=sys.stderr, flush=True)

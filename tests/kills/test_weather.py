@@ -1,0 +1,182 @@
+"""Hard weather: full and read-only disks, and files that are cut anywhere.
+
+Nothing is lost, nothing is half there, and a person reads one line.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from begun_runs import complete
+from conftest import Memmlp, one_line
+from disks import Disk
+from fake_runs import fake_run
+from processes import until
+
+from memmlp.common import lease
+from memmlp.common.errors import InputError
+from memmlp.common.files import atomic_write
+from memmlp.runs.evaluation_file import intact, write_report
+from memmlp.runs.run import Run
+from memmlp.search.director import objectives
+from memmlp.search.spec import Objective
+from memmlp.sweep.plan import Entry, Plan, RunTask
+from memmlp.sweep.worker import attempt
+from memmlp.tables.measured_run import load
+
+TASK = RunTask("a" * 16, "memmlp", {}, None, ("stream-0", "fp32-0"))
+STEPS = 2
+
+
+def whole(plan: Plan, task: RunTask) -> None:
+    """A run of a few steps, done as the pipeline does one: from its checkpoint, and only what is missing."""
+    run = plan.run_of(task)
+    if not run.done:
+        run.begin(task.kind, {"optim": {"steps": STEPS}}, data="d", upstream=None)
+        run.clear_stages()
+        first = int(run.checkpoint.read_bytes()) if run.checkpoint.exists() else 0
+        for step in range(first + 1, STEPS + 1):
+            run.log(step, {"loss": 1 / step})
+            atomic_write(run.checkpoint, str(step))
+        atomic_write(run.model, "weights")
+        run.finish(["model.safetensors"])
+    if not run.has("stream-0"):
+        run.attempt("evaluation")
+        report = {"mode": "stream", "run": run.id, "name": "stream-0", "settings": {}, "clips": []}
+        write_report(run.evaluation("stream-0"), report | {"mean": {"rotation": {"MPJPE": 6.5}}})
+    place = run.deployment("fp32-0")
+    if not place.done:
+        run.attempt("deployment")
+        place.folder.mkdir(parents=True, exist_ok=True)
+        atomic_write(place.onnx, "graph")
+        place.finish({"run": run.id})
+
+
+def sound(run: Run) -> bool:
+    """Whether all that is there of a run is whole, so that it can be gone on with."""
+    assert [entry.values for entry in run.metrics()] == [{"loss": 1 / (n + 1)} for n in range(run.step)]
+    assert not run.done or run.verify() == []
+    assert all(map(intact, run.evaluations.glob("*.json")))
+    return not list(run.folder.rglob(".*.tmp"))
+
+
+def error_of(action: Callable[[], object]) -> Exception | None:
+    """What an action raises."""
+    try:
+        action()
+    except Exception as error:
+        return error
+    return None
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small records, written quickly."""
+    monkeypatch.setattr("memmlp.runs.run.sources", lambda: {"a.py": "0"})
+    monkeypatch.setattr("memmlp.runs.run.changes", lambda: "")
+    for module in ("run", "evaluation_file", "deployment_folder"):
+        monkeypatch.setattr(f"memmlp.runs.{module}.environment", lambda: {"host": "h"})
+    monkeypatch.setattr("os.fsync", lambda handle: None)
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> Plan:
+    return Plan("trial", tmp_path, (Entry("arm", 0, TASK.id, TASK.stages),), (TASK,))
+
+
+@pytest.mark.slow
+def test_a_disk_that_is_full_at_any_write(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(lease, "LEASE", 0.0)  # a claim that could not be let go, as by a process that ended
+    run = plan.run_of(TASK)
+    full, refused = 0, True
+    while refused:
+        with monkeypatch.context() as context:
+            disk = Disk(context, tmp_path, errno.ENOSPC, full)
+            error = error_of(lambda: attempt(plan, TASK, whole))
+        refused = error is not None
+        if refused:
+            assert isinstance(error, OSError)
+            assert (error.errno, bool(error.filename)) == (errno.ENOSPC, True), full
+            assert not plan.complete(TASK)
+        assert sound(run), full
+        assert run.failure is None
+        until(lambda: attempt(plan, TASK, whole), "the run can be taken")
+        assert plan.complete(TASK), full
+        assert sound(run)
+        assert run.step == STEPS
+        run.reset()
+        full += 1
+    assert full == disk.writes + 1 > 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", [["train"], ["sweep", "14", "executor=debug"], ["tune"]])
+def test_outputs_that_are_read_only(memmlp: Memmlp, tmp_path: Path, monkeypatch, words: list[str]):
+    Disk(monkeypatch, tmp_path, errno.EROFS, 0)
+    ran = memmlp(*words, "profile=tiny", "tracking=none")
+    assert one_line(ran, "Read-only file system", "outputs"), ran.err
+    assert not (tmp_path / "outputs").exists()
+
+
+def at_every_byte(path: Path, look: Callable[[], object], whole_from: int = 1) -> int:
+    """Cut a file at every byte, and look; return how often a line said that something is wrong with it.
+
+    A look at a file that lacks up to `whole_from` bytes, such as the last line feed, may find it whole.
+    """
+    content, refused = path.read_bytes(), 0
+    expected = look()
+    for size in range(len(content)):
+        path.write_bytes(content[:size])
+        found: list[object] = []
+        error = error_of(lambda found=found: found.append(look()))
+        if error is None:
+            assert found != [expected] or size >= len(content) - whole_from, size
+        else:
+            assert isinstance(error, InputError)
+            assert path.name in str(error)
+            refused += 1
+    path.write_bytes(content)
+    assert look() == expected
+    return refused
+
+
+@pytest.mark.slow
+def test_the_marker_the_manifest_and_the_config_cut_at_every_byte(tmp_path: Path):
+    run = complete(tmp_path)
+    assert at_every_byte(run.marker, lambda: run.status) == 0  # then it is not done
+    for path in (run.evaluation("stream-0"), run.deployment("int8-0").latency):
+        at_every_byte(path, lambda: (run.verify(), run.has("int8-0"), run.results))
+    assert at_every_byte(run.manifest_path, lambda: (run.status, run.manifest)) == 0
+    run.fail("no luck")
+    assert at_every_byte(run.folder / "FAILED", lambda: run.failure) == 0
+    at_every_byte(run.config_path, lambda: run.config, whole_from=len(run.config_path.read_bytes()))
+
+
+@pytest.mark.slow
+def test_an_evaluation_cut_at_every_byte_is_in_no_table(tmp_path: Path):
+    run = fake_run(tmp_path, "arm", clips=("salsa/01",), branches=("rotation",))
+    path = run.evaluation("stream-0")
+    size = len(path.read_bytes())
+    assert at_every_byte(path, lambda: load(run.folder).means) == size
+
+
+def test_a_plan_cut_at_every_byte_is_refused(plan: Plan, tmp_path: Path):
+    path = tmp_path / "plan.json"
+    plan.save(path)
+    size = len(path.read_bytes())
+    assert at_every_byte(path, lambda: Plan.load(path)) >= size - 1
+
+
+def test_a_search_refuses_a_log_that_lacks_its_last_validation(tmp_path: Path):
+    """Whose earlier validations would pass for the run's result."""
+    run = complete(tmp_path, {"optim": {"steps": 20}})
+    wanted = [Objective("MPJPE", ((1.0, "rotation MPJPE"),))]
+    for step in (10, 20):
+        run.log(step, {"rotation MPJPE": 100.0 / step}, "val")
+    assert objectives(wanted, run) == [5.0]
+    assert at_every_byte(run.metrics_path, lambda: objectives(wanted, run)) == len(
+        run.metrics_path.read_bytes()
+    )

@@ -1,0 +1,164 @@
+"""Machines of a test: threads that count as machines, which share a folder, but no clock and no locks."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import random
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from memmlp.common import fences, files, lease, liveness
+from memmlp.common.liveness import Changes
+
+
+class Clock:
+    """A clock that a test turns."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class OwnChanges(threading.local):
+    """What each machine has seen, by a clock that all of them read."""
+
+    def __init__(self, clock: Clock):
+        self.unchanged = Changes(clock).unchanged
+
+
+class OwnFences(threading.local):
+    """The fences of each machine."""
+
+    def __init__(self) -> None:
+        fences: dict[Path, Any] = {}
+        self.get, self.set, self.remove = fences.__getitem__, fences.__setitem__, fences.__delitem__
+        self.has = fences.__contains__
+
+    def __getitem__(self, key: Path) -> Any:
+        return self.get(key)
+
+    def __setitem__(self, key: Path, value: Any) -> None:
+        self.set(key, value)
+
+    def __delitem__(self, key: Path) -> None:
+        self.remove(key)
+
+    def __contains__(self, key: Path) -> bool:
+        return self.has(key)
+
+
+def without_locks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a file system whose locks do nothing."""
+    monkeypatch.setattr(fcntl, "flock", lambda *_: None)
+
+
+def apart(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """Let every thread be a machine. Nothing beats by itself; the clock stands until it is turned."""
+    clock = Clock()
+    without_locks(monkeypatch)
+    monkeypatch.setattr(liveness, "place", lambda: threading.current_thread().name)
+    monkeypatch.setattr(lease, "place", lambda: threading.current_thread().name)
+    monkeypatch.setattr(lease, "_changes", OwnChanges(clock))
+    monkeypatch.setattr(fences, "_FENCES", OwnFences())
+    monkeypatch.setattr(lease, "BEAT", 1e6)
+    return clock
+
+
+class Machine:
+    """A thread that does one thing after another, each when it is told to."""
+
+    def __init__(self, name: str):
+        self.wanted: Callable[[], object] | None = None
+        self.result: object = None
+        self.go, self.done = threading.Semaphore(0), threading.Semaphore(0)
+        self.thread = threading.Thread(target=self._serve, name=name, daemon=True)
+        self.thread.start()
+
+    def __call__(self, action: Callable[..., Any], *arguments: Any) -> Any:
+        """Do it there, and return what it returns, or raise what it raises."""
+        self.wanted = lambda: action(*arguments)
+        self.go.release()
+        self.done.acquire()
+        if isinstance(self.result, BaseException):
+            raise self.result
+        return self.result
+
+    def _serve(self) -> None:
+        while True:
+            self.go.acquire()
+            assert self.wanted is not None
+            try:
+                self.result = self.wanted()
+            except BaseException as error:
+                self.result = error
+            self.done.release()
+
+
+class Scheduler:
+    """Lets one of several threads go at a time, from system call to system call, in an order drawn by lot."""
+
+    CALLS = ("listdir", "open", "write", "utime", "replace")
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, clock: Clock, dice: random.Random, pause: float):
+        self.clock, self.dice, self.pause = clock, dice, pause
+        self.turns: dict[int, threading.Semaphore] = {}
+        self.back = threading.Semaphore(0)
+        calls = {name: self._stepping(getattr(os, name)) for name in self.CALLS}
+        plain = {name: getattr(os, name) for name in dir(os) if not name.startswith("_")}
+        proxy = SimpleNamespace(**{**plain, **calls, "fsync": lambda handle: None})
+        for module in (lease, fences, files):
+            monkeypatch.setattr(module, "os", proxy)
+        monkeypatch.setattr(Path, "unlink", self._stepping(Path.unlink))
+        monkeypatch.setattr(files, "sync_folder", lambda folder: None)
+
+    def _stepping(self, call: Callable[..., Any]) -> Callable[..., Any]:
+        def stepping(*arguments: Any, **options: Any) -> Any:
+            if turn := self.turns.get(threading.get_ident()):
+                self.back.release()
+                turn.acquire()
+            return call(*arguments, **options)
+
+        return stepping
+
+    def run(self, actors: dict[str, Callable[[], None]]) -> None:
+        """Run the actors to their end, each as a machine of that name."""
+        threads: dict[str, threading.Thread] = {}
+        for name, actor in actors.items():
+            turn = threading.Semaphore(0)
+            threads[name] = threading.Thread(target=self._act, args=(actor, turn), name=name, daemon=True)
+            threads[name].start()
+            self.back.acquire()
+            self.turns[threads[name].ident or 0] = turn
+        while alive := [thread for thread in threads.values() if thread.ident in self.turns]:
+            chosen = self.dice.choice(alive).ident or 0
+            for _ in range(self.dice.randint(1, 25)):  # so long the others stand still
+                self.clock.now += self.dice.choice((0.1, 1.0, self.pause))
+                if turn := self.turns.get(chosen):
+                    turn.release()
+                    self.back.acquire()
+
+    def _act(self, actor: Callable[[], None], turn: threading.Semaphore) -> None:
+        self.back.release()
+        turn.acquire()
+        try:
+            actor()
+        finally:
+            del self.turns[threading.get_ident()]
+            self.back.release()
+
+
+@contextlib.contextmanager
+def taken(lock: lease.Lock) -> Iterator[lease.Lease]:
+    """The lock held, which nobody else has."""
+    with lock.hold(wait=False) as found:
+        assert found is not None
+        yield found
