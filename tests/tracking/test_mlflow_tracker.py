@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from memmlp.cli.mlflow_commands import track
+from memmlp.runs.mlflow_tracking import MLflowTracking, NoTracking, project_safely
 from processes import finished
 
-from memmlp.cli.mlflow_commands import track
 from memmlp.common.files import write_json
-from memmlp.runs.mlflow_tracking import MLflowTracking, NoTracking, project_safely
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Entry, Plan
 
