@@ -64,13 +64,11 @@ def list_command(
         return
     limit = len(found) if every or query or sort else NEWEST
     records = {run.id: recorded(run) for run in found[:limit]}
-    listed = found[:limit]
-    if query:
-        fits = query.of(list(records.values()))
-        listed = [run for run, fit in zip(listed, fits, strict=True) if fit]
+    fits = query.of(list(records.values())) if query else [True] * len(records)
+    listed = [run for run, fit in zip(found[:limit], fits, strict=True) if fit]
     if sort:
         listed = sorted_by(listed, records, sort)
-    shown_runs(listed, records, wanted(columns, records, listed))
+    show_runs(listed, records, wanted(columns, records, listed), {} if columns else SHOWN)
     if len(found) > limit:
         click.echo(f"{len(found) - limit} older ones: memmlp runs list --all")
     elif query:
@@ -116,21 +114,30 @@ def wanted(columns: str | None, records: Mapping[str, Record], listed: Sequence[
     return differing([run.config for run in networks])[:WIDEST] if len(networks) > 1 else []
 
 
-def shown_runs(listed: Sequence[Run], records: Mapping[str, Record], keys: Sequence[str]) -> None:
-    """Print the runs as a table."""
+def show_runs(
+    listed: Sequence[Run],
+    records: Mapping[str, Record],
+    keys: Sequence[str],
+    numbers: Mapping[str, str],
+) -> None:
+    """Print the runs as a table: with the values of some keys, and with some numbers under heads of ours."""
     from memmlp.runs.query import shown
 
+    table = _table()
+    for column in ("run", "kind", "status", "age"):
+        table.add_column(column, no_wrap=True)
     tags = any(records[run.id].get("tag") for run in listed)
-    table = _table("run", "kind", "status", "age", *keys, *(["tags"] if tags else []))
-    for column in SHOWN:
+    for column in (*keys, *(["tags"] if tags else [])):
+        table.add_column(column, overflow="fold")
+    for column in numbers:
         table.add_column(column, justify="right", no_wrap=True)
     for run in listed:
         one = records[run.id]
         cells = [shown(one[key]) if key in one else "-" for key in keys]
         labels = [" ".join(one.get("tag", ()))] if tags else []
-        kind = one.get("kind") or "-"
-        numbers = (_cell(one.get(key)) for key in SHOWN.values())
-        table.add_row(run.id, str(kind), str(one["status"]), _age(run), *cells, *labels, *numbers)
+        kind = str(one.get("kind") or "-")
+        values = (_cell(one.get(key)) for key in numbers.values())
+        table.add_row(run.id, kind, str(one["status"]), _age(run), *cells, *labels, *values)
     _console().print(table)
 
 

@@ -96,7 +96,8 @@ class Feed:
         except OSError as error:
             warn(f"runs are not shown by {', '.join(self.names)}: {error}")
             return None
-        threading.Thread(target=self._listen, args=(process.stdout,), daemon=True).start()
+        self.listener = threading.Thread(target=self._listen, args=(process.stdout,), daemon=True)
+        self.listener.start()
         return process
 
     @property

@@ -37,7 +37,7 @@ class TensorBoard:
         """Write a run's event file from its beginning; an earlier one is removed."""
         for old in self._folders(facts.id[:8]):
             shutil.rmtree(old)
-        shown = ShownInTensorBoard(_writer(Path(self.place) / file_name(facts.title)))
+        shown = ShownInTensorBoard(EventFile(Path(self.place) / file_name(facts.title)))
         shown.log(points)
         return shown
 
@@ -45,14 +45,14 @@ class TensorBoard:
         """Write a sweep's table as text and its aggregates as values."""
         folder = Path(self.place) / file_name(f"sweep {facts.name}")
         shutil.rmtree(folder, ignore_errors=True)
-        writer = _writer(folder)
+        writer = EventFile(folder)
         for path in facts.files:
             if path.suffix == ".md":
-                writer.add_text("table", path.read_text(encoding="utf-8"), 0)
+                writer.text("table", path.read_text(encoding="utf-8"))
         verdicts = "\n".join(f"| {key} | {verdict} |" for key, verdict in facts.verdicts.items())
-        writer.add_text("verdicts", f"| comparison | verdict |\n|---|---|\n{verdicts}", 0)
+        writer.text("verdicts", f"| comparison | verdict |\n|---|---|\n{verdicts}")
         for key, value in facts.aggregates.items():
-            writer.add_scalar(file_name(key), value, 0)
+            writer.scalar(key, value, 0, 0.0)
         writer.close()
 
     def _folders(self, word: str) -> list[Path]:
@@ -62,13 +62,13 @@ class TensorBoard:
 class ShownInTensorBoard:
     """A run whose event file is open."""
 
-    def __init__(self, writer: Any):
+    def __init__(self, writer: EventFile):
         self.writer = writer
 
     def log(self, points: Sequence[Point]) -> None:
-        """Write values, and hand them to the operating system."""
+        """Write values to the disk."""
         for point in points:
-            self.writer.add_scalar(point.key, point.value, point.step, point.time)
+            self.writer.scalar(point.key, point.value, point.step, point.time)
         self.writer.flush()
 
     def end(self, facts: Facts, results: Sequence[Point]) -> None:
@@ -79,7 +79,7 @@ class ShownInTensorBoard:
         texts |= {"tags": ", ".join(facts.labels), "config": f"| key | value |\n|---|---|\n{config}"}
         for key, text in texts.items():
             if text:
-                self.writer.add_text(key, text, 0)
+                self.writer.text(key, text)
         self.writer.flush()
 
     def leave(self) -> None:
@@ -87,10 +87,39 @@ class ShownInTensorBoard:
         self.writer.close()
 
 
-def _writer(folder: Path) -> Any:
-    from tensorboardX import SummaryWriter
+class EventFile:
+    """An event file that is written at once; tensorboardX's SummaryWriter leaves it to another thread."""
 
-    return SummaryWriter(str(folder), flush_secs=3600)  # it is flushed by hand
+    def __init__(self, folder: Path):
+        from tensorboardX.event_file_writer import EventsWriter
+
+        folder.mkdir(parents=True, exist_ok=True)
+        self.file = EventsWriter(str(folder / "events"))
+
+    def scalar(self, key: str, value: float, step: int, time: float) -> None:
+        """Add a value of a curve."""
+        from tensorboardX.summary import scalar
+
+        self._add(scalar(key, value), step, time)
+
+    def text(self, key: str, text: str) -> None:
+        """Add a text, in Markdown."""
+        from tensorboardX.summary import text as summary
+
+        self._add(summary(key, text), 0, 0.0)
+
+    def flush(self) -> None:
+        """Bring what was added to the disk."""
+        self.file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self.file.close()
+
+    def _add(self, summary: Any, step: int, time: float) -> None:
+        from tensorboardX.proto.event_pb2 import Event
+
+        self.file.write_event(Event(summary=summary, step=step, wall_time=time))
 
 
 def file_name(title: str) -> str:
