@@ -257,11 +257,11 @@ def gc_command(kinds: tuple[str, ...], yes: bool, outputs: Path) -> None:
         size = sum(one.size for one in found) / 1e6
         click.echo(f"{len(found)} runs, {size:.1f} MB; delete them with --yes")
         return
-    gone = [one for one in found if delete(one, outputs)]
+    gone = [one for one in found if delete(one)]
     click.echo(f"deleted {len(gone)} runs, {sum(one.size for one in gone) / 1e6:.1f} MB")
     for one in found:
         if one not in gone:
-            click.echo(f"run {one.run.id} stays: somebody is at it", err=True)
+            click.echo(f"run {one.run.id} stays: somebody is at it, or gave it a tag or a note", err=True)
 
 
 def _garbage_table(found: Sequence[Garbage]) -> Table:

@@ -47,16 +47,16 @@ def garbage(outputs: Path, kinds: Iterable[str] = REASONS) -> list[Garbage]:
     found = {}
     for run in runs:
         kind, reason = _reason(run, orphans)
-        if kind in wanted and not _kept(run):
+        if kind in wanted and not _marked(run) and run.state(False) != "running":
             found[run.id] = Garbage(run, kind, reason, _size(run.folder))
     used = {run.manifest.get("upstream") for run in runs if run.id not in found}
     return [one for run_id, one in found.items() if run_id not in used]
 
 
-def delete(one: Garbage, outputs: Path) -> bool:
-    """Delete a run's folder, its marker first. Returns False where somebody is at the run meanwhile."""
+def delete(one: Garbage) -> bool:
+    """Delete a run's folder, its marker first. Returns False where somebody is at the run or marked it."""
     with one.run.lock(wait=False) as mine:
-        if not mine or _kept(one.run):
+        if not mine or _marked(one.run):
             return False
         one.run.reset()
         shutil.rmtree(one.run.folder)
@@ -97,9 +97,10 @@ def _listed(path: Path, key: str) -> Iterator[Mapping[str, str]]:
     yield from (one for one in found or () if isinstance(one, dict) and "id" in one)
 
 
-def _kept(run: Run) -> bool:
+def _marked(run: Run) -> bool:
+    """Return whether people gave the run a tag or a note."""
     notes = read_notes(run)
-    return bool(notes.tags or notes.note) or run.state(False) == "running"
+    return bool(notes.tags or notes.note)
 
 
 def _size(folder: Path) -> int:

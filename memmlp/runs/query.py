@@ -112,8 +112,9 @@ class _Parser:
     """Recursive descent over the tokens of a condition."""
 
     def __init__(self, text: str):
-        self.text, self.tokens, self.keys, self.depth = text, list(self._tokens(text)), [], 0
-        self.place = 0
+        self.text, self.place, self.depth = text, 0, 0
+        self.keys: list[str] = []
+        self.tokens = list(self._tokens(text))
 
     def _tokens(self, text: str) -> Iterable[tuple[str, str]]:
         place, text = 0, text.rstrip()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -64,8 +65,11 @@ class WandB:
         os.environ.update(OFFLINE)
         import wandb
 
+        stamps = {old.name.split("-")[2] for old in self._folders(own)}
         for old in self._folders(own):
             shutil.rmtree(old)
+        while time.strftime("%Y%m%d_%H%M%S") in stamps:  # a folder of the same name would stay empty
+            time.sleep(0.05)
         Path(self.place).mkdir(parents=True, exist_ok=True)
         settings = wandb.Settings(
             console="off", silent=True, x_disable_stats=True, x_disable_meta=True,

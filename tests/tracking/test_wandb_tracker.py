@@ -41,7 +41,7 @@ def records(tracker: WandB, name: str) -> list[Any]:
 
 
 def pieces(content: bytes) -> Iterator[bytes]:
-    """The entries of a file in LevelDB's log format: blocks of 32 KiB; each piece has checksum, length, type."""
+    """The entries of a file in LevelDB's log format: in blocks of 32 KiB, with checksum, length, type."""
     place, whole = 7, b""  # after the file's own header
     while place < len(content):
         if 32768 - place % 32768 < 7:
