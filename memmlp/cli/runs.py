@@ -28,7 +28,7 @@ SHOWN = {
     "jitter": "stream.rotation.Jitter",
     "ms": "latency.median_ms",
 }
-WIDEST = 6  # columns of what differs
+ROOM, WIDTH = 66, 11  # characters of all other columns, and of one of what differs
 
 
 @click.group("runs")
@@ -68,7 +68,11 @@ def list_command(
     listed = [run for run, fit in zip(found[:limit], fits, strict=True) if fit]
     if sort:
         listed = sorted_by(listed, records, sort)
-    show_runs(listed, records, wanted(columns, records, listed), {} if columns else SHOWN)
+    keys = wanted(columns, records, listed)
+    fit = len(keys) if columns else max((_console().width - ROOM) // WIDTH, 1)
+    show_runs(listed, records, keys[:fit], {} if columns else SHOWN)
+    if keys[fit:]:
+        click.echo(f"they differ in {', '.join(keys[fit:])}, too: --columns shows it")
     if len(found) > limit:
         click.echo(f"{len(found) - limit} older ones: memmlp runs list --all")
     elif query:
@@ -111,7 +115,7 @@ def wanted(columns: str | None, records: Mapping[str, Record], listed: Sequence[
             check_key(key, records.values(), "--columns")
         return keys
     networks = [run for run in listed if records[run.id].get("kind") == "memmlp"]
-    return differing([run.config for run in networks])[:WIDEST] if len(networks) > 1 else []
+    return differing([run.config for run in networks]) if len(networks) > 1 else []
 
 
 def show_runs(
@@ -124,6 +128,7 @@ def show_runs(
     from memmlp.runs.query import shown
 
     table = _table()
+    table.padding = (0, 0)
     for column in ("run", "kind", "status", "age"):
         table.add_column(column, no_wrap=True)
     tags = any(records[run.id].get("tag") for run in listed)

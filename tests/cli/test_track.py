@@ -33,9 +33,7 @@ def test_sync_shows_runs_and_sweeps_and_then_nothing_more(memmlp: Memmlp, tmp_pa
     assert server.status == {"0" * 16: "done", "1" * 16: "failed"}
 
 
-def test_what_could_not_be_shown_is_a_line_each_and_exit_code_1(
-    memmlp: Memmlp, tmp_path: Path, server: Server
-):
+def test_what_could_not_be_shown_is_a_line_each(memmlp: Memmlp, tmp_path: Path, server: Server):
     a_run(tmp_path / "outputs")
     server.down = True
     ran = memmlp("track", "sync")

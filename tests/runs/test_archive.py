@@ -112,7 +112,8 @@ def test_weights_that_are_not_those_that_were_trained_are_refused(archive: Path,
 
 @pytest.mark.parametrize("name", [
     "../evil", "/etc/evil", "evaluations/../../evil.json", "evaluations/..json",
-    "deployments/../latency.json", "mine.py", "evaluations/a/b.json", "C:evil", "model.pkl", ".lock", "DONE/x", "evaluations\\x.json",
+    "deployments/../latency.json", "mine.py", "evaluations/a/b.json", "C:evil", "model.pkl",
+    ".lock", "DONE/x", "evaluations\\x.json",
 ])  # fmt: skip
 def test_no_other_name_is_unpacked(archive: Path, tmp_path: Path, name: str):
     changed(archive, {name: b"evil"})

@@ -18,7 +18,8 @@ from memmlp.runs.query import differing, parse, record
 
 ONE = {
     "memory": "gru", "seed": 1, "optim.lr": 1e-3, "memory.layers": [2, 4], "stream.MPJPE": 6.25,
-    "tag": ("good",), "note": "two words", "force": False, "vqvae.epochs": None, "started": "2026-01-02T03:04:05+00:00",
+    "tag": ("good",), "note": "two words", "force": False, "vqvae.epochs": None,
+    "started": "2026-01-02T03:04:05+00:00",
 }  # fmt: skip
 
 

@@ -8,16 +8,23 @@ from fake_runs import fake_run, fake_sweep, table_of
 
 from memmlp.common.files import read_json
 from memmlp.sweep.plan import Entry, Plan, RunTask
-from memmlp.sweep.spec import Arm, Sweep
+from memmlp.sweep.spec import load_sweep
 from memmlp.tables.summary import write_summary
 from memmlp.tracking.view import SweepFacts
 
 
+def written(folder: Path) -> Path:
+    """A sweep's file: two arms, three seeds."""
+    path = folder / "mine.yaml"
+    path.write_text(
+        "title: Mine\nseeds: [0, 1, 2]\ncontrol: full\nmetrics: [MPJPE]\n"
+        "arms:\n  full: []\n  none: ['memory=none']\n"
+    )
+    return path
+
+
 def test_table_means_verdicts_labels_and_status(tmp_path: Path):
-    sweep = Sweep(
-        "mine", "Mine", (Arm("full", ()), Arm("none", ("memory=none",))), seeds=(0, 1, 2), control="full",
-        metrics=("MPJPE",),
-    )  # fmt: skip
+    sweep = load_sweep(written(tmp_path))
     find = fake_sweep(tmp_path, sweep, {"none": 1.5})
     runs = {(arm.label, seed): find(arm, seed) for arm in sweep.arms for seed in sweep.seeds}
     entries = tuple(Entry(label, seed, run.id) for (label, seed), run in runs.items() if run)
@@ -38,7 +45,7 @@ def test_table_means_verdicts_labels_and_status(tmp_path: Path):
 
 
 def test_a_sweep_with_a_failed_run_failed_and_one_with_a_missing_run_goes_on(tmp_path: Path):
-    sweep = Sweep("mine", "Mine", (Arm("full", ()),), seeds=(0,), control="full", metrics=("MPJPE",))
+    sweep = load_sweep(written(tmp_path))
     table, run = table_of(sweep, fake_sweep(tmp_path, sweep)), fake_run(tmp_path, "other")
     entry, task = Entry("full", 0, run.id), RunTask(run.id, "memmlp", {})
     plan = Plan("mine", tmp_path, (entry,), (task,))
