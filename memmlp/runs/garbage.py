@@ -77,7 +77,8 @@ def _orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
     Orphans are runs of earlier versions of a sweep that no plan has now, VQ-VAEs that no run uses, and
     folders in which nothing began.
     """
-    planned, before = set(), {}
+    planned: set[str] = set()
+    before: dict[str, str] = {}
     for path in outputs.glob("sweeps/*/plan.json"):
         planned |= {task["id"] for task in _listed(path, "tasks")}
     for path in outputs.glob("sweeps/*/entries.json"):

@@ -45,13 +45,16 @@ def tracking(rounds: int, steps: int, uri: str | None, overrides: tuple[str, ...
         place = f"paths.outputs={folder}"
         words = ["profile=small", "memory=no_codes", place, f"optim.steps={steps}", *address, *overrides]
         experiment = build_experiment(composed(words))
-        plain, shown = [], []
+        pairs = []
         timed(experiment, Path(folder), 99, False)  # the first one warms up
         for number in range(rounds):
-            plain.append(timed(experiment, Path(folder), 2 * number, False))
-            shown.append(timed(experiment, Path(folder), 2 * number + 1, True))
-    for name, place in (("seconds", 0), ("of the processor", 1)):
-        before, after = (np.array([cost[place] for cost in costs]) for costs in (plain, shown))
+            ways = (timed(experiment, Path(folder), 2 * number + way, bool(way)) for way in (0, 1))
+            pairs.append(tuple(ways))
+            click.echo(
+                f"round {number + 1}: {pairs[-1][0].wall:.2f} s without, {pairs[-1][1].wall:.2f} s with"
+            )
+    for column, name in enumerate(("seconds", "of the processor")):
+        before, after = (np.array([pair[way][column] for pair in pairs]) for way in (0, 1))
         ratios = after / before
         click.echo(
             f"{name:16s} {np.median(before):8.2f} without, {np.median(after):8.2f} with: ratio "
