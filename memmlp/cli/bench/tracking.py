@@ -2,76 +2,81 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+import os
+import signal
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import click
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from memmlp.pipeline.experiment import Experiment
-
-
-class Cost(NamedTuple):
-    """What a training took: seconds, and seconds of this process on the processor."""
-
-    wall: float
-    processor: float
+from memmlp.runs.run import Run
 
 
 @click.command("tracking")
-@click.option("--rounds", default=3, show_default=True, help="How often each way is timed, the two in turn.")
-@click.option("--steps", default=1000, show_default=True, help="Length of each training.")
-@click.option(
-    "--uri", help="MLflow's store, such as a server that is dead or slow.  [default: a sqlite file]"
-)
+@click.option("--blocks", default=40, show_default=True, help="How many pieces of the training are timed.")
+@click.option("--steps", default=25, show_default=True, help="Length of a piece, training steps.")
+@click.option("--uri", help="MLflow's store, such as a dead or slow server.  [default: a sqlite file]")
 @click.argument("overrides", nargs=-1)
-def tracking(rounds: int, steps: int, uri: str | None, overrides: tuple[str, ...]) -> None:
-    """Time trainings that are shown in trackers against the same that are not.
+def tracking(blocks: int, steps: int, uri: str | None, overrides: tuple[str, ...]) -> None:
+    """Time a training that is shown in trackers, by pieces.
 
-    Printed is the ratio. OVERRIDES are those of `memmlp train`; the default is profile=small memory=no_codes,
-    and tracking=mlflow. It is all done in a temporary folder.
+    In every other piece the process that shows it is stopped, so that the ratio of neighbours tells what it
+    costs, whatever else the machine does. OVERRIDES are those of `memmlp train`; the default is profile=small
+    memory=no_codes and tracking=mlflow. It is all done in a temporary folder.
     """
     import tempfile
-    from pathlib import Path
 
     import numpy as np
 
     from memmlp.config.build import build_experiment
     from memmlp.config.compose import composed
+    from memmlp.pipeline.run_stages import train_run
+    from memmlp.tracking.feed import feed_of
 
     address = [f"tracking.mlflow.uri={uri}"] if uri else []
+    length = [f"optim.steps={(blocks + 3) * steps}", f"optim.log_every={steps}"]  # two pieces warm up
     with tempfile.TemporaryDirectory() as folder:
-        place = f"paths.outputs={folder}"
-        words = ["profile=small", "memory=no_codes", place, f"optim.steps={steps}", *address, *overrides]
+        words = ["profile=small", "memory=no_codes", f"paths.outputs={folder}", *length, *address, *overrides]
         experiment = build_experiment(composed(words))
-        pairs = []
-        timed(experiment, Path(folder), 99, False)  # the first one warms up
-        for number in range(rounds):
-            ways = (timed(experiment, Path(folder), 2 * number + way, bool(way)) for way in (0, 1))
-            pairs.append(tuple(ways))
-            click.echo(
-                f"round {number + 1}: {pairs[-1][0].wall:.2f} s without, {pairs[-1][1].wall:.2f} s with"
-            )
-    for column, name in enumerate(("seconds", "of the processor")):
-        before, after = (np.array([pair[way][column] for pair in pairs]) for way in (0, 1))
-        ratios = after / before
-        click.echo(
-            f"{name:16s} {np.median(before):8.2f} without, {np.median(after):8.2f} with: ratio "
-            f"{np.median(ratios):.4f} ({ratios.min():.4f} to {ratios.max():.4f} over {rounds} rounds)"
-        )
+        follower = feed_of(experiment.tracking).process
+        run = PiecewiseRun(Path(folder) / "runs" / ("0" * 16), follower.pid if follower else None)
+        with experiment.tracking.following(run):
+            train_run(experiment, run, experiment.data.prepare(), None)
+    pieces = np.array(run.seconds[2 : 2 + blocks // 2 * 2]).reshape(-1, 2)
+    ratios = pieces[:, 0] / pieces[:, 1]
+    low, high = np.quantile(ratios, (0.25, 0.75))
+    click.echo(f"{steps} steps: {np.median(pieces[:, 0]):.3f} s shown, {np.median(pieces[:, 1]):.3f} s not")
+    click.echo(f"ratio {np.median(ratios):.4f} (half of {len(ratios)} pairs: {low:.4f} to {high:.4f})")
 
 
-def timed(experiment: Experiment, outputs: Path, number: int, shown: bool) -> Cost:
-    """Train a network anew and return what it took, from its run's beginning to its end."""
-    import time
-    from contextlib import nullcontext
+class PiecewiseRun(Run):
+    """A run that times its training between lines of its log, and stops a process in every other piece.
 
-    from memmlp.pipeline.run_stages import train_run
-    from memmlp.runs.run import Run
+    Args:
+        folder: the run's folder.
+        pid: the process; None for none.
+    """
 
-    run, data = Run.of(outputs, f"{number:016x}"), experiment.data.prepare()
-    start, processor = time.perf_counter(), time.process_time()
-    with experiment.tracking.following(run) if shown else nullcontext():
-        train_run(experiment, run, data, None)
-    return Cost(time.perf_counter() - start, time.process_time() - processor)
+    def __init__(self, folder: Path, pid: int | None):
+        super().__init__(folder)
+        self.pid = pid
+        self.seconds: list[float] = []
+        self.since = time.perf_counter()
+
+    def log(self, step: int, values: Mapping[str, float], phase: str = "train") -> None:
+        """Log, and end a piece."""
+        super().log(step, values, phase)
+        if phase == "train":
+            self.seconds.append(time.perf_counter() - self.since)
+            self._signal(signal.SIGSTOP if len(self.seconds) % 2 else signal.SIGCONT)
+            self.since = time.perf_counter()
+
+    def finish(self, artifacts: Sequence[str]) -> None:
+        """Finish, with the process going on."""
+        super().finish(artifacts)
+        self._signal(signal.SIGCONT)
+
+    def _signal(self, which: signal.Signals) -> None:
+        if self.pid is not None:
+            os.kill(self.pid, which)
