@@ -39,10 +39,15 @@ def tracking(blocks: int, steps: int, uri: str | None, overrides: tuple[str, ...
     with tempfile.TemporaryDirectory() as folder:
         words = ["profile=small", "memory=no_codes", f"paths.outputs={folder}", *length, *address, *overrides]
         experiment = build_experiment(composed(words))
-        follower = feed_of(experiment.tracking).process
+        feed = feed_of(experiment.tracking)
+        follower = feed.process
         run = PiecewiseRun(Path(folder) / "runs" / ("0" * 16), follower.pid if follower else None)
         with experiment.tracking.following(run):
             train_run(experiment, run, experiment.data.prepare(), None)
+        feed.close()
+        if follower is not None:
+            follower.kill()  # its folder goes
+            follower.wait()
     pieces = np.array(run.seconds[2 : 2 + blocks // 2 * 2]).reshape(-1, 2)
     ratios = pieces[:, 0] / pieces[:, 1]
     low, high = np.quantile(ratios, (0.25, 0.75))
