@@ -233,7 +233,8 @@ def test_every_experiment_trains_and_streams(home, name, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize(("error", "failure"), [
-    (TrainingDiverged("loss is nan"), "TrainingDiverged: loss is nan"), (OSError(28, "disk full"), "disk full"),
+    (TrainingDiverged("loss is nan"), "TrainingDiverged: loss is nan"),
+    (OSError(28, "disk full"), "disk full"),
     (InputError("data changed"), None), (Cancelled("by its plan"), None), (KeyboardInterrupt(), None),
 ])  # fmt: skip
 def test_a_failure_of_the_work_is_kept_with_the_run_and_an_interruption_is_not(
