@@ -16,7 +16,7 @@ from processes import finished
 from memmlp.common.files import write_json
 from memmlp.runs.notes import add_tags, remove_tags, set_note
 from memmlp.runs.run import Run
-from memmlp.tracking.mlflow_tracker import MLflow, allowed
+from memmlp.tracking.mlflow_tracker import MLflow, allowed, quiet
 from memmlp.tracking.sync import sync
 from memmlp.tracking.tracker import Session
 from memmlp.tracking.view import SweepFacts
@@ -56,8 +56,9 @@ def client_of(outputs: Path) -> Any:
 
 
 def shown(outputs: Path) -> list[Any]:
-    client = client_of(outputs)
-    return client.search_runs([client.get_experiment_by_name("memmlp").experiment_id])
+    with quiet():  # what SQLAlchemy says of MLflow's tables, when they are first used
+        client = client_of(outputs)
+        return client.search_runs([client.get_experiment_by_name("memmlp").experiment_id])
 
 
 def steps(outputs: Path, key: str) -> list[tuple[int, float]]:
