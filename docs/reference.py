@@ -146,13 +146,19 @@ def option_section(path: Path) -> Iterator[str]:
         yield said
     keys = [key for key in file_keys(path) if not key.name.split(".")[-1].startswith("_")]
     if "@package _global_" not in text:
-        keys = [key._replace(name=f"{group}.{key.name}") for key in keys]
+        keys = [key._replace(name=f"{package(text) or group}.{key.name}") for key in keys]
     if own := [key for key in keys if key.name.startswith(f"{group}.")]:
         yield keys_table(own, SCHEMAS.get(schema_name(text)), group)
     taken = [f"`{name}={option or 'null'}`" for name, option in overridden(text)]
     others = [f"`{key.name}={key.value}`" for key in keys if key not in own]
     if taken or others:
         yield f"Sets {', '.join([*taken, *others])}."
+
+
+def package(text: str) -> str | None:
+    """Where a file says that its keys stand; None where it leaves that to its folder."""
+    first = text.partition("\n")[0]
+    return first.removeprefix("# @package ").strip() if first.startswith("# @package ") else None
 
 
 def overridden(text: str) -> Iterator[tuple[str, str | None]]:

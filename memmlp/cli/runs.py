@@ -1,8 +1,8 @@
-"""`memmlp runs`: list, show and compare run folders."""
+"""`memmlp runs`: list, show, compare, tag, clean up and move run folders."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,49 +12,138 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from memmlp.cli.options import outputs_option
+from memmlp.cli.options import PATH, Finite, outputs_option
+from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
+    from memmlp.runs.garbage import Garbage
+    from memmlp.runs.query import Record
     from memmlp.runs.run import Run
 
 NEWEST = 20
 SHOWN = {
-    # the column's head -> the path of its number in results.json
-    "stream\ncm": ("stream", "rotation", "MPJPE"),
-    "window\ncm": ("window", "rotation", "MPJPE"),
-    "jitter": ("stream", "rotation", "Jitter"),
-    "ms": ("latency", "median_ms"),
+    # the column's head -> the key of its number
+    "stream\ncm": "stream.rotation.MPJPE",
+    "window\ncm": "window.rotation.MPJPE",
+    "jitter": "stream.rotation.Jitter",
+    "ms": "latency.median_ms",
 }
+ROOM, WIDTH = 66, 11  # characters of all other columns, and of one of what differs
 
 
 @click.group("runs")
 def runs() -> None:
-    """List, show and compare runs."""
+    """List, show, compare, tag, clean up and move runs."""
 
 
 @runs.command("list")
 @click.option("--all", "every", is_flag=True, help=f"List all runs, and not only the newest {NEWEST}.")
+@click.option(
+    "--where", help="List the runs that fulfil a condition, such as 'memory=gru and stream.MPJPE<6.3'."
+)
+@click.option("--sort", help="Sort by a key, such as stream.MPJPE; -KEY begins with the largest.")
+@click.option("--columns", help="Show these keys, separated by commas.  [default: config keys that differ]")
 @outputs_option
-def list_command(every: bool, outputs: Path) -> None:
+def list_command(
+    every: bool, where: str | None, sort: str | None, columns: str | None, outputs: Path
+) -> None:
     """List the runs, the newest first.
 
-    Shown are the MPJPE of the rotation branch in both modes, Jitter, and the latency of a frame.
+    Shown are what differs between their configs, the MPJPE of the rotation branch in both modes, Jitter, and
+    the latency of a frame. Keys are those of the config (`memory`, `optim.lr`), results (`stream.MPJPE`,
+    `window.position.Jitter`, `latency.median_ms`), and `id`, `kind`, `status`, `name`, `started`, `tag`,
+    `note`.
     """
     from memmlp.runs.lookup import list_runs
+    from memmlp.runs.query import parse
 
+    query = parse(where) if where else None
     found = list_runs(outputs)
     if not found:
         click.echo(f"no runs in {outputs / 'runs'}; memmlp demo makes the first")
         return
-    table = _table("run", "kind", "status", "age")
-    for column in SHOWN:
+    limit = len(found) if every or query or sort else NEWEST
+    records = {run.id: recorded(run) for run in found[:limit]}
+    fits = query.of(list(records.values())) if query else [True] * len(records)
+    listed = [run for run, fit in zip(found[:limit], fits, strict=True) if fit]
+    if sort:
+        listed = sorted_by(listed, records, sort)
+    keys = wanted(columns, records, listed)
+    fit = len(keys) if columns else max((_console().width - ROOM) // WIDTH, 1)
+    show_runs(listed, records, keys[:fit], {} if columns else SHOWN)
+    if keys[fit:]:
+        click.echo(f"they differ in {', '.join(keys[fit:])}, too: --columns shows it")
+    if len(found) > limit:
+        click.echo(f"{len(found) - limit} older ones: memmlp runs list --all")
+    elif query:
+        click.echo(f"{len(listed)} of {len(found)} runs")
+
+
+def recorded(run: Run) -> Record:
+    """Return what may be asked of a run; of one with a damaged file, its id and status alone."""
+    from memmlp.runs.query import record
+
+    try:
+        return record(run)
+    except InputError as error:
+        click.echo(f"memmlp: warning: {error}", err=True)
+        return {"id": run.id, "status": "damaged"}
+
+
+def sorted_by(listed: Sequence[Run], records: Mapping[str, Record], sort: str) -> list[Run]:
+    """Return the runs sorted by a key; those that have no such value come last."""
+    from memmlp.runs.query import check_key
+
+    key, down = sort.removeprefix("-"), sort.startswith("-")
+    check_key(key, records.values(), "--sort")
+    known = [run for run in listed if records[run.id].get(key) not in (None, "", ())]
+    values = [records[run.id][key] for run in known]
+    numbers = all(isinstance(value, int | float) for value in values)
+    ranked = sorted(
+        known, key=lambda run: records[run.id][key] if numbers else str(records[run.id][key]), reverse=down
+    )
+    return [*ranked, *(run for run in listed if run not in known)]
+
+
+def wanted(columns: str | None, records: Mapping[str, Record], listed: Sequence[Run]) -> list[str]:
+    """Return the keys to show: those asked for, or those of the config that differ among finished runs."""
+    from memmlp.runs.query import check_key, differing
+
+    if columns is not None:
+        keys = [key.strip() for key in columns.split(",") if key.strip()]
+        for key in keys:
+            check_key(key, records.values(), "--columns")
+        return keys
+    networks = [run for run in listed if records[run.id].get("kind") == "memmlp"]
+    return differing([run.config for run in networks]) if len(networks) > 1 else []
+
+
+def show_runs(
+    listed: Sequence[Run],
+    records: Mapping[str, Record],
+    keys: Sequence[str],
+    numbers: Mapping[str, str],
+) -> None:
+    """Print the runs as a table: with the values of some keys, and with some numbers under heads of ours."""
+    from memmlp.runs.query import shown
+
+    table = _table()
+    table.padding = (0, 0)
+    for column in ("run", "kind", "status", "age"):
+        table.add_column(column, no_wrap=True)
+    tags = any(records[run.id].get("tag") for run in listed)
+    for column in (*keys, *(["tags"] if tags else [])):
+        table.add_column(column, overflow="fold")
+    for column in numbers:
         table.add_column(column, justify="right", no_wrap=True)
-    for run in found if every else found[:NEWEST]:
-        numbers = (_number(run.results, path) for path in SHOWN.values())
-        table.add_row(run.id, run.manifest.get("kind", "-"), run.status, _age(run), *numbers)
+    for run in listed:
+        one = records[run.id]
+        cells = [shown(one[key]) if key in one else "-" for key in keys]
+        labels = [" ".join(one.get("tag", ()))] if tags else []
+        kind = str(one.get("kind") or "-")
+        values = (_cell(one.get(key)) for key in numbers.values())
+        table.add_row(run.id, kind, str(one["status"]), _age(run), *cells, *labels, *values)
     _console().print(table)
-    if len(found) > NEWEST and not every:
-        click.echo(f"{len(found) - NEWEST} older ones: memmlp runs list --all")
 
 
 @runs.command("show")
@@ -109,6 +198,119 @@ def diff_command(a: str, b: str, outputs: Path) -> None:
         _console().print(table)
 
 
+@runs.command("tag")
+@click.argument("run")
+@click.argument("tags", nargs=-1, required=True)
+@click.option("--remove", is_flag=True, help="Take the tags away instead.")
+@outputs_option
+def tag_command(run: str, tags: tuple[str, ...], remove: bool, outputs: Path) -> None:
+    """Give a run tags.
+
+    They lie in its folder, are found by `memmlp runs list --where tag=WORD`, and are no part of what the run
+    is. `memmlp runs gc` spares runs with tags.
+    """
+    from memmlp.runs.lookup import find_run
+    from memmlp.runs.notes import add_tags, remove_tags
+
+    found = find_run(outputs, run)
+    notes = remove_tags(found, tags) if remove else add_tags(found, tags)
+    click.echo(f"{found.id}: {', '.join(notes.tags) or 'no tags'}")
+
+
+@runs.command("note")
+@click.argument("run")
+@click.argument("text", required=False)
+@outputs_option
+def note_command(run: str, text: str | None, outputs: Path) -> None:
+    """Replace a run's note by TEXT, or print it.
+
+    An empty TEXT removes it.
+    """
+    from memmlp.runs.lookup import find_run
+    from memmlp.runs.notes import read_notes, set_note
+
+    found = find_run(outputs, run)
+    notes = read_notes(found) if text is None else set_note(found, text)
+    click.echo(f"{found.id}: {notes.note or 'no note'}")
+
+
+@runs.command("gc")
+@click.option(
+    "--only",
+    "kinds",
+    multiple=True,
+    type=click.Choice(["failed", "old", "orphaned"]),
+    help="Delete these alone; may be repeated.  [default: all three]",
+)
+@click.option("--yes", is_flag=True, help="Delete them. Without it they are only shown.")
+@outputs_option
+def gc_command(kinds: tuple[str, ...], yes: bool, outputs: Path) -> None:
+    """Show, or delete, runs that nobody needs.
+
+    These have failed, are of an older recipe, or are orphaned: no longer in a sweep, a VQ-VAE that no run
+    uses, a folder in which nothing began. Runs with a tag or a note, runs that are going on, and what other
+    runs build upon stay.
+    """
+    from memmlp.runs.garbage import REASONS, delete, garbage
+
+    found = garbage(outputs, kinds or REASONS)
+    if not found:
+        click.echo("nothing to delete")
+        return
+    _console().print(_garbage_table(found))
+    if not yes:
+        size = sum(one.size for one in found) / 1e6
+        click.echo(f"{len(found)} runs, {size:.1f} MB; delete them with --yes")
+        return
+    gone = [one for one in found if delete(one)]
+    click.echo(f"deleted {len(gone)} runs, {sum(one.size for one in gone) / 1e6:.1f} MB")
+    for one in found:
+        if one not in gone:
+            click.echo(f"run {one.run.id} stays: somebody is at it, or gave it a tag or a note", err=True)
+
+
+def _garbage_table(found: Sequence[Garbage]) -> Table:
+    table = _table("run", "why", "reason", "age", "MB")
+    for one in found:
+        table.add_row(one.run.id, one.kind, one.reason, _age(one.run), f"{one.size / 1e6:.1f}")
+    return table
+
+
+@runs.command("export")
+@click.argument("run")
+@click.option("--out", type=PATH, help="The file.  [default: RUN.memmlp.zip in this folder]")
+@outputs_option
+def export_command(run: str, out: Path | None, outputs: Path) -> None:
+    """Write a finished run to one file, which another machine can import.
+
+    It has the run's config, record, weights, results, tags and note, and no checkpoint.
+    """
+    from memmlp.runs.archive import export_run
+    from memmlp.runs.lookup import find_run
+
+    found = find_run(outputs, run)
+    path = out or Path(f"{found.id}.memmlp.zip")
+    digest = export_run(found, path)
+    click.echo(f"{path}  {path.stat().st_size / 1e6:.1f} MB")
+    click.echo(f"sha256 {digest}")
+
+
+@runs.command("import")
+@click.argument("path", type=PATH)
+@click.option("--sha256", help="The digest that `memmlp runs export` printed.  [default: any]")
+@click.option("--max-gb", type=Finite(0, min_open=True), default=4.0, show_default=True, help="Size at most.")
+@outputs_option
+def import_command(path: Path, sha256: str | None, max_gb: float, outputs: Path) -> None:
+    """Take a run from a file that `memmlp runs export` wrote.
+
+    It is refused if a digest in it does not hold. With --sha256 it is the very file that was exported.
+    """
+    from memmlp.runs.archive import import_run
+
+    run, new = import_run(path, outputs, sha256, int(max_gb * 1e9))
+    click.echo(f"run {run.id}: {'imported' if new else 'was there already'}")
+
+
 def _console() -> Console:
     return Console(highlight=False, markup=False)
 
@@ -137,11 +339,8 @@ def _text(value: Any) -> str:
     return "-" if value is None else str(value)
 
 
-def _number(results: Mapping[str, Any], path: tuple[str, ...]) -> str:
-    """Return the number at a path of nested results as text; "-" where there is none."""
-    value: Any = results
-    for key in path:
-        value = value.get(key) if isinstance(value, Mapping) else None
+def _cell(value: Any) -> str:
+    """Return a number as text; "-" where there is none."""
     return f"{value:.2f}" if isinstance(value, int | float) else "-"
 
 

@@ -107,33 +107,18 @@ def reset(plan: Plan) -> None:
 
 
 def bring_to_end(chosen: Sweep, plan: Plan, workers: Workers) -> None:
-    """Start workers, wait until they have done the plan's runs, and show these as one group in tracking."""
+    """Start workers, and wait until they have done the plan's runs."""
     from memmlp.config.plan_sweep import sweep_folder
     from memmlp.sweep.board import Board
     from memmlp.sweep.controller import oversee
 
     _, fleet = hire(sweep_folder(chosen, plan.outputs), plan, workers, devices(plan))
     oversee(plan, fleet, Board())
-    show_in_mlflow(plan)
 
 
 def devices(plan: Plan) -> set[str]:
     """Return the values of the key `device` of the plan's runs."""
     return {task.config["device"] for task in plan.tasks}
-
-
-def show_in_mlflow(plan: Plan) -> None:
-    """Show the plan's finished runs as one group, where runs are tracked."""
-    from omegaconf import OmegaConf
-
-    from memmlp.config.build import build_tracking
-    from memmlp.runs.mlflow_tracking import harmless
-
-    labels = {entry.id: entry.label for entry in plan.entries if plan.complete(entry)}
-    if labels:
-        config = next(task.config for task in plan.tasks if task.id in labels)
-        with harmless(f"sweep {plan.name}"):
-            build_tracking(OmegaConf.create(dict(config))).group(plan.name, labels)
 
 
 def show(chosen: Sweep, plan: Plan) -> None:
@@ -185,7 +170,8 @@ def report(shown: Shown, words: Sequence[str], chosen: Sweep) -> None:
     """
     from memmlp.cli.rounds import closing
     from memmlp.cli.table import SHOWN_MODES, of_plan, on_screen
-    from memmlp.config.plan_sweep import orphans
+    from memmlp.cli.track import show_in_trackers
+    from memmlp.config.plan_sweep import orphans, sweep_folder
     from memmlp.tables.measured_run import load
 
     plan, known = shown.plan, shown.rounds
@@ -193,6 +179,7 @@ def report(shown: Shown, words: Sequence[str], chosen: Sweep) -> None:
     failed = [task for task in plan.tasks if states[task.key] in ("failed", "blocked")]
     command = " ".join(["memmlp sweep", *words])
     found = of_plan(shown, SHOWN_MODES["both"], command, load)
+    show_in_trackers(plan, sweep_folder(chosen, plan.outputs), found.table)
     on_screen([found.table])
     for line in closing(known, chosen, found.runs) if known else ():
         click.echo(line)

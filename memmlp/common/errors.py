@@ -1,5 +1,6 @@
 """The errors that the command line turns into one line and an exit code."""
 
+import errno
 import unicodedata
 
 BREAKING = ("Cc", "Cs", "Zl", "Zp")  # Unicode's controls, surrogates, separators of lines and of paragraphs
@@ -33,3 +34,8 @@ class LeaseLost(RuntimeError):
 
     What was to be written is not written. The message is one line; the exit code is 1.
     """
+
+
+def of_the_disk(error: Exception) -> bool:
+    """Return whether an error says that the disk is full or read-only, which is no run's fault."""
+    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS)

@@ -19,6 +19,7 @@ from memmlp.common.errors import InputError
 from memmlp.config.build_motion import build_motion, shares
 from memmlp.config.compose import composed
 from memmlp.config.instantiate import built
+from memmlp.config.readable_name import readable_name
 from memmlp.config.schema import check, restored
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
@@ -39,8 +40,8 @@ from memmlp.pipeline.devices import device
 from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.identity import flatten
 from memmlp.runs.lookup import check_trained
-from memmlp.runs.mlflow_tracking import Tracking
 from memmlp.runs.run import Run
+from memmlp.tracking.feed import Tracking
 from memmlp.training.losses import Loss, MotionLoss
 from memmlp.training.network import NetworkTraining
 from memmlp.training.optim import Optim, vqvae_optim
@@ -88,6 +89,7 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
         deployment=build_deployment(cfg),
         predictions=Path(cfg.save_predictions) if cfg.save_predictions else None,
         tracking=build_tracking(cfg),
+        called=readable_name,
     )
 
 
@@ -101,9 +103,9 @@ def untrained(overrides: Sequence[str]) -> WindowModel:
 
 
 def build_tracking(cfg: DictConfig) -> Tracking:
-    """Build what shows the config's runs elsewhere, in MLflow or nowhere."""
-    folder = {"outputs": Path(cfg.paths.outputs)} if "uri" in cfg.tracking else {}
-    return built(cfg.tracking, **folder)
+    """Build what shows the config's runs elsewhere: any number of trackers."""
+    outputs = Path(cfg.paths.outputs)
+    return Tracking(tuple(built(node, outputs=outputs) for node in cfg.tracking.values()), outputs)
 
 
 def build_architecture(cfg: DictConfig) -> Architecture:

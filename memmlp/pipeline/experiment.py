@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,14 @@ from memmlp.evaluation.evaluation import Evaluation
 from memmlp.motion.preparing.source import MotionSource
 from memmlp.networks.architecture import VQVAE_SETTINGS, Architecture
 from memmlp.runs.identity import Identity, deployment_id, evaluation_id
-from memmlp.runs.mlflow_tracking import Tracking
+from memmlp.tracking.feed import Tracking
 from memmlp.training.network import NetworkTraining
 from memmlp.training.vqvae import VQVAETraining
+
+
+def unnamed(kind: str, config: Mapping[str, Any]) -> str:
+    """Return the kind alone as a run's name."""
+    return kind
 
 
 @dataclass(frozen=True)
@@ -34,7 +40,8 @@ class Experiment:
         evaluation: how it is evaluated.
         deployment: how it is exported and timed; None where it is not to be.
         predictions: folder for predictions of the test clips; None for no such files.
-        tracking: shows finished runs elsewhere.
+        tracking: shows runs elsewhere.
+        called: makes a name that people can read, of the config of a run and the word for its kind.
     """
 
     config: dict[str, Any]
@@ -49,6 +56,7 @@ class Experiment:
     deployment: Deployment | None
     predictions: Path | None
     tracking: Tracking
+    called: Callable[[str, Mapping[str, Any]], str] = unnamed
 
     @property
     def evaluations(self) -> dict[str, str]:

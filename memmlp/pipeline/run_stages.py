@@ -6,7 +6,9 @@ Each stage has an identity (memmlp.runs.identity): it is found if it was made be
 from __future__ import annotations
 
 import contextlib
+import getpass
 import time
+import traceback
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +16,7 @@ from typing import Any
 import torch
 
 from memmlp.common import parallel
+from memmlp.common.errors import LeaseLost, of_the_disk
 from memmlp.common.files import write_json
 from memmlp.common.progress import stage_begins
 from memmlp.evaluation.evaluation import picture
@@ -23,8 +26,8 @@ from memmlp.pipeline.devices import described
 from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.evaluation_file import read_report, write_report
 from memmlp.runs.identity import Identity, deployment_settings, evaluation_recipes, evaluation_settings
-from memmlp.runs.mlflow_tracking import project_safely
 from memmlp.runs.run import Run
+from memmlp.tracking.feed import Tracking
 from memmlp.training.loop import Watch, unwatched
 
 
@@ -58,16 +61,15 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
         if experiment.force:
             run.reset()
         made = []
-        if not run.done:
-            train_run(experiment, run, data, codes, watch)
-            made.append("training")
-        made += finish(experiment, run, data)
+        with shown(experiment, run):
+            if not run.done:
+                train_run(experiment, run, data, codes, watch)
+                made.append("training")
+            made += finish(experiment, run, data)
         if experiment.predictions is not None:
             model = experiment.architecture.load(run.weights()).to(experiment.device)
             test = data.open("test").to(experiment.device)
             save_predictions(experiment.evaluation, model, test, experiment.predictions)
-    if made:
-        project_safely(experiment.tracking, run)
     return Outcome(run, tuple(made), results_of(experiment, run))
 
 
@@ -85,12 +87,10 @@ def complete_stages(
     Returns:
         The results, and the names of the stages that were made.
     """
-    with run.lock():
+    with run.lock(), shown(experiment, run, again):
         if again:
             evaluate_run(experiment, run, data, experiment.evaluation.modes)
         made = [*(["evaluation"] if again else []), *finish(experiment, run, data)]
-    if made:
-        project_safely(experiment.tracking, run)
     return results_of(experiment, run), made
 
 
@@ -141,16 +141,41 @@ def vqvae_run(experiment: Experiment, data: Prepared) -> Run:
     with run.lock():
         if run.done:
             return run
-        begin(experiment, run, identity, experiment.vqvae.config)
-        run.write_manifest({"partial": partial_words(experiment, data)})
-        stage_begins(f"VQ-VAE: train it, whose code-vectors the network's memory uses (run {run.id})")
-        parallel.of_first("vqvae")
-        with timed(run, "train"):
-            errors = experiment.vqvae.train(experiment.architecture, data, run, experiment.device)
-        write_json(run.results_path, {"val": errors})
-        run.finish(("model.safetensors", "results.json"))
-    project_safely(experiment.tracking, run)
+        with shown(experiment, run):
+            train_vqvae(experiment, run, data, identity)
     return run
+
+
+def train_vqvae(experiment: Experiment, run: Run, data: Prepared, identity: Identity) -> None:
+    """Train the VQ-VAE of a run, and mark the run as done."""
+    begin(experiment, run, identity, experiment.vqvae.config)
+    run.write_manifest({"partial": partial_words(experiment, data)})
+    stage_begins(f"VQ-VAE: train it, whose code-vectors the network's memory uses (run {run.id})")
+    parallel.of_first("vqvae")
+    with timed(run, "train"):
+        errors = experiment.vqvae.train(experiment.architecture, data, run, experiment.device)
+    write_json(run.results_path, {"val": errors})
+    run.finish(("model.safetensors", "results.json"))
+
+
+@contextlib.contextmanager
+def shown(experiment: Experiment, run: Run, again: bool = False) -> Iterator[None]:
+    """Show work on a run elsewhere while it goes on, if there is any; its failure is kept with the run.
+
+    Only failures of the work itself count: bad input, interruptions, a full disk and the loss of the run to
+    another process leave it as it is.
+    """
+    missing = again or not run.done or not all(map(run.has, experiment.stages))
+    tracking = experiment.tracking if missing else Tracking((), experiment.outputs)
+    with tracking.following(run):
+        try:
+            yield
+        except LeaseLost:
+            raise
+        except (RuntimeError, OSError) as error:
+            if not of_the_disk(error):
+                run.fail(f"{type(error).__name__}: {error}", traceback.format_exc())
+            raise
 
 
 def train_run(
@@ -208,7 +233,16 @@ def begin(experiment: Experiment, run: Run, identity: Identity, config: dict[str
     above = identity.upstream.id if identity.upstream else None
     facts = {"recipes": identity.recipes, "what": identity.what, **machine(experiment)}
     facts["processes"] = parallel.size()
+    counting = {**(identity.upstream.config if identity.upstream else {}), **identity.config}
+    facts |= {"name": experiment.called(identity.kind, counting), "user": user()}
     run.begin(identity.kind, config, data=identity.data, upstream=above, **facts)
+
+
+def user() -> str | None:
+    """Return the name of the user, where the system knows one."""
+    with contextlib.suppress(KeyError, OSError, ImportError):
+        return getpass.getuser()
+    return None
 
 
 def partial_words(experiment: Experiment, data: Prepared) -> str | None:

@@ -17,7 +17,18 @@ from typing import Any
 import memmlp
 
 PACKAGE = Path(memmlp.__file__).parent
-NOT_NUMBERS = ("cli", "config", "live", "render", "report", "search", "statistics", "sweep", "tables")
+NOT_NUMBERS = (
+    "cli",
+    "config",
+    "live",
+    "render",
+    "report",
+    "search",
+    "statistics",
+    "sweep",
+    "tables",
+    "tracking",
+)
 """Folders of the package whose code no result of a run comes from."""
 WIRING = ("config/build.py", "config/instantiate.py")  # they decide what reaches the constructors
 PATCH = 1_000_000  # at most so many characters of changes are kept with a run

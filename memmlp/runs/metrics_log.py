@@ -31,6 +31,13 @@ class Metrics(NamedTuple):
     time: float
 
 
+def parsed(line: bytes) -> Metrics:
+    """Return the record in a line. Raises ValueError, KeyError or TypeError where it holds none."""
+    entry = json.loads(line)
+    values = {key: float(value) for key, value in entry["values"].items()}
+    return Metrics(entry["step"], entry["phase"], values, entry["time"])
+
+
 class MetricsLog:
     """The file `metrics.jsonl` of a run."""
 
@@ -80,9 +87,7 @@ class MetricsLog:
         entries: dict[tuple[str, int], Metrics] = {}
         for number, line in enumerate(self.path.read_bytes().split(b"\n")[:-1], 1):
             try:
-                entry = json.loads(line)
-                values = {key: float(value) for key, value in entry["values"].items()}
-                metrics = Metrics(entry["step"], entry["phase"], values, entry["time"])
+                metrics = parsed(line)
             except (ValueError, KeyError, TypeError):
                 raise InputError(f"{self.path}: line {number} is no line of a metrics log") from None
             entries[metrics.phase, metrics.step] = metrics

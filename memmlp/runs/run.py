@@ -54,6 +54,7 @@ class Run:
         "model.safetensors",
         "results.json",
         "metrics.jsonl",
+        "system.jsonl",
         "poses.png",
         "FAILED",
         "code.patch",

@@ -7,14 +7,13 @@ takes its run over from the last checkpoint.
 
 from __future__ import annotations
 
-import errno
 import sys
 import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
+from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged, of_the_disk
 from memmlp.common.files import read_json, write_json
 from memmlp.common.liveness import Changes, lives, myself
 from memmlp.runs.run import Run
@@ -23,7 +22,6 @@ from memmlp.sweep.plan import Plan, RunTask
 PAUSE = 0.5  # seconds before another look at a plan whose tasks others are at
 ABANDONED = 600.0  # seconds without a sign of life after which an open plan's controller counts as dead
 DEATHS = 10  # workers that died at the same step of a run before it counts as failed
-FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}  # errors of a disk, which are no run's fault
 
 _changes = Changes()
 
@@ -110,7 +108,7 @@ def _perform(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
     except (InputError, TrainingDiverged) as error:
         run.fail(str(error))
     except Exception as error:
-        if isinstance(error, OSError) and error.errno in FULL:
+        if of_the_disk(error):
             raise
         run.fail(f"{type(error).__name__}: {error}", traceback.format_exc())
 

@@ -99,3 +99,70 @@ def test_no_difference(memmlp: Memmlp, outputs: Path):
 
 def test_an_unknown_run_is_one_line(memmlp: Memmlp, outputs: Path):
     assert one_line(memmlp("runs", "diff", "a", "zz"), "run 'zz'")
+
+
+def test_list_shows_what_differs_as_far_as_there_is_room(
+    memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config = {"seed": 1, "memory": {"layers": [2]}}
+    Run.of(outputs, "d" * 16).begin("memmlp", config, data="d", upstream=None)
+    narrow = memmlp("runs", "list").out
+    assert "seed" in narrow.partition("─")[0]
+    assert "differ in memory.layers, too: --columns shows it" in narrow
+    monkeypatch.setenv("COLUMNS", "120")
+    wide = memmlp("runs", "list").out
+    assert "memory.layers" in wide.partition("─")[0]
+    assert "[2]" in wide
+    assert "too:" not in wide
+
+
+def test_where_sort_and_columns(memmlp: Memmlp, outputs: Path):
+    memmlp("runs", "tag", A, "good")
+    where = ["--where", "stream.MPJPE>1 and status=done"]
+    ran = memmlp("runs", "list", *where, "--sort", "-seed", "--columns", "seed")
+    rows = [line.split() for line in ran.out.splitlines() if line.strip()[:1] in set("abc")]
+    assert [(row[0], row[-1]) for row in rows] == [(B, "1"), (A, "good")]
+    assert "2 of 3 runs" in ran.out
+    assert one_line(memmlp("runs", "list", "--where", "memry.layers=2"), "memory.layers")
+    assert one_line(memmlp("runs", "list", "--sort", "sed"), "--sort", "did you mean seed")
+    assert one_line(memmlp("runs", "list", "--columns", "seed,sed"), "--columns")
+    assert one_line(memmlp("runs", "list", "--where", "seed="), "it ends where a value")
+
+
+def test_a_damaged_run_is_listed_and_named(memmlp: Memmlp, outputs: Path):
+    (outputs / "runs" / A / "config.yaml").write_text("{")
+    ran = memmlp("runs", "list")
+    assert "damaged" in ran.out
+    assert "cannot be read" in ran.err
+
+
+def test_tag_and_note(memmlp: Memmlp, outputs: Path):
+    assert memmlp("runs", "tag", A, "good", "odd").out == f"{A}: good, odd\n"
+    assert memmlp("runs", "tag", A, "odd", "--remove").out == f"{A}: good\n"
+    assert memmlp("runs", "note", A).out == f"{A}: no note\n"
+    assert memmlp("runs", "note", A, "a note").out == f"{A}: a note\n"
+    assert memmlp("runs", "note", A).out == f"{A}: a note\n"
+    assert one_line(memmlp("runs", "tag", A, "two words"), "allowed are")
+
+
+def test_gc_shows_first_and_deletes_on_yes(memmlp: Memmlp, outputs: Path):
+    run = Run.of(outputs, C)
+    assert memmlp("runs", "gc").out == "nothing to delete\n"
+    run.fail("loss is nan")
+    shown = memmlp("runs", "gc")
+    assert "loss is nan" in shown.out
+    assert "1 runs" in shown.out
+    assert run.folder.exists()
+    assert memmlp("runs", "gc", "--only", "old").out == "nothing to delete\n"
+    assert "deleted 1 runs" in memmlp("runs", "gc", "--yes").out
+    assert not run.folder.exists()
+    assert Run.of(outputs, A).folder.exists()
+
+
+def test_export_and_import(memmlp: Memmlp, outputs: Path):
+    said = memmlp("runs", "export", A, "--out", "run.zip").out
+    there = ["--outputs", "there", "--sha256", said.split()[-1]]
+    assert memmlp("runs", "import", "run.zip", *there).out == f"run {A}: imported\n"
+    assert one_line(memmlp("runs", "import", "run.zip", "--sha256", "0" * 64), "SHA-256")
+    assert one_line(memmlp("runs", "import", "none.zip"), "no such file")
+    assert one_line(memmlp("runs", "export", C), "allowed is a finished run")

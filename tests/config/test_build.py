@@ -246,7 +246,7 @@ GROUPS: dict[str, list[str]] = {
     "frame.coordinates": ["heading", "head_relative", "world"],
     "evaluation.ik": ["off", "lbfgs"],
     "vqvae.codebook": ["ema", "gradient"],
-    "tracking": ["mlflow", "none"],
+    "tracking": ["mlflow", "none", "tensorboard", "wandb", "all"],
 }
 OPTIONS = [f"{group}={option}" for group, options in GROUPS.items() for option in options]
 PAIRS = [(a, b) for a, b in combinations(OPTIONS, 2) if a.split("=")[0] != b.split("=")[0]]

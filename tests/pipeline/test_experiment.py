@@ -24,10 +24,11 @@ from memmlp.pipeline.experiment import Experiment
 from memmlp.pipeline.run_stages import vqvae_run
 from memmlp.runs.identity import NEUTRAL, Identity, deployment_id, evaluation_id, flatten
 from memmlp.runs.run import Run
+from memmlp.tracking.feed import Tracking
 
 BASE = [
     "profile=tiny", "data=mocap", "data.root=clips", "data.split.groups=[]", "memory.shift=frame",
-    "tracking=mlflow", "threads=1", "optim.steps=4", "vqvae.steps=3",
+    "tracking=all", "threads=1", "optim.steps=4", "vqvae.steps=3",
     "optim.batch=4", "model.width=8", "model.frames=5", "model.depth=4", "memory.layers=[2]", "vqvae.width=8",
     "memory.width=4", "predictor.depth=1", "optim.checkpoint_every=9", "optim.validate_every=9",
     "evaluation.ik=lbfgs", "evaluation.ik_iterations=2", "optim.schedule=step", "optim.drop_at=0.5",
@@ -55,7 +56,7 @@ CHANGES: dict[str, str] = {
     "evaluation.modes": "[stream]", "evaluation.batch": "1", "evaluation.ik": "off",
     "evaluation.ik_iterations": "3",
     "export.graph": "naive", "export.precision": "int8", "export.latency_steps": "250",
-    "tracking.uri": "sqlite:///other.db",
+    "tracking.mlflow.uri": "sqlite:///other.db", "tracking.wandb.project": "other",
 }  # fmt: skip
 
 UNTRIED = {
@@ -121,7 +122,7 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
     experiment = replace(build_experiment(composed([*BASE, *overrides])), outputs=folder)
     data = experiment.data.prepare()
     identity = experiment.identity(data.digest)
-    codes = vqvae_run(replace(experiment, tracking=Silent()), data).model
+    codes = vqvae_run(replace(experiment, tracking=Tracking((), folder)), data).model
     run = Run(folder / "run")
     run.folder.mkdir(parents=True)
     model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)
@@ -142,13 +143,6 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
             "deployment": digest(deployed(experiment, model, short)),
         },
     )
-
-
-class Silent:
-    """Tracking that shows nothing."""
-
-    def project(self, run: Run) -> None:
-        """Nothing."""
 
 
 def deployed(experiment: Experiment, model: Any, clip: MotionDataset) -> list[Any]:
@@ -196,7 +190,8 @@ def test_identity_moves_exactly_where_a_result_moves(base: Outcome, home: Path, 
 
 NOWHERE = {
     "force", "save_predictions", "data.name", "data.strict", "optim.checkpoint_every", "optim.log_every",
-    "optim.validate_every", "evaluation.modes", "evaluation.batch", "tracking.uri",
+    "optim.validate_every", "evaluation.modes", "evaluation.batch", "tracking.mlflow.uri",
+    "tracking.wandb.project",
 }  # fmt: skip
 """Keys that change no result; what they do has tests of its own."""
 

@@ -4,6 +4,8 @@ import json
 import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import onnx
@@ -15,17 +17,19 @@ from command_line import run as command
 from conftest import INT8, one_line
 from PIL import Image
 
-from memmlp.common.errors import InputError
+from memmlp.common.errors import InputError, TrainingDiverged
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.config.packaged import packaged
 from memmlp.live.stream import Stream
 from memmlp.motion.dataset import MotionDataset
-from memmlp.pipeline.run_stages import vqvae_run
+from memmlp.pipeline.run_stages import shown, vqvae_run
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.recipes import RECIPES
 from memmlp.runs.run import Run
+from memmlp.sweep.worker import Cancelled
 from memmlp.tables.measured_run import load
+from memmlp.tracking.feed import Tracking
 
 
 def motion_run(folder: Path) -> Run:
@@ -226,3 +230,20 @@ def test_every_experiment_trains_and_streams(home, name, monkeypatch: pytest.Mon
     assert all(np.isfinite(value) for value in values.values())
     assert len(data.open("test").names) > 0
     assert torch.isfinite(model.stem.weight).all()
+
+
+@pytest.mark.parametrize(("error", "failure"), [
+    (TrainingDiverged("loss is nan"), "TrainingDiverged: loss is nan"),
+    (OSError(28, "disk full"), "disk full"),
+    (InputError("data changed"), None), (Cancelled("by its plan"), None), (KeyboardInterrupt(), None),
+])  # fmt: skip
+def test_a_failure_of_the_work_is_kept_with_the_run_and_an_interruption_is_not(
+    tmp_path: Path, error: BaseException, failure: str | None
+):
+    run = Run.of(tmp_path, "0" * 16)
+    run.begin("memmlp", {}, data="d", upstream=None)
+    experiment: Any = SimpleNamespace(tracking=Tracking((), tmp_path), stages=(), outputs=tmp_path)
+    with pytest.raises(type(error)), shown(experiment, run):
+        raise error
+    assert (run.failure is None) == (failure is None)
+    assert (failure or "") in (run.failure or "")

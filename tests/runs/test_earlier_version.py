@@ -25,8 +25,8 @@ from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
 from memmlp.tables.measured_run import load
 
-CLASSES = {"memmlp.runs.mlflow_tracking.NoTracking": "memmlp.runs.tracking.NoTracker"}
-"""By today's path that of 0.1; of other classes the rooms alone were others."""
+TRACKER = {"name": "none", "_target_": "memmlp.runs.tracking.NoTracker"}
+"""The group of 0.1, which had a single tracker."""
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def earlier(home: Path) -> tuple[Path, Run]:
 
 def _as_it_was(run: Run) -> None:
     """Give a run's files the names of version 0.1."""
-    config = {"tracker" if key == "tracking" else key: value for key, value in run.config.items()}
+    config = {key: value for key, value in run.config.items() if key != "tracking"} | {"tracker": TRACKER}
     run.config_path.write_text(yaml.safe_dump(_mapped(config, _earlier_class), sort_keys=False))
     for path in (run.model, run.checkpoint):
         _rename_tensors(path)
@@ -62,7 +62,7 @@ def _mapped(tree: Any, change: Callable[[str, Any], Any]) -> Any:
 def _earlier_class(key: str, value: Any) -> Any:
     if key != "_target_":
         return value
-    return CLASSES.get(value) or f"memmlp.core.{value.rsplit('.', 1)[-1]}"
+    return value if value == TRACKER[key] else f"memmlp.core.{value.rsplit('.', 1)[-1]}"
 
 
 def _rename_tensors(path: Path) -> None:

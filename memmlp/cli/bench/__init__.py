@@ -10,6 +10,7 @@ from memmlp.cli.bench.live_frame import avatar
 from memmlp.cli.bench.prepare_data import prepare
 from memmlp.cli.bench.soak import soak
 from memmlp.cli.bench.stream_evaluation import stream
+from memmlp.cli.bench.tracking import tracking
 from memmlp.cli.bench.verdict_simulation import calibration
 
 
@@ -18,5 +19,5 @@ def bench() -> None:
     """Measure this machine: speed as rates and as ratios within one run, sweeps under kills, verdicts."""
 
 
-for command in (prepare, stream, latency, avatar, soak, chaos, chaos_tune, calibration):
+for command in (prepare, stream, latency, avatar, soak, tracking, chaos, chaos_tune, calibration):
     bench.add_command(command)

@@ -88,7 +88,7 @@ def _show(value: Any) -> str:
     return str(list(value)) if OmegaConf.is_list(value) else str(value)
 
 
-SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "tracking")
+SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand")
 
 
 def _check_names(cfg: DictConfig) -> None:
@@ -98,6 +98,9 @@ def _check_names(cfg: DictConfig) -> None:
         path = node.get("_target_") if node is not None else None
         if path and not path.startswith("memmlp.") and f"{slot}_{node.name}" in SCHEMAS:
             raise InputError(f"{slot}.name={node.name}: allowed for {path} is a name of its own")
+    for name, node in cfg.tracking.items():
+        if node.name != name:
+            raise InputError(f"tracking.{name}.name={node.name}: allowed is {name}, the tracker's key")
 
 
 def _check_combinations(cfg: DictConfig) -> None:

@@ -137,24 +137,31 @@ class ExportConfig:
 
 
 @dataclass
-class TrackingConfig:
-    """Where runs are shown beside their folders (conf/tracking)."""
+class TrackerConfig:
+    """Where runs are shown beside their folders (conf/tracking), by the name of the tracker."""
 
     name: str = key(Text())
     _target_: str = MISSING
 
 
 @dataclass
-class MLflowTrackingConfig(TrackingConfig):
+class MLflowConfig(TrackerConfig):
     name: str = called("mlflow")
-    _target_: str = target("memmlp.runs.mlflow_tracking.MLflowTracking")
+    _target_: str = target("memmlp.tracking.mlflow_tracker.MLflow")
     uri: Optional[str] = key()
 
 
 @dataclass
-class NoTrackingConfig(TrackingConfig):
-    name: str = called("none")
-    _target_: str = target("memmlp.runs.mlflow_tracking.NoTracking")
+class TensorBoardConfig(TrackerConfig):
+    name: str = called("tensorboard")
+    _target_: str = target("memmlp.tracking.tensorboard_tracker.TensorBoard")
+
+
+@dataclass
+class WandBConfig(TrackerConfig):
+    name: str = called("wandb")
+    _target_: str = target("memmlp.tracking.wandb_tracker.WandB")
+    project: str = key(Text())
 
 
 @dataclass
@@ -180,7 +187,7 @@ class Config:
     optim: OptimConfig = field(default_factory=OptimConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     export: ExportConfig = field(default_factory=ExportConfig)
-    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    tracking: dict[str, TrackerConfig] = field(default_factory=dict)
 
 
 SCHEMAS: dict[str, type] = {
@@ -219,8 +226,9 @@ SCHEMAS: dict[str, type] = {
     "optim": OptimConfig,
     "evaluation": EvaluationConfig,
     "export": ExportConfig,
-    "tracking_mlflow": MLflowTrackingConfig,
-    "tracking_none": NoTrackingConfig,
+    "tracking_mlflow": MLflowConfig,
+    "tracking_tensorboard": TensorBoardConfig,
+    "tracking_wandb": WandBConfig,
 }
 
 
@@ -238,7 +246,6 @@ GROUPS = {
     "optim": OptimConfig,
     "evaluation": EvaluationConfig,
     "export": ExportConfig,
-    "tracking": TrackingConfig,
 }
 DATA = {"seeded": SeededDataConfig, "lists": ListDataConfig, "subsets": SubsetDataConfig}
 
@@ -265,12 +272,26 @@ def _restored(group: str, content: Mapping[str, Any]) -> Any:
 
     A component that is not part of this package keeps the path of its class.
     """
+    if group == "tracking":
+        return _trackers(content)
     if group == "data":
         schema = SynthDataConfig if content["synth"] else DATA[content["split"]["name"]]
         return OmegaConf.merge(OmegaConf.structured(schema), _bare(content))
     option = SCHEMAS.get(f"{group}_{content.get('name')}")
     own = _bare(content) if option else dict(content)
     return OmegaConf.merge(OmegaConf.structured(option or GROUPS[group]), own)
+
+
+def _trackers(content: Mapping[str, Any]) -> Any:
+    """Return the trackers as typed configs. Up to version 0.2 there was a single one, itself the group."""
+    every = {str(content["name"]): content} if "name" in content else content
+    return {name: _restored_tracker(name, node) for name, node in every.items() if name != "none"}
+
+
+def _restored_tracker(name: str, content: Mapping[str, Any]) -> Any:
+    option = SCHEMAS.get(f"tracking_{name}")
+    own = _bare(content) if option else dict(content)
+    return OmegaConf.merge(OmegaConf.structured(option or TrackerConfig), own)
 
 
 def _bare(content: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,112 @@
+"""`memmlp track` and `memmlp mlflow`: run folders shown in MLflow, TensorBoard and W&B."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from memmlp.cli.options import outputs_option
+from memmlp.common.errors import InputError
+
+if TYPE_CHECKING:
+    from memmlp.sweep.plan import Plan
+    from memmlp.tables.table import Table
+    from memmlp.tracking.tracker import Tracker
+
+TRACKERS = ("mlflow", "tensorboard", "wandb")
+
+
+@click.group("track")
+def track() -> None:
+    """Fill in what MLflow, TensorBoard or W&B lack of runs."""
+
+
+@track.command("sync")
+@click.option(
+    "--tracker",
+    "names",
+    multiple=True,
+    type=click.Choice(TRACKERS),
+    help="Which to bring up to date; may be repeated.  [default: mlflow]",
+)
+@click.option(
+    "--uri",
+    default=None,
+    help="Address of MLflow's store.  [default: MLFLOW_TRACKING_URI, or else sqlite in OUTPUTS]",
+)
+@click.option("--project", default="memmlp", show_default=True, help="W&B's project.")
+@click.option("--full", is_flag=True, help="Compare runs anew that were shown to their end before.")
+@outputs_option
+def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outputs: Path) -> None:
+    """Bring trackers up to date with all runs and sweeps.
+
+    Afterwards they have exactly what the run folders have, each thing once; runs that are going on at present
+    are left to the process that shows them. It may be repeated at any time.
+    """
+    from memmlp.common.progress import progress_bar
+    from memmlp.runs.lookup import list_runs
+    from memmlp.tracking.sync import sync as fill_in
+    from memmlp.tracking.sync import sync_sweeps
+
+    begun = [run for run in list_runs(outputs) if run.manifest]
+    sweeps = sorted(path.parent for path in outputs.glob("sweeps/*/summary.json"))
+    complaints: list[str] = []
+    for tracker in _trackers(names or ("mlflow",), uri, project, outputs):
+        found = fill_in(tracker, progress_bar(begun, tracker.name), outputs, complaints.append, full)
+        groups = sync_sweeps(tracker, sweeps, complaints.append)
+        live = f", {found['live']} are going on" if found["live"] else ""
+        runs = f"{found['shown'] + found['same']} runs ({found['shown']} of them now)"
+        click.echo(f"{runs} and {groups} sweeps are in {tracker.place}{live}")
+    for line in complaints:
+        click.echo(f"memmlp: warning: {line}", err=True)
+    if complaints:
+        raise SystemExit(1)
+
+
+def _trackers(names: Sequence[str], uri: str | None, project: str, outputs: Path) -> list[Tracker]:
+    """Return the trackers of these names. Raises InputError where a package is missing."""
+    from memmlp.tracking.mlflow_tracker import MLflow
+    from memmlp.tracking.tensorboard_tracker import TensorBoard
+    from memmlp.tracking.wandb_tracker import WandB
+
+    every: dict[str, Tracker] = {
+        "mlflow": MLflow(uri, outputs),
+        "tensorboard": TensorBoard(outputs),
+        "wandb": WandB(project, outputs),
+    }
+    return [every[name] for name in dict.fromkeys(names)]
+
+
+def show_in_trackers(plan: Plan, folder: Path, table: Table) -> None:
+    """Leave the sweep's summary in its folder, and show it where its runs are shown."""
+    from omegaconf import OmegaConf
+
+    from memmlp.config.build import build_tracking
+    from memmlp.tables.summary import write_summary
+
+    write_summary(plan, table, folder)
+    if plan.tasks:
+        build_tracking(OmegaConf.create(dict(plan.tasks[0].config))).sweep(folder)
+
+
+@click.command("mlflow")
+@click.option("--port", default=5000, show_default=True)
+@outputs_option
+def mlflow(port: int, outputs: Path) -> None:
+    """Open MLflow's page on the tracked runs (needs pip install 'memmlp[ui]')."""
+    from memmlp.tracking.mlflow_tracker import MLflow
+
+    store = MLflow(None, outputs).place
+    program = shutil.which("mlflow")
+    try:
+        import mlflow.server  # noqa: F401  (mlflow-skinny has none)
+    except ImportError:
+        program = None
+    if program is None:
+        raise InputError("mlflow: its page is not installed; pip install 'memmlp[ui]'")
+    os.execv(program, [program, "ui", "--backend-store-uri", store, "--port", str(port)])

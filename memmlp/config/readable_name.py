@@ -1,0 +1,129 @@
+"""A run's name for people: what its config has that a default one has not, such as "memory=gru · seed 1"."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from memmlp.config.compose import VERSION_BASE
+from memmlp.config.packaged import packaged
+from memmlp.config.schema import register
+from memmlp.runs.identity import SLOTS, flatten, trained_by
+
+KINDS = {"vqvae": "VQ-VAE"}
+MOST = 6  # words
+BETWEEN = " · "
+
+
+def readable_name(kind: str, config: Mapping[str, Any]) -> str:
+    """Return a name for a run.
+
+    Slots are named by their option, other keys by their value where it is not the option's own. Data is no
+    part of it, nor is where and how the run is made.
+
+    Args:
+        kind: "vqvae", or "memmlp" for every motion network.
+        config: the run's resolved config.
+    """
+    words = [KINDS[kind]] if kind in KINDS else []
+    try:
+        words += [*_profile(config.get("profile") or {}), *_differences(config)]
+    except (HydraException, OmegaConfBaseException):  # a name is no reason to stop a run
+        words.append("own config")
+    if len(words) > MOST:
+        words = [*words[:MOST], f"{len(words) - MOST} more"]
+    seed = config.get("seed", (config.get("vqvae") or {}).get("seed"))
+    return BETWEEN.join([*(words or ["default"]), f"seed {seed}"])
+
+
+def _differences(config: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the words for slots and keys that are not as `memmlp train` has them without overrides."""
+    profile = tuple(f"profile.{k}={_word(v)}" for k, v in (config.get("profile") or {}).items())
+    model = _option(config, "model")
+    chosen = (f"model={model}",) if _shipped("model", model) else ()
+    default = _default((*profile, *chosen))
+    if model != "mem_mlp" and "model" in config:
+        yield f"model={model}"
+    others = {slot for slot in SLOTS if slot != "model" and slot in config}
+    changed = {slot: _option(config, slot) for slot in SLOTS if slot in others}
+    changed = {slot: option for slot, option in changed.items() if option != _option(default, slot)}
+    yield from (f"{slot}={option or 'none'}" for slot, option in changed.items())
+    known = tuple(f"{slot}={option}" for slot, option in changed.items() if _shipped(slot, option))
+    if known:
+        default = _default((*profile, *chosen, *known))
+    foreign = [slot for slot, option in changed.items() if not _shipped(slot, option)]
+    yield from _keys(config, default, [*foreign, *([] if chosen else ["model"])])
+
+
+def _keys(config: Mapping[str, Any], default: Mapping[str, Any], foreign: list[str]) -> Iterator[str]:
+    """Yield words for the keys that have another value than by default; a component of one's own has none."""
+    own, usual = flatten(config), {"data.weighting": "frames"} | flatten(default)
+    for key in trained_by(config):
+        slot, _, last = key.partition(".")
+        if slot in foreign or last in ("name", "_target_", "_partial_") or key in ("seed", "vqvae.seed"):
+            continue
+        if key in own and own[key] != usual.get(key):
+            yield f"{key}={_word(own[key])}"
+
+
+def _option(config: Mapping[str, Any], slot: str) -> str | None:
+    """Return the name of the option in a slot. Mem-MLP itself is no option with a name."""
+    node = config.get(slot) or {}
+    return node.get("name", "mem_mlp" if slot == "model" else None)
+
+
+def _shipped(slot: str, option: str | None) -> bool:
+    return (packaged("conf") / slot / f"{option}.yaml").is_file()
+
+
+def _word(value: Any) -> str:
+    """Return a value as it is typed on a command line."""
+    if isinstance(value, list):
+        return f"[{','.join(map(_word, value))}]"
+    return {None: "null", True: "true", False: "false"}.get(value, str(value))
+
+
+@functools.lru_cache(maxsize=64)
+def _default(overrides: tuple[str, ...]) -> dict[str, Any]:
+    """Return the config of `memmlp train` with these overrides, beside whatever Hydra is busy with."""
+    register()
+    hydra = GlobalHydra.instance()
+    before, hydra.hydra = hydra.hydra, None  # that of `memmlp train`, which has but one at a time
+    try:
+        with initialize_config_dir(str(packaged("conf")), version_base=VERSION_BASE, job_name="name"):
+            cfg = compose("train", list(overrides))
+    finally:
+        GlobalHydra.instance().hydra = before
+    groups = {str(key): cfg[key] for key in cfg if key not in ("data", "paths", "tracking")}
+    return {
+        key: OmegaConf.to_container(group, resolve=True) if OmegaConf.is_config(group) else group
+        for key, group in groups.items()
+    }
+
+
+def _profile(config: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the profile's name if it is not `small`, and the keys that are not as it has them."""
+    if not config:
+        return
+    values = {path.stem: _values(path) for path in sorted((packaged("conf") / "profile").glob("*.yaml"))}
+    count = {name: sum(own.get(k) != v for k, v in config.items()) for name, own in values.items()}
+    nearest = min(count, key=lambda name: (count[name], name != "small"))
+    if nearest != "small":
+        yield f"profile={nearest}"
+    for key, value in config.items():
+        if values[nearest].get(key) != value:
+            yield f"profile.{key}={_word(value)}"
+
+
+@functools.cache
+def _values(path: Path) -> dict[str, Any]:
+    return {key: value for key, value in yaml.safe_load(path.read_text()).items() if key != "defaults"}

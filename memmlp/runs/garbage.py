@@ -1,0 +1,108 @@
+"""Runs that nobody needs any more: failed, of an old recipe, or orphaned."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from memmlp.common.files import read_json
+from memmlp.runs.lookup import list_runs
+from memmlp.runs.notes import read_notes
+from memmlp.runs.recipes import outdated
+from memmlp.runs.run import Run
+
+REASONS = ("failed", "old", "orphaned")
+
+
+class Garbage(NamedTuple):
+    """A run that may go.
+
+    Attributes:
+        run: the run.
+        kind: one of REASONS.
+        reason: why, in words.
+        size: bytes in its folder.
+    """
+
+    run: Run
+    kind: str
+    reason: str
+    size: int
+
+
+def garbage(outputs: Path, kinds: Iterable[str] = REASONS) -> list[Garbage]:
+    """Find the runs that may go.
+
+    Never among them are runs that somebody is at, that people gave a tag or a note, or that a run builds upon
+    that stays.
+
+    Args:
+        outputs: the outputs folder.
+        kinds: which of REASONS count.
+    """
+    runs = list_runs(outputs)
+    orphans, wanted = _orphans(outputs, runs), set(kinds)
+    found = {}
+    for run in runs:
+        kind, reason = _reason(run, orphans)
+        if kind in wanted and not _marked(run) and run.state(False) != "running":
+            found[run.id] = Garbage(run, kind, reason, _size(run.folder))
+    used = {run.manifest.get("upstream") for run in runs if run.id not in found}
+    return [one for run_id, one in found.items() if run_id not in used]
+
+
+def delete(one: Garbage) -> bool:
+    """Delete a run's folder, its marker first. Returns False where somebody is at the run or marked it."""
+    with one.run.lock(wait=False) as mine:
+        if not mine or _marked(one.run):
+            return False
+        one.run.reset()
+        shutil.rmtree(one.run.folder)
+    return True
+
+
+def _reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, str]:
+    if run.failure:
+        return "failed", run.failure
+    if changed := outdated(run.manifest.get("recipes") or {}):
+        return "old", f"older recipe: {', '.join(changed)}"
+    return ("orphaned", orphans[run.id]) if run.id in orphans else ("", "")
+
+
+def _orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
+    """Return by id why a run is an orphan.
+
+    Orphans are runs of earlier versions of a sweep that no plan has now, VQ-VAEs that no run uses, and
+    folders in which nothing began.
+    """
+    planned: set[str] = set()
+    before: dict[str, str] = {}
+    for path in outputs.glob("sweeps/*/plan.json"):
+        planned |= {task["id"] for task in _listed(path, "tasks")}
+    for path in outputs.glob("sweeps/*/entries.json"):
+        before |= {
+            entry["id"]: f"no longer in sweep {path.parent.name}" for entry in _listed(path, "entries")
+        }
+    used = {run.manifest.get("upstream") for run in runs} | planned
+    codes = [run for run in runs if run.manifest.get("kind") == "vqvae" and run.id not in used]
+    empty = [run for run in runs if not run.manifest]
+    found = {run_id: reason for run_id, reason in before.items() if run_id not in planned}
+    found |= {run.id: "a VQ-VAE that no run uses" for run in codes}
+    return found | {run.id: "nothing began in it" for run in empty}
+
+
+def _listed(path: Path, key: str) -> Iterator[Mapping[str, str]]:
+    found = read_json(path).get(key)
+    yield from (one for one in found or () if isinstance(one, dict) and "id" in one)
+
+
+def _marked(run: Run) -> bool:
+    """Return whether people gave the run a tag or a note."""
+    notes = read_notes(run)
+    return bool(notes.tags or notes.note)
+
+
+def _size(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

@@ -1,0 +1,75 @@
+"""Tags and notes that people give a run: the file `notes.json` in its folder, no part of any identity."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from memmlp.common.errors import InputError
+from memmlp.common.files import read_json, write_json
+from memmlp.runs.run import Run
+
+TAG = re.compile(r"[\w.+/:-]{1,64}")
+LONGEST = 10_000  # characters of a note
+
+
+@dataclass(frozen=True)
+class Notes:
+    """What people said of a run.
+
+    Attributes:
+        tags: short words, sorted.
+        note: a text; empty for none.
+    """
+
+    tags: tuple[str, ...] = ()
+    note: str = ""
+
+
+def notes_path(run: Run) -> Path:
+    """Return the file of a run's tags and note."""
+    return run.folder / "notes.json"
+
+
+def read_notes(run: Run) -> Notes:
+    """Return a run's tags and note; empty ones where nobody gave any or the file is damaged."""
+    found = read_json(notes_path(run))
+    tags, note = found.get("tags"), found.get("note")
+    words = [tag for tag in tags if isinstance(tag, str)] if isinstance(tags, list) else []
+    return Notes(tuple(sorted(set(words))), note if isinstance(note, str) else "")
+
+
+def add_tags(run: Run, tags: Iterable[str]) -> Notes:
+    """Give a run tags. Raises InputError for one that is no short word."""
+    known = read_notes(run)
+    return _write(run, Notes(tuple(sorted({*known.tags, *map(checked, tags)})), known.note))
+
+
+def remove_tags(run: Run, tags: Iterable[str]) -> Notes:
+    """Take tags from a run. Raises InputError for one that it does not have."""
+    known, gone = read_notes(run), set(tags)
+    if missing := sorted(gone - set(known.tags)):
+        has = ", ".join(known.tags) or "none"
+        raise InputError(f"tag '{missing[0]}': run {run.id} has no such tag; it has {has}")
+    return _write(run, Notes(tuple(tag for tag in known.tags if tag not in gone), known.note))
+
+
+def set_note(run: Run, note: str) -> Notes:
+    """Replace a run's note; an empty one removes it. Raises InputError for one that is too long."""
+    if len(note) > LONGEST:
+        raise InputError(f"note: {len(note)} characters; allowed are {LONGEST}")
+    return _write(run, Notes(read_notes(run).tags, note.strip()))
+
+
+def checked(tag: str) -> str:
+    """Return the tag. Raises InputError where it is no short word."""
+    if not TAG.fullmatch(tag):
+        raise InputError(f"tag '{tag}': allowed are up to 64 letters, digits and . _ + / : -")
+    return tag
+
+
+def _write(run: Run, notes: Notes) -> Notes:
+    write_json(notes_path(run), {"tags": list(notes.tags), "note": notes.note})
+    return notes

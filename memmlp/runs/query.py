@@ -1,0 +1,222 @@
+"""Conditions on runs, such as "memory=gru and stream.MPJPE<6.3", and the values that they are about.
+
+A condition is made of comparisons, `and`, `or`, `not` and parentheses. Nothing of it is ever executed.
+"""
+
+from __future__ import annotations
+
+import difflib
+import operator
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from memmlp.common.errors import InputError
+from memmlp.runs.identity import SLOTS, flatten, trained_by
+from memmlp.runs.notes import read_notes
+from memmlp.runs.run import Run
+
+Record = Mapping[str, Any]
+Condition = Callable[[Record], bool]
+
+TOKEN = re.compile(r"""\s*(?:(?P<op><=|>=|!=|==|[=<>()])|"(?P<quoted>[^"]*)"|(?P<word>[^\s<>=!()"]+))""")
+ORDER: dict[str, Callable[[Any, Any], bool]] = {
+    "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
+}  # fmt: skip
+COMPARISONS = ("=", "==", "!=", *ORDER)
+WORDS = ("and", "or", "not")
+DEEPEST = 50  # parentheses and "not"s in one another
+
+
+def record(run: Run) -> dict[str, Any]:
+    """Return what may be asked of a run, by key.
+
+    These are its id, kind, status, name, started, tag, note and step; the keys of its config, slots also by
+    their name alone (`memory` for `memory.name`); and its results, those of the rotation branch also without
+    the branch (`stream.MPJPE` for `stream.rotation.MPJPE`).
+    """
+    manifest, config, notes = run.manifest, run.config, read_notes(run)
+    results = flatten(run.results)
+    short = {key.replace(".rotation.", "."): value for key, value in results.items()}
+    slots = {slot: (config.get(slot) or {}).get("name") for slot in SLOTS if slot in config}
+    facts = {name: manifest.get(name) for name in ("kind", "name", "started", "data", "upstream", "user")}
+    facts |= {"id": run.id, "status": run.status, "tag": notes.tags, "note": notes.note}
+    return {**flatten(config), **slots, **short, **results, **facts}
+
+
+def differing(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the config keys that change a result and differ among these configs.
+
+    Where the option in a slot differs, its name stands for its keys that the others don't have.
+    """
+    flats = [flatten(config) for config in configs]
+    counting = {key for config in configs for key in (*trained_by(config), *_later(config))}
+    names = [key for key in dict.fromkeys(key for flat in flats for key in flat) if key in counting]
+    different = [key for key in names if len({repr(flat.get(key)) for flat in flats}) > 1]
+    changed = {key.removesuffix(".name") for key in different if key.endswith(".name")}
+    return [
+        key.removesuffix(".name")
+        for key in different
+        if key.endswith(".name")
+        or not (key.split(".")[0] in changed and any(key not in flat for flat in flats))
+    ]
+
+
+def _later(config: Mapping[str, Any]) -> list[str]:
+    """The keys of evaluation and export, which change what is made of a trained network."""
+    return [key for key in flatten(config) if key.startswith(("evaluation.ik", "export.precision"))]
+
+
+def shown(value: Any) -> str:
+    """Return a value as it is typed in a condition, and shown in a column."""
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(shown, value))}]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return "null" if value is None else str(value)
+
+
+def check_key(key: str, records: Iterable[Record], option: str) -> None:
+    """Raise InputError where no run has the key."""
+    keys = {name for one in records for name in one}
+    if key not in keys:
+        near = difflib.get_close_matches(key, keys, n=1)
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise InputError(
+            f"{option}: no run has the key '{key}'; {hint}allowed are keys of the config (memory, optim.lr), "
+            "results (stream.MPJPE), id, kind, status, name, started, tag and note"
+        )
+
+
+class Query(NamedTuple):
+    """A condition and the keys in it."""
+
+    condition: Condition
+    keys: tuple[str, ...]
+
+    def of(self, records: Sequence[Record], option: str = "--where") -> list[bool]:
+        """Return for each record whether it fulfils the condition. Raises InputError for unknown keys."""
+        for key in self.keys if records else ():
+            check_key(key, records, option)
+        return [self.condition(one) for one in records]
+
+
+def parse(text: str) -> Query:
+    """Parse a condition. Raises InputError, in one line, where it is none."""
+    return _Parser(text).parsed()
+
+
+class _Parser:
+    """Recursive descent over the tokens of a condition."""
+
+    def __init__(self, text: str):
+        self.text, self.place, self.depth = text, 0, 0
+        self.keys: list[str] = []
+        self.tokens = list(self._tokens(text))
+
+    def _tokens(self, text: str) -> Iterable[tuple[str, str]]:
+        place, text = 0, text.rstrip()
+        while place < len(text):
+            found = TOKEN.match(text, place)
+            if found is None:
+                raise self._refusal(f"'{text[place:].strip()[:20]}' is not understood")
+            yield found.lastgroup or "", found[found.lastgroup or 0]
+            place = found.end()
+
+    def parsed(self) -> Query:
+        condition = self._or()
+        if self.place < len(self.tokens):
+            raise self._refusal(f"'{self._peek()[1]}' is not expected")
+        return Query(condition, tuple(dict.fromkeys(self.keys)))
+
+    def _or(self) -> Condition:
+        parts = [self._and()]
+        while self._take("word", "or"):
+            parts.append(self._and())
+        return parts[0] if len(parts) == 1 else lambda one: any(part(one) for part in parts)
+
+    def _and(self) -> Condition:
+        parts = [self._not()]
+        while self._take("word", "and"):
+            parts.append(self._not())
+        return parts[0] if len(parts) == 1 else lambda one: all(part(one) for part in parts)
+
+    def _not(self) -> Condition:
+        self.depth += 1
+        if self.depth > DEEPEST:
+            raise self._refusal("it is too deep")
+        try:
+            if self._take("word", "not"):
+                inner = self._not()
+                return lambda one: not inner(one)
+            if self._take("op", "("):
+                inner = self._or()
+                if not self._take("op", ")"):
+                    raise self._refusal("a ) is missing")
+                return inner
+            return self._comparison()
+        finally:
+            self.depth -= 1
+
+    def _comparison(self) -> Condition:
+        kind, key = self._next("a key")
+        if kind != "word" or key in WORDS:
+            raise self._refusal(f"'{key}' stands where a key is expected")
+        _, sign = self._next(f"a comparison after {key}")
+        if sign not in COMPARISONS:
+            raise self._refusal(f"after {key} comes '{sign}'")
+        kind, value = self._next(f"a value after {key}{sign}")
+        if kind == "op":
+            raise self._refusal(f"after {key}{sign} comes '{value}'")
+        if sign in ORDER and _number(value) is None and key != "started":
+            raise self._refusal(f"{key}{sign}{value}: {sign} compares with a number")
+        self.keys.append(key)
+        return lambda one: _holds(one.get(key), sign, value)
+
+    def _peek(self) -> tuple[str, str]:
+        return self.tokens[self.place] if self.place < len(self.tokens) else ("end", "")
+
+    def _take(self, kind: str, text: str) -> bool:
+        if self._peek() != (kind, text):
+            return False
+        self.place += 1
+        return True
+
+    def _next(self, wanted: str) -> tuple[str, str]:
+        if self._peek()[0] == "end":
+            raise self._refusal(f"it ends where {wanted} is expected")
+        self.place += 1
+        return self.tokens[self.place - 1]
+
+    def _refusal(self, reason: str) -> InputError:
+        return InputError(
+            f"--where '{self.text}': {reason}; allowed are comparisons (= != < <= > >=), and, or, not, ( )"
+        )
+
+
+def _holds(own: Any, sign: str, value: str) -> bool:
+    """Return whether a comparison holds. What a run does not have is neither smaller nor larger."""
+    if sign in ORDER:
+        if isinstance(own, str):
+            return ORDER[sign](own, value)
+        number = _number(value)
+        known = isinstance(own, int | float) and not isinstance(own, bool)
+        return known and number is not None and ORDER[sign](own, number)
+    return _equal(own, value) == (sign != "!=")
+
+
+def _equal(own: Any, value: str) -> bool:
+    if isinstance(own, tuple):  # tags: it has the tag
+        return value in own
+    if isinstance(own, int | float) and not isinstance(own, bool):
+        return own == _number(value)
+    return shown(own) == value.replace(", ", ",")
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None

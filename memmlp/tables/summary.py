@@ -1,0 +1,41 @@
+"""What a sweep leaves in its folder for those who look at it later: its table, aggregates and verdicts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from memmlp.common.files import atomic_write, write_json
+from memmlp.sweep.plan import Plan
+from memmlp.tables.formats import FORMATS
+from memmlp.tables.table import Cell, Table
+
+
+def write_summary(plan: Plan, table: Table, folder: Path) -> None:
+    """Write table.md, table.html and summary.json of a sweep, whose runs need not all be done."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for form in ("md", "html"):
+        atomic_write(folder / f"table.{form}", FORMATS[form](table))
+    write_json(folder / "summary.json", summary(plan, table))
+
+
+def summary(plan: Plan, table: Table) -> dict[str, Any]:
+    """Return a sweep's status, its runs' labels, and by LABEL/MODE/METRIC means over seeds and verdicts."""
+    cells = {
+        f"{row.label}/{mode}/{metric}": cell
+        for row in table.rows
+        for mode, metrics in row.cells.items()
+        for metric, cell in metrics.items()
+    }
+    states = plan.counts()
+    return {
+        "name": plan.name,
+        "status": "failed" if states["failed"] else "running" if plan.left() else "done",
+        "labels": {entry.id: entry.label for entry in plan.entries if plan.run_of(entry).manifest},
+        "aggregates": {key: cell.mean for key, cell in cells.items() if cell.mean is not None},
+        "verdicts": {key: verdict for key, cell in cells.items() if (verdict := _verdict(cell))},
+    }
+
+
+def _verdict(cell: Cell) -> str | None:
+    return str(cell.effect.verdict.value) if cell.effect and cell.effect.verdict else None

@@ -1,0 +1,51 @@
+"""`memmlp track sync` and `memmlp mlflow`, and training with trackers, as a person types them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from conftest import Memmlp, one_line
+from fake_tracker import FakeTracker, Server, a_run
+
+from memmlp.cli import track
+from memmlp.common.files import write_json
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch) -> Server:
+    """What is shown, by a tracker in memory."""
+    tracker = FakeTracker()
+    monkeypatch.setattr(track, "_trackers", lambda *_: [tracker])
+    return tracker.server
+
+
+def test_sync_shows_runs_and_sweeps_and_then_nothing_more(memmlp: Memmlp, tmp_path: Path, server: Server):
+    outputs = tmp_path / "outputs"
+    a_run(outputs, "0" * 16).finish([])
+    a_run(outputs, "1" * 16).fail("why")
+    names = {"name": "mine", "status": "done", "labels": {}, "aggregates": {}, "verdicts": {}}
+    (outputs / "sweeps" / "mine").mkdir(parents=True)
+    write_json(outputs / "sweeps" / "mine" / "summary.json", names)
+    assert memmlp("track", "sync").out == "2 runs (2 of them now) and 1 sweeps are in memory\n"
+    assert memmlp("track", "sync").out == "2 runs (0 of them now) and 1 sweeps are in memory\n"
+    assert memmlp("track", "sync", "--full").out == "2 runs (2 of them now) and 1 sweeps are in memory\n"
+    assert server.status == {"0" * 16: "done", "1" * 16: "failed"}
+
+
+def test_what_could_not_be_shown_is_a_line_each(memmlp: Memmlp, tmp_path: Path, server: Server):
+    a_run(tmp_path / "outputs")
+    server.down = True
+    ran = memmlp("track", "sync")
+    assert ran.code == 1
+    assert ran.err == f"memmlp: warning: run {'0' * 16} is not shown by fake: connection refused\n"
+
+
+def test_a_tracker_that_there_is_not_is_refused(memmlp: Memmlp):
+    assert one_line(memmlp("track", "sync", "--tracker", "paper"), "paper", "mlflow", "tensorboard", "wandb")
+
+
+def test_the_trackers_of_a_command_line(tmp_path: Path):
+    found = track._trackers(["wandb", "mlflow", "tensorboard", "wandb"], "http://x", "mine", tmp_path)
+    assert [one.name for one in found] == ["wandb", "mlflow", "tensorboard"]
+    assert found[1].place == "http://x"

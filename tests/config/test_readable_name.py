@@ -1,0 +1,61 @@
+"""Names say what differs from the default, whatever Hydra is busy with."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from memmlp.config.compose import composed
+from memmlp.config.readable_name import readable_name
+
+pytestmark = pytest.mark.slow
+
+
+def config(*words: str) -> dict[str, Any]:
+    found: Any = OmegaConf.to_container(composed(list(words)), resolve=True)
+    return found
+
+
+def name(*words: str) -> str:
+    return readable_name("memmlp", config(*words))
+
+
+@pytest.mark.parametrize(("words", "expected"), [
+    ("seed=1", "default · seed 1"),
+    ("memory=gru seed=1", "memory=gru · seed 1"),
+    ("memory=gru memory.layers=[2]", "memory=gru · memory.layers=[2] · seed 0"),
+    ("model=agrol_mlp", "model=agrol_mlp · seed 0"),
+    ("profile=paper optim.lr=0.01", "profile=paper · optim.lr=0.01 · seed 0"),
+    ("profile.width=64", "profile.width=64 · seed 0"),
+    ("data.weighting=clips device=cpu threads=1 tracking=none evaluation.modes=[window]",
+     "data.weighting=clips · seed 0"),
+])  # fmt: skip
+def test_what_differs(words: str, expected: str):
+    assert name(*words.split()) == expected
+
+
+def test_many_differences_are_counted():
+    words = [f"optim.{key}" for key in ("lr=0.02", "steps=9", "batch=3", "weight_decay=0.5", "clip_norm=2")]
+    found = name(*words, "memory=none", "predictor=rotation_only", "hand=off")
+    assert found.endswith(" · 2 more · seed 0")
+
+
+def test_a_vqvae_and_a_component_of_ones_own():
+    whole = config()
+    codes = {"frame": whole["frame"], "vqvae": whole["vqvae"] | {"codes": 9, "seed": 4}}
+    assert readable_name("vqvae", codes) == "VQ-VAE · vqvae.codes=9 · seed 4"
+    mine = whole | {"memory": {"name": "mine", "_target_": "mine.Memory", "knob": 3}}
+    assert readable_name("memmlp", mine) == "memory=mine · seed 0"
+
+
+def test_hydra_is_as_busy_afterwards_as_before():
+    busy, whole = GlobalHydra.instance(), config("optim.lr=0.5")
+    busy.hydra = "a job's"  # type: ignore[assignment]
+    try:
+        assert readable_name("memmlp", whole) == "optim.lr=0.5 · seed 0"
+        assert GlobalHydra.instance().hydra == "a job's"
+    finally:
+        GlobalHydra.instance().clear()

@@ -1,0 +1,173 @@
+"""A run travels as one file, which is taken in only if it is whole and nothing else."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from memmlp.common.errors import InputError
+from memmlp.common.files import file_digest
+from memmlp.runs.archive import INDEX, export_run, import_run
+from memmlp.runs.notes import add_tags, read_notes
+from memmlp.runs.run import Run
+
+NAME = "0123456789abcdef"
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    made = Run.of(tmp_path / "here", NAME)
+    made.begin("memmlp", {"seed": 1}, data="d", upstream=None)
+    made.log(1, {"loss": 1.0})
+    made.model.write_bytes(b"weights")
+    made.checkpoint.write_bytes(b"large")
+    made.finish([made.model.name])
+    place = made.deployment("fp32-0")
+    place.folder.mkdir(parents=True)
+    place.onnx.write_bytes(b"onnx")
+    place.finish({"settings": {}})
+    (made.folder / "mine.txt").write_text("of the user")
+    add_tags(made, ["good"])
+    return made
+
+
+@pytest.fixture
+def archive(run: Run, tmp_path: Path) -> Path:
+    export_run(run, tmp_path / "run.zip")
+    return tmp_path / "run.zip"
+
+
+def changed(archive: Path, files: dict[str, bytes | None], index: bool = True) -> Path:
+    """The archive with other files (None removes one); with `index` its index fits them."""
+    with zipfile.ZipFile(archive) as old:
+        content = {name: old.read(name) for name in old.namelist()}
+    listed = json.loads(content[INDEX])
+    for name, data in files.items():
+        content.pop(name, None)
+        listed["files"].pop(name, None)
+        if data is not None:
+            content[name] = data
+            listed["files"][name] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    if index and INDEX not in files:
+        content[INDEX] = json.dumps(listed).encode()
+    with zipfile.ZipFile(archive, "w") as new:
+        for name, data in content.items():
+            new.writestr(name, data)
+    return archive
+
+
+def refused(archive: Path, outputs: Path, words: str, **limits: int) -> None:
+    with pytest.raises(InputError, match=words):
+        import_run(archive, outputs, **limits)
+    left = [path for path in outputs.rglob("*") if path.is_file()] if outputs.exists() else []
+    assert left == [], "something was left"
+
+
+def test_it_arrives_as_it_was_without_checkpoint_and_strange_files(run: Run, archive: Path, tmp_path: Path):
+    there, new = import_run(archive, tmp_path / "there", file_digest(archive))
+    assert new
+    assert there.done
+    assert there.verify() == []
+    assert there.config == run.config
+    assert there.metrics() == run.metrics()
+    assert there.onnx.read_bytes() == b"onnx"
+    assert read_notes(there).tags == ("good",)
+    assert not there.checkpoint.exists()
+    assert not (there.folder / "mine.txt").exists()
+    assert (
+        import_run(archive, tmp_path / "there") == (there, False)
+        or not import_run(archive, tmp_path / "there")[1]
+    )
+    assert [path.name for path in there.folder.parent.iterdir()] == [NAME]
+
+
+def test_only_a_finished_and_unchanged_run_leaves(run: Run, tmp_path: Path):
+    run.model.write_bytes(b"other")
+    with pytest.raises(InputError, match=r"changed since it was made: model\.safetensors"):
+        export_run(run, tmp_path / "x.zip")
+    run.marker.unlink()
+    with pytest.raises(InputError, match="allowed is a finished run"):
+        export_run(run, tmp_path / "x.zip")
+    assert list(tmp_path.glob("*x.zip*")) == []
+
+
+def test_another_file_than_was_exported_is_refused(archive: Path, tmp_path: Path):
+    with pytest.raises(InputError, match="its SHA-256 is"):
+        import_run(archive, tmp_path / "there", "0" * 64)
+
+
+def test_a_file_that_does_not_fit_its_digest_is_refused(archive: Path, tmp_path: Path):
+    changed(archive, {"model.safetensors": b"WEIGHTS"}, index=False)
+    refused(archive, tmp_path / "there", "model.safetensors: its digest does not hold")
+
+
+def test_weights_that_are_not_those_that_were_trained_are_refused(archive: Path, tmp_path: Path):
+    changed(archive, {"model.safetensors": b"WEIGHTS"})
+    refused(archive, tmp_path / "there", "changed since it was made: model.safetensors")
+
+
+@pytest.mark.parametrize("name", [
+    "../evil", "/etc/evil", "evaluations/../../evil.json", "evaluations/..json",
+    "deployments/../latency.json", "mine.py", "evaluations/a/b.json", "C:evil", "model.pkl",
+    ".lock", "DONE/x", "evaluations\\x.json",
+])  # fmt: skip
+def test_no_other_name_is_unpacked(archive: Path, tmp_path: Path, name: str):
+    changed(archive, {name: b"evil"})
+    refused(archive, tmp_path / "there", "is no file of a run|not both in the archive")
+    assert list(tmp_path.rglob("*evil*")) == []
+
+
+def test_a_file_that_is_not_in_the_index_is_refused(archive: Path, tmp_path: Path):
+    changed(archive, {"notes.json": b"{}"}, index=False)
+    with zipfile.ZipFile(archive, "a") as old:
+        old.writestr("poses.png", b"more")
+    refused(archive, tmp_path / "there", "is not both in the archive and in its index")
+
+
+def test_a_file_that_is_longer_than_the_index_says_is_cut_off(archive: Path, tmp_path: Path):
+    with zipfile.ZipFile(archive) as old:
+        listed = json.loads(old.read(INDEX))
+    zeros = bytes(10**6)
+    listed["files"]["metrics.jsonl"] |= {"size": 10}
+    changed(archive, {"metrics.jsonl": zeros, INDEX: json.dumps(listed).encode()})
+    refused(archive, tmp_path / "there", "metrics.jsonl: its digest does not hold")
+
+
+def test_more_than_is_allowed_is_refused(archive: Path, tmp_path: Path):
+    refused(archive, tmp_path / "there", "allowed are 0.0", largest=5)
+
+
+@pytest.mark.parametrize("index", [
+    b"[]", b"{", b"{}", b'{"format": "memmlp run 1", "run": "../x", "files": {}}',
+    b'{"format": "memmlp run 1", "run": "0123456789abcdef", "files": {"DONE": {"size": -1, "sha256": "x"}}}',
+    b'{"format": "memmlp run 2", "run": "0123456789abcdef", "files": {}}',
+])  # fmt: skip
+def test_an_index_that_is_none_is_refused(archive: Path, tmp_path: Path, index: bytes):
+    changed(archive, {INDEX: index})
+    refused(archive, tmp_path / "there", "not an archive|is not one of format|no id")
+
+
+@pytest.mark.parametrize("content", [b"", b"text", b"PK\x03\x04" + bytes(50)])
+def test_what_is_no_zip_is_refused(tmp_path: Path, content: bytes):
+    path = tmp_path / "x.zip"
+    path.write_bytes(content)
+    refused(path, tmp_path / "there", "not an archive of a run")
+
+
+def test_an_archive_cut_anywhere_is_refused(archive: Path, tmp_path: Path):
+    whole = archive.read_bytes()
+    for length in range(0, len(whole), 97):
+        archive.write_bytes(whole[:length])
+        refused(archive, tmp_path / "there", "not an archive|digest does not hold")
+
+
+def test_another_run_of_that_id_stays(run: Run, archive: Path, tmp_path: Path):
+    place = Run.of(tmp_path / "there", NAME)
+    place.begin("memmlp", {}, data="d", upstream=None)
+    with pytest.raises(InputError, match="is there already, stopped"):
+        import_run(archive, tmp_path / "there")
+    assert place.config == {}

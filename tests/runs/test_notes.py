@@ -1,0 +1,46 @@
+"""Tags and notes lie beside the run and change nothing of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from begun_runs import begun
+
+from memmlp.common.errors import InputError
+from memmlp.runs.notes import Notes, add_tags, notes_path, read_notes, remove_tags, set_note
+
+
+def test_tags_and_note_are_kept_and_survive_a_reset(tmp_path: Path):
+    run = begun(tmp_path)
+    assert read_notes(run) == Notes()
+    add_tags(run, ["good", "a/b"])
+    set_note(run, " a note ")
+    add_tags(run, ["good"])
+    run.reset()
+    assert read_notes(run) == Notes(("a/b", "good"), "a note")
+    assert remove_tags(run, ["good"]) == Notes(("a/b",), "a note")
+    assert set_note(run, "") == Notes(("a/b",), "")
+
+
+@pytest.mark.parametrize("tag", ["", "two words", "x" * 65, "a,b", "a\nb"])
+def test_a_tag_is_a_short_word(tmp_path: Path, tag: str):
+    run = begun(tmp_path)
+    with pytest.raises(InputError, match="allowed are up to 64"):
+        add_tags(run, ["good", tag])
+    assert read_notes(run) == Notes()
+
+
+def test_what_is_not_there_or_too_long_is_refused(tmp_path: Path):
+    run = begun(tmp_path)
+    with pytest.raises(InputError, match="no such tag; it has none"):
+        remove_tags(run, ["good"])
+    with pytest.raises(InputError, match="10001 characters"):
+        set_note(run, "x" * 10001)
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"tags": 5, "note": []}', '{"tags": [3], "note": null}'])
+def test_a_damaged_file_says_nothing(tmp_path: Path, content: str):
+    run = begun(tmp_path)
+    notes_path(run).write_text(content)
+    assert read_notes(run) == Notes()

@@ -1,0 +1,96 @@
+"""Conditions on runs: what they mean, and one line where they mean nothing."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from begun_runs import begun
+from hypothesis import given
+from hypothesis import strategies as st
+
+from memmlp.common.errors import InputError
+from memmlp.common.files import write_json
+from memmlp.runs.notes import add_tags
+from memmlp.runs.query import differing, parse, record
+
+ONE = {
+    "memory": "gru", "seed": 1, "optim.lr": 1e-3, "memory.layers": [2, 4], "stream.MPJPE": 6.25,
+    "tag": ("good",), "note": "two words", "force": False, "vqvae.epochs": None,
+    "started": "2026-01-02T03:04:05+00:00",
+}  # fmt: skip
+
+
+def holds(text: str) -> bool:
+    return parse(text).of([ONE])[0]
+
+
+@pytest.mark.parametrize("text", [
+    "memory=gru", "memory==gru", "memory!=vq", "memory=gru and stream.MPJPE<6.3", "seed=1", "seed=1.0",
+    "optim.lr=1e-3", "optim.lr<=0.001", "memory.layers=[2,4]", 'memory.layers="[2, 4]"', "tag=good",
+    "tag!=bad", 'note="two words"', "force=false", "vqvae.epochs=null", "not memory=vq",
+    "memory=vq or seed=1",
+    "memory=vq and seed=2 or seed=1", "not (memory=vq or seed=2)", "not not seed=1", "started>2026-01-01",
+    "(seed>0)and(seed<2)", "stream.MPJPE>=6.25",
+])  # fmt: skip
+def test_holds(text: str):
+    assert holds(text)
+
+
+@pytest.mark.parametrize("text", [
+    "memory=vq", "memory!=gru", "seed=2", "seed<1", "tag=bad", "tag!=good",
+    "memory=vq and (seed=1 or seed=2)", "vqvae.epochs<5", "vqvae.epochs>=0", "force>0", "note=two",
+])  # fmt: skip
+def test_does_not_hold(text: str):
+    assert not holds(text)
+
+
+def test_what_a_run_does_not_have_is_neither_smaller_nor_larger():
+    assert parse("a<1 or a>=1").of([{"a": 0}, {"b": 0}]) == [True, False]
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    ("", "it ends where a key is expected"), ("memory", "it ends where a comparison after memory"),
+    ("memory=", "it ends where a value after memory="), ("memory=gru and", "a key"),
+    ("memory=gru or or seed=1", "'or' stands where a key"), ("(memory=gru", "a ) is missing"),
+    ("memory=gru)", "')' is not expected"), ("memory gru", "after memory comes 'gru'"),
+    ("seed<many", "compares with a number"), ("=gru", "'=' stands where a key"), ("seed=(", "comes '('"),
+    ('note="open', "is not understood"), ("memory=gru seed=1", "'seed' is not expected"),
+    ("(" * 60 + "a=1" + ")" * 60, "too deep"), ("not " * 60 + "a=1", "too deep"),
+])  # fmt: skip
+def test_what_is_no_condition_is_one_line(text: str, words: str):
+    with pytest.raises(InputError) as error:
+        parse(text)
+    assert words in str(error.value)
+    assert str(error.value).startswith("--where '")
+
+
+@given(st.text(alphabet='ab1.<>=!()" andort', max_size=30))
+def test_any_text_is_a_condition_or_one_line(text: str):
+    with contextlib.suppress(InputError):
+        parse(text).condition(ONE)
+
+
+def test_an_unknown_key_names_its_neighbour():
+    with pytest.raises(InputError, match="no run has the key 'memry'; did you mean memory"):
+        parse("memry=gru").of([ONE])
+    assert parse("anything=1").of([]) == []
+
+
+def test_a_run_may_be_asked_for_slots_results_and_facts(tmp_path: Path):
+    config: dict[str, Any] = {"seed": 3, "memory": {"name": "gru", "layers": [2]}}
+    run = begun(tmp_path, config)
+    write_json(run.results_path, {"stream": {"rotation": {"MPJPE": 6.5}, "position": {"MPJPE": 7.0}}})
+    add_tags(run, ["good"])
+    one = record(run)
+    text = "memory=gru and memory.layers=[2] and stream.MPJPE=6.5 and stream.position.MPJPE=7 and tag=good"
+    assert parse(f"{text} and status=stopped and id={run.id} and stream.rotation.MPJPE<7").of([one]) == [True]
+
+
+def test_the_keys_that_differ_without_neutral_ones():
+    first = {"seed": 0, "paths": {"outputs": "a"}, "memory": {"name": "vq", "width": 5, "codes": 3}}
+    second = {"seed": 0, "paths": {"outputs": "b"}, "memory": {"name": "gru", "width": 6}}
+    assert differing([first, second]) == ["memory", "memory.width"]
+    assert differing([first, first]) == []
