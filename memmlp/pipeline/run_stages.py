@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from memmlp.common import parallel
-from memmlp.common.errors import LeaseLost, of_the_disk
+from memmlp.common.errors import LeaseLost, TrainingDiverged, of_the_disk
 from memmlp.common.files import write_json
 from memmlp.common.progress import stage_begins
 from memmlp.evaluation.evaluation import picture
@@ -171,6 +171,9 @@ def shown(experiment: Experiment, run: Run, again: bool = False) -> Iterator[Non
         try:
             yield
         except LeaseLost:
+            raise
+        except TrainingDiverged as error:
+            run.fail(str(error))
             raise
         except (RuntimeError, OSError) as error:
             if not of_the_disk(error):

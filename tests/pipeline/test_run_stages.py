@@ -17,7 +17,7 @@ from command_line import run as command
 from conftest import INT8, one_line
 from PIL import Image
 
-from memmlp.common.errors import InputError, TrainingDiverged
+from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.config.packaged import packaged
@@ -233,8 +233,8 @@ def test_every_experiment_trains_and_streams(home, name, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize(("error", "failure"), [
-    (TrainingDiverged("loss is nan"), "TrainingDiverged: loss is nan"),
-    (OSError(28, "disk full"), "disk full"),
+    (TrainingDiverged("loss is nan"), "loss is nan"), (OSError(5, "bad disk"), "bad disk"),
+    (OSError(28, "disk full"), None), (LeaseLost("taken over"), None),
     (InputError("data changed"), None), (Cancelled("by its plan"), None), (KeyboardInterrupt(), None),
 ])  # fmt: skip
 def test_a_failure_of_the_work_is_kept_with_the_run_and_an_interruption_is_not(

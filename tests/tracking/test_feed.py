@@ -136,7 +136,7 @@ with Tracking((FileTracker(outputs / "shown"),), outputs).following(a_run(output
 def test_a_run_that_is_killed_is_shown_as_killed_and_its_follower_ends(tmp_path: Path):
     path = os.pathsep.join(filter(None, sys.path))
     processes.finished([sys.executable, "-c", KILLED, str(tmp_path)], env=os.environ | {"PYTHONPATH": path})
+    end, shown = f"end {'0' * 16} killed", tmp_path / "shown"
+    processes.until(lambda: shown.exists() and shown.read_text().splitlines()[-1:] == [end], "what was shown")
     processes.until(lambda: not processes.marked(), "the end of the follower")
-    lines = (tmp_path / "shown").read_text().splitlines()
-    assert lines[-1] == f"end {'0' * 16} killed"
     assert Run.of(tmp_path, "0" * 16).status == "stopped"

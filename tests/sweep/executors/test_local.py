@@ -51,7 +51,8 @@ def test_preempted_work_is_queued_again(tmp_path: Path):
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="environments are read from /proc")
 def test_each_worker_sees_its_own_gpus_and_a_new_one_those_of_the_dead(tmp_path: Path):
     """Two workers have a GPU each, four share them two by two, and without GPUs there is none."""
-    work = partial(os.getenv, "CUDA_VISIBLE_DEVICES")
+    go = tmp_path / "go"
+    work = partial(variable_once, str(go))
     executor = Local(tmp_path / "%j", [("0",), ("1",)])
     workers = executor.submit(work, 4)
     assert executor.gpus
@@ -65,9 +66,16 @@ def test_each_worker_sees_its_own_gpus_and_a_new_one_those_of_the_dead(tmp_path:
     assert not bare.gpus
     assert variable(workers[5]) == ""
     alive = [worker for worker in workers if worker is not workers[1]]
+    go.touch()
     until(lambda: not any(worker.alive() for worker in alive), "the workers end")
     seen = Counter(worker.complaint() for worker in alive)  # what they returned
     assert seen == {"0": 2, "1": 2, "": 1}
+
+
+def variable_once(path: str) -> str | None:
+    """What a worker itself has for its GPUs, once there is a file."""
+    until(Path(path).exists, "the test has looked at the processes")
+    return os.getenv("CUDA_VISIBLE_DEVICES")
 
 
 def variable(worker) -> str:
