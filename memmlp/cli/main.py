@@ -37,6 +37,7 @@ COMMANDS = {
     "runs": Command("runs", "runs", "List, show, compare, tag, clean up and move runs."),
     "track": Command("track", "track", "Fill in what MLflow, TensorBoard or W&B lack of runs."),
     "mlflow": Command("track", "mlflow", "MLflow's page on the tracked runs."),
+    "ui": Command("ui", "ui", "Runs, sweeps and searches on a page of this machine, live."),
     "eval": Command("evaluate", "evaluate", "Metrics and predictions of a finished run."),
     "predict": Command("predict", "predict", "What a network makes of clips, as BVH, glTF or npz."),
     "render": Command("render", "render", "Figures and films of runs beside the truth, coloured by error."),
