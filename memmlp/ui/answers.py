@@ -11,6 +11,7 @@ from memmlp.runs.identity import ID
 from memmlp.ui import runs
 from memmlp.ui.curves import Curves
 from memmlp.ui.index import Index
+from memmlp.ui.names import places
 from memmlp.ui.replay import Predict, Replays, body
 from memmlp.ui.runs import Rows
 from memmlp.ui.searches import Searches
@@ -34,7 +35,7 @@ class Answers:
         self.index = Index(outputs, outputs / "cache" / "ui" / "runs.sqlite" if kept else None)
         self.sweeps, self.searches = Sweeps(self.index), Searches(outputs)
         self.curves, self.replays = Curves(outputs), Replays(outputs, predict)
-        self.rows = Rows(self.index, self.sweeps.known)
+        self.rows = Rows(self.index, self.places)
         self.looked = False
 
     def look(self) -> str:
@@ -44,6 +45,10 @@ class Answers:
         self.looked = True
         self.sweeps.known()
         return f"{generation} {hash((self.sweeps.stamp(), self.searches.stamp()))}"
+
+    def places(self) -> dict[str, list[dict[str, Any]]]:
+        """Return, by run id, the sweeps and searches in which a run stands."""
+        return places(self.sweeps.known(), self.searches.runs())
 
     def of(self, name: str, query: Mapping[str, str]) -> Mapping[str, Any]:
         """Return the answer to a question.
@@ -67,7 +72,7 @@ class Answers:
         if not ID.fullmatch(rest) or rest not in self.index.runs:
             raise KeyError(name)
         if room == "run":
-            return runs.page(self.index, self.sweeps.known(), rest)
+            return runs.page(self.index, self.sweeps.known(), self.places(), rest)
         if room == "replay":
             return self._replay(rest, query)
         raise KeyError(name)

@@ -8,14 +8,14 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
-from memmlp.runs.identity import flatten
+from memmlp.runs.identity import NEUTRAL, flatten
 from memmlp.runs.lookup import is_trained
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan
 from memmlp.tables.measured_run import load
 from memmlp.ui.facts import read_config
 from memmlp.ui.index import Index
-from memmlp.ui.names import name, places
+from memmlp.ui.names import name
 
 SHOWN_FILES = ("config.yaml", "manifest.json", "metrics.jsonl", "code.patch", "FAILED", "notes.json", "poses.png")
 """Files of a run that the page may show as they are."""
@@ -26,8 +26,8 @@ MOST_FILES = 200
 class Rows:
     """The rows of the table of runs, for a page that has some of them already."""
 
-    def __init__(self, index: Index, plans: Callable[[], Sequence[Plan]]):
-        self.index, self.plans = index, plans
+    def __init__(self, index: Index, places: Callable[[], Mapping[str, Sequence[Mapping[str, Any]]]]):
+        self.index, self.places = index, places
 
     def since(self, generation: int, heads: str = "") -> dict[str, Any]:
         """Return the rows that changed after a generation, and which runs are gone.
@@ -37,7 +37,7 @@ class Rows:
         """
         with self.index.lock:
             runs, now, removed = dict(self.index.runs), self.index.generation, dict(self.index.removed)
-        where = places(self.plans())
+        where = self.places()
         keys, metrics = differing(runs.values()), measured(runs.values())
         known = "|".join([*keys, *metrics, str(sum(map(len, where.values())))])
         whole = generation == 0 or heads != str(hash(known))
@@ -48,7 +48,7 @@ class Rows:
         ]
         gone = [run_id for run_id, when in removed.items() if when > generation]
         return {
-            "generation": now, "heads": str(hash(known)), "whole": whole, "keys": keys, "metrics": metrics,
+            "generation": now, "heads": str(hash(known)), "whole": whole, "keys": keys, "minor": minor(keys), "metrics": metrics,
             "rows": rows, "removed": gone,
         }  # fmt: skip
 
@@ -82,6 +82,12 @@ def differing(runs: Any) -> list[str]:
     return [key for key in first if key in found or counts[key] < total]
 
 
+def minor(keys: Sequence[str]) -> list[str]:
+    """Return those keys that change no result, and the profile's, which others take over."""
+    groups = [name for name in NEUTRAL if name != "data"]
+    return [key for key in keys if any(key == name or key.startswith(f"{name}.") for name in groups)]
+
+
 def measured(runs: Any) -> list[str]:
     """Return the names of all numbers that were measured of some run."""
     return list(dict.fromkeys(metric for run in runs for metric in run["metrics"]))
@@ -91,20 +97,29 @@ def _short(value: float | None) -> float | None:
     return None if value is None else float(f"{value:.6g}")
 
 
-def page(index: Index, plans: Sequence[Plan], run_id: str) -> dict[str, Any]:
-    """Return everything that a run's page shows. Raises KeyError for an unknown run."""
+def page(
+    index: Index, plans: Sequence[Plan], every: Mapping[str, Sequence[Mapping[str, Any]]], run_id: str
+) -> dict[str, Any]:
+    """Return everything that a run's page shows. Raises KeyError for an unknown run.
+
+    Args:
+        index: the runs.
+        plans: the plans of all sweeps.
+        every: the places of all runs (`places`).
+        run_id: which run.
+    """
     with index.lock:
         facts = dict(index.runs[run_id])
         known = dict(index.runs)
     run = Run.of(index.outputs, run_id)
-    where = places(plans).get(run_id, [])
+    where = every.get(run_id, [])
     control = control_of(plans, run_id, known)
     return {
         **facts,
         "name": name(facts, where),
         "places": where,
         "config": whole_config(run),
-        "control": control and {"id": control, "name": name(known[control], places(plans).get(control, [])), "config": whole_config(Run.of(index.outputs, control))},
+        "control": control and {"id": control, "name": name(known[control], every.get(control, [])), "config": whole_config(Run.of(index.outputs, control))},
         "manifest": flatten(run.manifest),
         "clips": clips(run),
         "latency": latency(run),

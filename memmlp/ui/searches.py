@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +33,13 @@ class Searches:
     def stamp(self) -> str:
         """Return a text that changes when a search does."""
         return repr([(name, _stamp(self.outputs / "tune" / name)) for name in self.names()])
+
+    def runs(self) -> Iterator[tuple[str, int, str]]:
+        """Yield a search's name, a trial's number and the id of one of its runs, for all there are."""
+        for name in self.names():
+            for trial in self.page(name).get("trials", ()):
+                for run_id in trial["runs"]:
+                    yield name, trial["number"], run_id
 
     def rows(self) -> dict[str, Any]:
         """Return a row for each search; one that can't be read says why."""

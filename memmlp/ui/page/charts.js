@@ -231,7 +231,7 @@ export function course(values, { fps, label, at: when, go, marks, colours }) {
   const points = values.flatMap((one, i) => one.errors.map((error, frame) => ({ time: frame / fps, error, name: one.name, i })));
   const draw = width => {
     const plot = Plot.plot(base(width, 120, {
-      marginTop: 12, marginBottom: 28, x: { label: 'seconds', labelAnchor: 'right' }, y: { label, grid: true, ticks: 3, zero: true, nice: true },
+      marginTop: 12, marginBottom: 28, x: { label: 'seconds', labelAnchor: 'right', domain: [0, Math.max(values[0].errors.length - 1, 1) / fps] }, y: { label, grid: true, ticks: 3, zero: true, nice: true },
       marks: [
         Plot.rectX(marks, { x1: mark => mark.first / fps, x2: mark => mark.first / fps + 1, fill: 'var(--bad)', fillOpacity: (_, i) => (i ? 0.08 : 0.16) }),
         Plot.line(points, { x: 'time', y: 'error', z: 'i', stroke: point => colours[point.i], strokeWidth: 1.5 }),

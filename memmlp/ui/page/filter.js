@@ -26,7 +26,7 @@ function test(word) {
 // The values of a run under a name, which may be the end or the beginning of a dotted key.
 function values(run, key) {
   if (key === 'tag' || key === 'tags') return run.tags;
-  if (key === 'sweep') return run.places.map(place => place.sweep);
+  if (key === 'sweep' || key === 'search' || key === 'trial') return run.places.map(place => place[key]);
   if (key === 'arm') return run.places.map(place => place.arm);
   if (OWN.includes(key)) return [run[key]];
   const near = name => name === key || name === `${key}.name`;

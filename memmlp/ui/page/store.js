@@ -5,7 +5,7 @@ const answers = embedded ? JSON.parse(embedded.textContent) : null;
 export const alone = answers !== null; // the page is a file without a server
 
 export const runs = new Map();
-export const about = { keys: [], metrics: [], outputs: '', generation: 0, heads: '' };
+export const about = { keys: [], minor: [], metrics: [], outputs: '', generation: 0, heads: '' };
 const listeners = new Set();
 let state = alone ? 'file' : 'connecting';
 
@@ -50,7 +50,7 @@ function readable(row) {
   const metrics = Object.fromEntries(about.metrics.map((key, i) => [key, row.metrics[i]]));
   const words = [
     row.id, row.name, row.status, row.kind, row.device, row.note, row.failure, ...row.tags,
-    ...row.places.flatMap(place => [place.sweep, place.arm]), ...about.keys.map((key, i) => `${key}=${row.config[i]}`),
+    ...row.places.flatMap(place => Object.values(place).map(String)), ...about.keys.map((key, i) => `${key}=${row.config[i]}`),
   ];
   return { ...row, config, metrics, text: words.join('\n').toLowerCase() };
 }
