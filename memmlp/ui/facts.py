@@ -12,14 +12,16 @@ from typing import Any
 
 import yaml
 
-from memmlp.common.errors import InputError
-from memmlp.common.files import read_json
+from memmlp.common.files import plain, read_json
 from memmlp.runs.evaluation_file import current
-from memmlp.runs.identity import belongs, flatten, used_as_configured
+from memmlp.runs.identity import INFERENCE, flatten, used_as_configured
 from memmlp.runs.run import Run
 
 HIDDEN = ("paths", "tracking", "tracker", "force", "hydra", "save_predictions")
 """Groups of the config that say nothing about a run."""
+
+ACTING = {key.split(".")[0] for key in INFERENCE}
+"""Groups of the config that say how a trained network is used."""
 
 TAIL = 1 << 14  # bytes at the end of a metrics log in which its last entries are looked for
 RATE = 5  # how many of its last training entries tell how fast a run is
@@ -32,8 +34,9 @@ def facts(folder: Path) -> dict[str, Any]:
     """Return what the table of runs shows of a run's folder; `damage` lists what could not be read."""
     run, damage = Run(folder), list[str]()
     manifest = _object(run.manifest_path, damage)
-    config = _config(run.config_path, damage)
-    reports = _reports(run, config, damage)
+    config, shown = _config(run.config_path, damage)
+    used = {name: config[name] for name in ACTING if name in config}
+    reports = _reports(run, used, damage)
     recent = last_entries(run.metrics_path)
     git = manifest.get("git") if isinstance(manifest.get("git"), dict) else {}
     return {
@@ -50,15 +53,15 @@ def facts(folder: Path) -> dict[str, Any]:
         "upstream": _word(manifest.get("upstream")),
         "steps": total_steps(manifest.get("kind"), config),
         "recent": recent,
-        "config": {key: value for key, value in flatten(config).items() if _shown(key)},
-        "metrics": _metrics(run, reports),
+        "config": shown,
+        "metrics": _metrics(run, used, reports),
         "failure": _word(read_json(folder / "FAILED").get("reason")),
         **_notes(folder),
         "damage": damage,
     }
 
 
-def last_entries(path: Path) -> list[list[float]]:
+def last_entries(path: Path) -> list[list[Any]]:
     """Return step, time and loss of a log's last training entries, the newest last."""
     try:
         with open(path, "rb") as file:
@@ -66,11 +69,11 @@ def last_entries(path: Path) -> list[list[float]]:
             lines = file.read().split(b"\n")[:-1]
     except OSError:
         return []
-    found: list[list[float]] = []
+    found: list[list[Any]] = []
     for line in reversed(lines):
         entry = parsed_line(line)
         if entry and entry["phase"] == "train":
-            found.append([entry["step"], entry["time"], entry["values"].get("loss", math.nan)])
+            found.append([entry["step"], entry["time"], finite(entry["values"].get("loss"))])
         if len(found) == RATE:
             break
     return found[::-1]
@@ -86,6 +89,11 @@ def parsed_line(line: bytes) -> dict[str, Any] | None:
         return None
 
 
+def finite(value: float | None) -> float | None:
+    """Return a number; None for none, NaN and infinity."""
+    return value if value is not None and math.isfinite(value) else None
+
+
 def total_steps(kind: object, config: Mapping[str, Any]) -> int | None:
     """Return how many steps a run's training has; None where its config does not say."""
     group = config.get("vqvae" if kind == "vqvae" else "optim")
@@ -98,30 +106,37 @@ def read_config(path: Path) -> dict[str, Any]:
 
     The runs of a sweep share most groups of their configs, so that each group's text is parsed once.
     """
+    return _parsed(path)[0]
+
+
+def _parsed(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the config of a file, and its dotted keys that are shown. Raises ValueError."""
     try:
-        text = path.read_text(encoding="utf-8")
-        found: dict[str, Any] = {}
-        for group in re.split(r"\n(?=[^\s#-])", text):
-            found |= _group(group)
-        return found
+        groups = [_group(group) for group in re.split(r"\n(?=[^\s#-])", path.read_text(encoding="utf-8"))]
     except (OSError, UnicodeDecodeError, yaml.YAMLError, TypeError) as error:
         raise ValueError(str(error)) from None
+    config: dict[str, Any] = {}
+    shown: dict[str, Any] = {}
+    for tree, flat in groups:
+        config |= tree
+        shown |= flat
+    return config, shown
 
 
 @lru_cache(4096)
-def _group(text: str) -> dict[str, Any]:
+def _group(text: str) -> tuple[dict[str, Any], dict[str, Any]]:
     found = yaml.load(text, Loader)  # a safe loader
     if not isinstance(found, dict):
         raise TypeError("no config")
-    return found
+    return found, {key: value for key, value in plain(flatten(found)).items() if _shown(key)}
 
 
-def _config(path: Path, damage: list[str]) -> dict[str, Any]:
+def _config(path: Path, damage: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
     try:
-        return read_config(path)
+        return _parsed(path)
     except ValueError:
         damage.append(path.name)
-        return {}
+        return {}, {}
 
 
 def _object(path: Path, damage: list[str]) -> dict[str, Any]:
@@ -148,17 +163,15 @@ def _reports(run: Run, config: Mapping[str, Any], damage: list[str]) -> list[dic
     return [report for *_, report in sorted(found, key=lambda one: one[:2])]
 
 
-def _metrics(run: Run, reports: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+def _metrics(
+    run: Run, config: Mapping[str, Any], reports: Iterable[Mapping[str, Any]]
+) -> dict[str, float]:
     """Return what was measured as numbers by dotted name, such as "stream.rotation.MPJPE"."""
     found: dict[str, Any] = {}
     for report in reports:
         found |= flatten(report["mean"], f"{report.get('mode')}.")
-    if any(run.deployments.glob("*/latency.json")):
-        try:
-            record = run.preferred_deployment.record
-        except InputError:  # the config is damaged, as is said elsewhere
-            record = {}
-        found |= {f"latency.{key}": record[key] for key in COSTS if key in record}
+    record = run.deployment_used(config).record
+    found |= {f"latency.{key}": record[key] for key in COSTS if key in record}
     if run.results_path.exists():
         found |= flatten(read_json(run.results_path), "vqvae.")
     return {key: value for key, value in found.items() if isinstance(value, int | float) and math.isfinite(value)}

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from memmlp.common.files import plain
 from memmlp.runs.identity import ID
 from memmlp.runs.run import Run
 from memmlp.ui import facts as run_facts
@@ -74,7 +73,7 @@ class Index:
         signature = _signature(folder)
         known = self.runs.get(run_id)
         if known is None or self.signatures.get(run_id) != signature:
-            known = plain(run_facts.facts(folder))
+            known = run_facts.facts(folder)
             self.signatures[run_id] = signature
             if self.store:
                 self.store.put(run_id, signature, known)

@@ -132,7 +132,10 @@ class Handler(BaseHTTPRequestHandler):
             self._json(200, found)
 
     def _json(self, code: int, value: Mapping[str, Any]) -> None:
-        text = json.dumps(plain(value), separators=(",", ":"), allow_nan=False)
+        try:
+            text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+        except ValueError:  # a number that JSON has no word for
+            text = json.dumps(plain(value), separators=(",", ":"), allow_nan=False)
         self._send(code, "application/json", text.encode())
 
     def _file(self, run_id: str, name: str) -> None:
