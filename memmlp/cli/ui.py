@@ -50,7 +50,10 @@ def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path)
         raise InputError("--token: goes with --host; this machine's own address needs none")
     if token is not None and len(token) < 16:
         raise InputError(f"--token: {len(token)} characters; allowed are 16 or more")
-    with Server(Answers(outputs, predict), port, host, token) as server, contextlib.suppress(KeyboardInterrupt):
+    with (
+        Server(Answers(outputs, predict), port, host, token) as server,
+        contextlib.suppress(KeyboardInterrupt),
+    ):
         click.echo(f"{server.url}  runs in {outputs / 'runs'}; Ctrl-C ends")
         if not no_browser:
             webbrowser.open(server.url)

@@ -61,7 +61,10 @@ class Answers:
             self.look()
         room, _, rest = name.partition("/")
         if room == "runs" and not rest:
-            return {**self.rows.since(int(query.get("since", 0)), query.get("heads", "")), "outputs": str(self.outputs.absolute())}
+            return {
+                **self.rows.since(int(query.get("since", 0)), query.get("heads", "")),
+                "outputs": str(self.outputs.absolute()),
+            }
         if room == "curves" and not rest:
             return self._curves(query)
         if room == "body" and not rest:
@@ -78,7 +81,9 @@ class Answers:
         raise KeyError(name)
 
     def _curves(self, query: Mapping[str, str]) -> dict[str, Any]:
-        wanted = [one for one in re.findall(ID, query.get("runs", "")) if one in self.index.runs][:MOST_CURVES]
+        wanted = [one for one in re.findall(ID, query.get("runs", "")) if one in self.index.runs][
+            :MOST_CURVES
+        ]
         names = query["names"].split("|") if query.get("names") else None
         return {"curves": {run_id: self.curves.of(run_id, names) for run_id in wanted}}
 

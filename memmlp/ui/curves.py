@@ -72,7 +72,10 @@ def thinned(points: dict[int, float], most: int = MOST) -> list[list[Any]]:
         kept = {0, len(pairs) - 1}
         for start in range(0, len(pairs), size):
             stretch = range(start, min(start + size, len(pairs)))
-            kept |= {min(stretch, key=lambda i: _order(pairs[i][1])), max(stretch, key=lambda i: _order(pairs[i][1]))}
+            kept |= {
+                min(stretch, key=lambda i: _order(pairs[i][1])),
+                max(stretch, key=lambda i: _order(pairs[i][1])),
+            }
         pairs = [pairs[i] for i in sorted(kept)]
     return [[step for step, _ in pairs], [_rounded(value) for _, value in pairs]]
 

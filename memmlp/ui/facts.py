@@ -84,7 +84,12 @@ def parsed_line(line: bytes) -> dict[str, Any] | None:
     try:
         entry = json.loads(line)
         values = {str(key): float(value) for key, value in entry["values"].items()}
-        return {"step": int(entry["step"]), "phase": str(entry["phase"]), "time": float(entry["time"]), "values": values}
+        return {
+            "step": int(entry["step"]),
+            "phase": str(entry["phase"]),
+            "time": float(entry["time"]),
+            "values": values,
+        }
     except (ValueError, KeyError, TypeError, AttributeError):
         return None
 
@@ -163,9 +168,7 @@ def _reports(run: Run, config: Mapping[str, Any], damage: list[str]) -> list[dic
     return [report for *_, report in sorted(found, key=lambda one: one[:2])]
 
 
-def _metrics(
-    run: Run, config: Mapping[str, Any], reports: Iterable[Mapping[str, Any]]
-) -> dict[str, float]:
+def _metrics(run: Run, config: Mapping[str, Any], reports: Iterable[Mapping[str, Any]]) -> dict[str, float]:
     """Return what was measured as numbers by dotted name, such as "stream.rotation.MPJPE"."""
     found: dict[str, Any] = {}
     for report in reports:
@@ -174,7 +177,9 @@ def _metrics(
     found |= {f"latency.{key}": record[key] for key in COSTS if key in record}
     if run.results_path.exists():
         found |= flatten(read_json(run.results_path), "vqvae.")
-    return {key: value for key, value in found.items() if isinstance(value, int | float) and math.isfinite(value)}
+    return {
+        key: value for key, value in found.items() if isinstance(value, int | float) and math.isfinite(value)
+    }
 
 
 def _seconds(value: object) -> float | None:

@@ -63,7 +63,10 @@ class Index:
             return self.generation
 
     def _folders(self) -> Iterator[Path]:
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(self.outputs / "runs") as entries:
+        with (
+            contextlib.suppress(FileNotFoundError, NotADirectoryError),
+            os.scandir(self.outputs / "runs") as entries,
+        ):
             for entry in entries:
                 if ID.fullmatch(entry.name) and entry.is_dir():
                     yield Path(entry.path)
@@ -142,7 +145,9 @@ class Store:
         """Return id, signature and facts of each run that is kept."""
         try:
             with contextlib.closing(self._open()) as database:
-                rows = database.execute("SELECT id, signature, facts FROM runs WHERE format = ?", (FORMAT,)).fetchall()
+                rows = database.execute(
+                    "SELECT id, signature, facts FROM runs WHERE format = ?", (FORMAT,)
+                ).fetchall()
             return [(run_id, signature, json.loads(text)) for run_id, signature, text in rows]
         except (sqlite3.Error, ValueError, OSError):
             with contextlib.suppress(OSError):
@@ -170,5 +175,7 @@ class Store:
     def _open(self) -> sqlite3.Connection:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         database = sqlite3.connect(self.path, timeout=2)
-        database.execute("CREATE TABLE IF NOT EXISTS runs (id TEXT PRIMARY KEY, format TEXT, signature TEXT, facts TEXT)")
+        database.execute(
+            "CREATE TABLE IF NOT EXISTS runs (id TEXT PRIMARY KEY, format TEXT, signature TEXT, facts TEXT)"
+        )
         return database

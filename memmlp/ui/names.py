@@ -10,7 +10,9 @@ from memmlp.sweep.plan import Plan
 SLOTS = ("model", "memory", "predictor")
 
 
-def places(plans: Iterable[Plan], trials: Iterable[tuple[str, int, str]] = ()) -> dict[str, list[dict[str, Any]]]:
+def places(
+    plans: Iterable[Plan], trials: Iterable[tuple[str, int, str]] = ()
+) -> dict[str, list[dict[str, Any]]]:
     """Return, by run id, the sweeps in which a run stands, each with arm and seed, and searches with trials.
 
     `trials` are the name of a search, the number of a trial and the id of one of its runs.
@@ -18,7 +20,9 @@ def places(plans: Iterable[Plan], trials: Iterable[tuple[str, int, str]] = ()) -
     found: dict[str, list[dict[str, Any]]] = {}
     for plan in plans:
         for entry in plan.entries:
-            found.setdefault(entry.id, []).append({"sweep": plan.name, "arm": entry.label, "seed": entry.seed})
+            found.setdefault(entry.id, []).append(
+                {"sweep": plan.name, "arm": entry.label, "seed": entry.seed}
+            )
     for search, number, run_id in trials:
         found.setdefault(run_id, []).append({"search": search, "trial": number})
     return found
@@ -30,7 +34,9 @@ def name(facts: Mapping[str, Any], places: Iterable[Mapping[str, Any]]) -> str:
     seed = config.get("seed")
     ending = "" if seed is None else f" · seed {seed}"
     for place in places:
-        return f"{place['arm']} · seed {place['seed']}" if "arm" in place else f"trial {place['trial']}{ending}"
+        return (
+            f"{place['arm']} · seed {place['seed']}" if "arm" in place else f"trial {place['trial']}{ending}"
+        )
     if facts["kind"] == "vqvae":
         return f"VQ-VAE{ending}"
     slots = {slot: config.get(f"{slot}.name") for slot in SLOTS}

@@ -43,6 +43,16 @@ class Replays:
         self.made: dict[tuple[str, str, str], Future[dict[str, np.ndarray]]] = {}
         self.lock = threading.Lock()
 
+    def now(
+        self, run_id: str, clip: str, mode: str, begin: float | None = None, seconds: float = SECONDS
+    ) -> dict[str, Any]:
+        """Return the same as `get` of a piece of so many seconds, once it is computed."""
+        try:
+            motion = self._motion(Run.of(self.outputs, run_id), clip, mode)
+        except Exception as error:
+            return _failed(error)
+        return piece(motion["truth"], motion["joints"], begin, seconds)
+
     def get(self, run_id: str, clip: str, mode: str, begin: float | None = None) -> dict[str, Any]:
         """Return a piece of a replay, or say that it is being computed.
 
@@ -68,8 +78,7 @@ class Replays:
             return {"state": "computing"}
         except Exception as error:  # the page tells it, and may ask again; the server goes on
             self.made.pop(key, None)
-            words = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-            return {"state": "failed", "reason": words}
+            return _failed(error)
         return piece(motion["truth"], motion["joints"], begin)
 
     def _motion(self, run: Run, clip: str, mode: str) -> dict[str, np.ndarray]:
@@ -103,6 +112,11 @@ class Replays:
         self.worker.shutdown(wait=False, cancel_futures=True)
 
 
+def _failed(error: Exception) -> dict[str, Any]:
+    words = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    return {"state": "failed", "reason": words}
+
+
 def _read(path: Path) -> dict[str, np.ndarray] | None:
     """Return a kept prediction; None where there is none, or the file is damaged."""
     try:
@@ -120,12 +134,15 @@ def body() -> dict[str, Any]:
     return {"limbs": limbs, "heat": HEAT, "joints": JOINTS, "fps": FPS}
 
 
-def piece(truth: np.ndarray, joints: np.ndarray, begin: float | None = None) -> dict[str, Any]:
+def piece(
+    truth: np.ndarray, joints: np.ndarray, begin: float | None = None, seconds: float = SECONDS
+) -> dict[str, Any]:
     """Return a piece of a clip for a page.
 
     Args:
         truth, joints: positions (N, 22, 3), metres, world.
         begin: where the piece begins, seconds; None for around the worst second.
+        seconds: its length.
 
     Returns:
         `errors`, the mean over the joints of each frame of the clip, cm; `worst`, the worst seconds, each with
@@ -135,7 +152,7 @@ def piece(truth: np.ndarray, joints: np.ndarray, begin: float | None = None) -> 
     distances = 100 * np.linalg.norm(joints - truth, axis=-1)
     errors = distances.mean(1)
     worst = worst_seconds(errors)
-    length = SECONDS * FPS
+    length = round(seconds * FPS)
     first = round(begin * FPS) if begin is not None else worst[0]["first"] - (length - FPS) // 2
     first = max(min(first, len(truth) - length), 0)
     shown = slice(first, first + length)

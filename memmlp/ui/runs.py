@@ -17,7 +17,15 @@ from memmlp.ui.facts import read_config
 from memmlp.ui.index import Index
 from memmlp.ui.names import name
 
-SHOWN_FILES = ("config.yaml", "manifest.json", "metrics.jsonl", "code.patch", "FAILED", "notes.json", "poses.png")
+SHOWN_FILES = (
+    "config.yaml",
+    "manifest.json",
+    "metrics.jsonl",
+    "code.patch",
+    "FAILED",
+    "notes.json",
+    "poses.png",
+)
 """Files of a run that the page may show as they are."""
 
 MOST_FILES = 200
@@ -57,7 +65,23 @@ def row(
     facts: Mapping[str, Any], keys: Sequence[str], metrics: Sequence[str], where: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
     """Return a run's row in the table."""
-    own = ("id", "kind", "status", "started", "finished", "seconds", "device", "tags", "note", "failure", "damage", "code", "steps", "recent")
+    own = (
+        "id",
+        "kind",
+        "status",
+        "started",
+        "finished",
+        "seconds",
+        "device",
+        "tags",
+        "note",
+        "failure",
+        "damage",
+        "data",
+        "code",
+        "steps",
+        "recent",
+    )
     return {
         **{key: facts[key] for key in own},
         "name": name(facts, where),
@@ -119,7 +143,12 @@ def page(
         "name": name(facts, where),
         "places": where,
         "config": whole_config(run),
-        "control": control and {"id": control, "name": name(known[control], every.get(control, [])), "config": whole_config(Run.of(index.outputs, control))},
+        "control": control
+        and {
+            "id": control,
+            "name": name(known[control], every.get(control, [])),
+            "config": whole_config(Run.of(index.outputs, control)),
+        },
         "manifest": flatten(run.manifest),
         "clips": clips(run),
         "latency": latency(run),
@@ -153,11 +182,19 @@ def clips(run: Run) -> list[dict[str, Any]]:
         return []
     try:
         found = load(run.folder).clips
-        own = {report["name"]: report.get("frames") for path in run.own_evaluations for report in read_json(path).get("clips", [])}
+        own = {
+            report["name"]: report.get("frames")
+            for path in run.own_evaluations
+            for report in read_json(path).get("clips", [])
+        }
     except (InputError, KeyError, TypeError):
         return []
     return [
-        {"name": clip, "frames": own.get(clip), **{mode: errors[mode] for mode in ("stream", "window") if mode in errors}}
+        {
+            "name": clip,
+            "frames": own.get(clip),
+            **{mode: errors[mode] for mode in ("stream", "window") if mode in errors},
+        }
         for clip, errors in found.items()
     ]
 
@@ -180,6 +217,10 @@ def files(folder: Path) -> list[dict[str, Any]]:
     """Return the files of a run's folder, with their sizes."""
     paths = sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
     return [
-        {"name": str(path.relative_to(folder)), "bytes": path.stat().st_size, "shown": path.name in SHOWN_FILES and path.parent == folder}
+        {
+            "name": str(path.relative_to(folder)),
+            "bytes": path.stat().st_size,
+            "shown": path.name in SHOWN_FILES and path.parent == folder,
+        }
         for path in paths[:MOST_FILES]
     ]

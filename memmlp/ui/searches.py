@@ -46,7 +46,12 @@ class Searches:
         found = []
         for name in self.names():
             page = self.page(name)
-            found.append({key: page.get(key) for key in ("name", "title", "error", "objectives", "wanted", "counts", "best")})
+            found.append(
+                {
+                    key: page.get(key)
+                    for key in ("name", "title", "error", "objectives", "wanted", "counts", "best")
+                }
+            )
         return {"searches": found}
 
     def page(self, name: str) -> dict[str, Any]:
@@ -75,7 +80,11 @@ def _stamp(folder: Path) -> int:
 
 def _page(folder: Path) -> dict[str, Any]:
     spec = read_json(folder / "search.json")
-    about = {"name": folder.name, "title": str(spec.get("name") or folder.name), "wanted": spec.get("n_trials")}
+    about = {
+        "name": folder.name,
+        "title": str(spec.get("name") or folder.name),
+        "wanted": spec.get("n_trials"),
+    }
     try:
         return {**about, **_of_study(_study(folder, spec.get("storage")))}
     except KeyError:
@@ -104,7 +113,14 @@ def _of_study(study: optuna.Study) -> dict[str, Any]:
     return {
         "objectives": objectives,
         "keys": list(dict.fromkeys(key for trial in trials for key in trial.params)),
-        "log": sorted({key for trial in trials for key, one in trial.distributions.items() if getattr(one, "log", False)}),
+        "log": sorted(
+            {
+                key
+                for trial in trials
+                for key, one in trial.distributions.items()
+                if getattr(one, "log", False)
+            }
+        ),
         "counts": dict(Counter(trial.state.name.lower() for trial in trials)),
         "front": front,
         "best": [_trial(trial) for trial in complete if trial.number in front][:1],
@@ -122,5 +138,9 @@ def _trial(trial: FrozenTrial) -> dict[str, Any]:
         "params": trial.params,
         "runs": list(trial.user_attrs.get("runs", ())),
         "reason": str(trial.user_attrs.get("reason", "")),
-        "course": [[step, value] for step, value in course[:: max(len(course) // MOST_STEPS, 1)] if math.isfinite(value)],
+        "course": [
+            [step, value]
+            for step, value in course[:: max(len(course) // MOST_STEPS, 1)]
+            if math.isfinite(value)
+        ],
     }

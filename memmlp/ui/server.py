@@ -77,7 +77,11 @@ class Handler(BaseHTTPRequestHandler):
             url = urllib.parse.urlsplit(self.path)
             query = dict(urllib.parse.parse_qsl(url.query))
             if not self._allowed(query):
-                self._send(403, "text/plain; charset=utf-8", b"not allowed; open the address that memmlp ui printed\n")
+                self._send(
+                    403,
+                    "text/plain; charset=utf-8",
+                    b"not allowed; open the address that memmlp ui printed\n",
+                )
             elif "token" in query:
                 self._settle(query["token"])
             else:
@@ -89,7 +93,9 @@ class Handler(BaseHTTPRequestHandler):
             return self.headers.get("Sec-Fetch-Mode") == "navigate" and self.path.partition("?")[0] == "/"
         if self.server.token is None:
             return self._host() in LOCAL  # another name that leads here is DNS rebinding
-        return secrets.compare_digest((query.get("token") or self._cookie()).encode(), self.server.token.encode())
+        return secrets.compare_digest(
+            (query.get("token") or self._cookie()).encode(), self.server.token.encode()
+        )
 
     def _host(self) -> str:
         return self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
@@ -162,7 +168,9 @@ class Handler(BaseHTTPRequestHandler):
             known = "-"
             while not watch.closed:
                 state = watch.wait(known)
-                self.wfile.write(b": quiet\n\n" if state == known else f"data: {json.dumps(state)}\n\n".encode())
+                self.wfile.write(
+                    b": quiet\n\n" if state == known else f"data: {json.dumps(state)}\n\n".encode()
+                )
                 self.wfile.flush()
                 known = state
         finally:
@@ -208,14 +216,18 @@ class Server(ThreadingHTTPServer):
     block_on_close = False
     allow_reuse_address = True
 
-    def __init__(self, answers: Answers, port: int, host: str = LOCAL[0], token: str | None = None, every: float = 1.0):
+    def __init__(
+        self, answers: Answers, port: int, host: str = LOCAL[0], token: str | None = None, every: float = 1.0
+    ):
         self.answers, self.policy = answers, pages.policy()
         self.token = None if loopback(host) else token or secrets.token_urlsafe(24)
         self.watch = Watch(answers.look, every)
         try:
             super().__init__((host, port), Handler)
         except (OSError, OverflowError) as error:
-            raise InputError(f"--host {host} --port {port}: {getattr(error, 'strerror', None) or error}; allowed are this machine's addresses and free ports") from None
+            raise InputError(
+                f"--host {host} --port {port}: {getattr(error, 'strerror', None) or error}; allowed are this machine's addresses and free ports"
+            ) from None
 
     def server_bind(self) -> None:
         """Bind to the address, without asking a name server for its name."""

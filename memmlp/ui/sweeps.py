@@ -125,7 +125,12 @@ class Sweeps:
 
     def _share(self, plan: Plan, states: Mapping[str, str]) -> float:
         """Return which part of all steps is done."""
-        total = sum(self._left(task, "new") if task.id not in self.index.runs else int(self.index.runs[task.id]["steps"] or 0) for task in plan.tasks)
+        total = sum(
+            self._left(task, "new")
+            if task.id not in self.index.runs
+            else int(self.index.runs[task.id]["steps"] or 0)
+            for task in plan.tasks
+        )
         left = sum(self._left(task, states[task.key]) for task in plan.tasks)
         return 1 - left / total if total else 0.0
 
@@ -135,7 +140,11 @@ class Sweeps:
         paces = [pace for task in plan.tasks if (pace := _pace(self.index.runs.get(task.id))) is not None]
         if not running or not paces:
             return None
-        left = sum(self._left(task, states[task.key]) for task in plan.tasks if states[task.key] not in ("failed", "blocked"))
+        left = sum(
+            self._left(task, states[task.key])
+            for task in plan.tasks
+            if states[task.key] not in ("failed", "blocked")
+        )
         return left * statistics.median(paces) / len(running)
 
     def table(self, plan: Plan) -> dict[str, Any]:
@@ -181,7 +190,12 @@ class Sweeps:
 def table_words(table: Any) -> dict[str, Any]:
     """Return what a table holds, with its columns' heads and what explains it."""
     words = json.loads(as_json(table))
-    return {**words, "caption": caption(table), "headings": {m: heading(m) for m in table.metrics}, "legend": legend(table)}
+    return {
+        **words,
+        "caption": caption(table),
+        "headings": {m: heading(m) for m in table.metrics},
+        "legend": legend(table),
+    }
 
 
 def caption_of(sweep: Sweep) -> str:
@@ -202,6 +216,8 @@ def _pace(facts: Mapping[str, Any] | None) -> float | None:
     if len(recent) < 2 or recent[-1][0] <= recent[0][0]:
         return None
     seconds = recent[-1][1] - recent[0][1]
-    return seconds / (recent[-1][0] - recent[0][0]) if 0 < seconds < 86400 and recent[-1][1] < time.time() + 60 else None
-
-
+    return (
+        seconds / (recent[-1][0] - recent[0][0])
+        if 0 < seconds < 86400 and recent[-1][1] < time.time() + 60
+        else None
+    )

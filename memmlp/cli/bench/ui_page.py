@@ -24,7 +24,9 @@ MEMORIES = ("none", "vq", "lstm", "gru", "no_codes")
 
 @click.command("ui")
 @click.option("--runs", default=2000, show_default=True, type=click.IntRange(1), help="How many run folders.")
-@click.option("--lines", default=300, show_default=True, type=click.IntRange(1), help="Lines of each metrics log.")
+@click.option(
+    "--lines", default=300, show_default=True, type=click.IntRange(1), help="Lines of each metrics log."
+)
 def ui(runs: int, lines: int) -> None:
     """Make many run folders of made-up numbers in a temporary folder, and time the page on them.
 
@@ -33,8 +35,12 @@ def ui(runs: int, lines: int) -> None:
     """
     with tempfile.TemporaryDirectory() as folder:
         outputs = Path(folder)
-        click.echo(f"{runs} runs of {lines} lines, made in {_timed(lambda: make(outputs, runs, lines)):.1f} s")
-        click.echo(f"first answer {first_answer(outputs):.2f} s, from what was kept {first_answer(outputs):.2f} s")
+        click.echo(
+            f"{runs} runs of {lines} lines, made in {_timed(lambda: make(outputs, runs, lines)):.1f} s"
+        )
+        click.echo(
+            f"first answer {first_answer(outputs):.2f} s, from what was kept {first_answer(outputs):.2f} s"
+        )
         browser = next(filter(None, map(shutil.which, BROWSERS)), None)
         if browser is None:
             click.echo("page: not timed, as Chromium is not installed")
@@ -71,7 +77,15 @@ def in_browser(outputs: Path, browser: str) -> tuple[float, float]:
 
     with Server(Answers(outputs), 0) as server, tempfile.TemporaryDirectory() as profile:
         address = f"{server.url}#/runs?filter=memory%3Dgru+stream.MPJPE%3C6.3"
-        command = [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={profile}", "--dump-dom", address]
+        command = [
+            browser,
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            f"--user-data-dir={profile}",
+            "--dump-dom",
+            address,
+        ]
         page = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
     numbers = re.findall(r'data-(ready|filtered)="(\d+)"', page)
     found = {name: int(value) / 1000 for name, value in numbers}
@@ -93,28 +107,57 @@ def make(outputs: Path, runs: int, lines: int) -> None:
         memory = MEMORIES[number % len(MEMORIES)]
         config = {**configs[memory], "seed": number // len(MEMORIES)}
         config["optim"] = {**config["optim"], "steps": 10 * lines, "lr": (1e-3, 3e-4, 1e-4)[number % 3]}
-        _run(outputs / "runs" / f"{0x9E3779B97F4A7C15 * (number + 1) % 2**64:016x}", number, config, lines, yaml)
+        _run(
+            outputs / "runs" / f"{0x9E3779B97F4A7C15 * (number + 1) % 2**64:016x}",
+            number,
+            config,
+            lines,
+            yaml,
+        )
 
 
 def _run(folder: Path, number: int, config: dict[str, Any], lines: int, yaml: Any) -> None:
     """Write one run's folder."""
     factor = 1 + 0.2 * ((number * 7919) % 100) / 100
     errors = {metric: value * factor for metric, value in METRICS.items()}
-    clips = [{"name": f"clip/{clip:02}", "frames": 600, "rotation": errors, "position": errors} for clip in range(CLIPS)]
-    manifest = {"id": folder.name, "kind": "memmlp", "data": "d" * 64, "started": "2026-01-02T03:04:05+00:00", "seconds": {"train": 300.0}}
+    clips = [
+        {"name": f"clip/{clip:02}", "frames": 600, "rotation": errors, "position": errors}
+        for clip in range(CLIPS)
+    ]
+    manifest = {
+        "id": folder.name,
+        "kind": "memmlp",
+        "data": "d" * 64,
+        "started": "2026-01-02T03:04:05+00:00",
+        "seconds": {"train": 300.0},
+    }
     files: dict[str, Any] = {
         "manifest.json": manifest,
         "DONE": {"id": folder.name, "artifacts": {}},
         "deployments/fp32-0/latency.json": {"median_ms": 3.0 * factor, "settings": {}, "run": folder.name},
     }
     for mode in ("stream", "window"):
-        files[f"evaluations/{mode}-0.json"] = {"mode": mode, "run": folder.name, "mean": {"rotation": errors, "position": errors}, "clips": clips}
+        files[f"evaluations/{mode}-0.json"] = {
+            "mode": mode,
+            "run": folder.name,
+            "mean": {"rotation": errors, "position": errors},
+            "clips": clips,
+        }
     for name, content in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(json.dumps(content))
-    (folder / "config.yaml").write_text(yaml.dump(config, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False))
+    (folder / "config.yaml").write_text(
+        yaml.dump(config, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False)
+    )
     log = (
-        json.dumps({"step": 10 * (step + 1), "phase": "train", "time": 1.7e9 + step, "values": {"loss": factor / (1 + step / 30)}})
+        json.dumps(
+            {
+                "step": 10 * (step + 1),
+                "phase": "train",
+                "time": 1.7e9 + step,
+                "values": {"loss": factor / (1 + step / 30)},
+            }
+        )
         for step in range(lines)
     )
     (folder / "metrics.jsonl").write_text("\n".join(log) + "\n")

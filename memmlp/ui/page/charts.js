@@ -79,6 +79,13 @@ export function curves(series, { label, log = false, smooth = 0, each = false, c
   return figure(`${label} by step. ${last.filter(Boolean).join('; ')}.`, draw, rows);
 }
 
+// A chart at least so wide; on a narrower page it scrolls.
+function wide(width, least, options) {
+  const plot = Plot.plot(options(Math.max(width, least)));
+  if (width < least) (plot.tagName === 'svg' ? plot : plot.querySelector('svg')).setAttribute('data-wide', '');
+  return plot;
+}
+
 const thin = (points, most) => points.filter((_, i) => i % Math.ceil(points.length / most) === 0);
 
 // An exponential mean without its bias at the beginning; weight 0 leaves the values alone.
@@ -126,7 +133,7 @@ export function forest(rows, { label, smallest }) {
   const named = Math.min(Math.max(...domain.map(arm => arm.length)) * 6.6 + 18, 230);
   const draw = width => Plot.plot(base(width, 64 + 34 * domain.length, {
     marginLeft: Math.min(named, width * 0.38), marginBottom: 38,
-    x: { label: `${label}, difference from the control (left is better)`, grid: true, zero: true, ticks: Math.min(width / 80, 9), labelAnchor: 'center', labelArrow: 'none' },
+    x: { label: `${label}, difference`, grid: true, zero: true, ticks: Math.min(width / 80, 9), labelAnchor: 'center', labelArrow: 'none' },
     y: { domain, label: null, tickSize: 0, tickFormat: arm => (arm.length > 34 ? `${arm.slice(0, 33)}…` : arm) },
     marks: [
       smallest ? Plot.rect([0], { x1: -smallest, x2: smallest, fill: 'var(--faint)', fillOpacity: 0.1 }) : null,
@@ -209,7 +216,7 @@ export function parallel(trials, axes, { label }) {
   const lines = order.flatMap((trial, rank) => scales.filter(scale => trial.cells[scale.key] !== undefined && trial.cells[scale.key] !== null)
     .map(scale => ({ id: trial.id, axis: scale.name, y: scale.at(trial.cells[scale.key]), rank: (rank + 1) / order.length, best: rank === order.length - 1, text: trial.text })));
   const names = scales.map(scale => scale.name);
-  const draw = width => Plot.plot(base(width, 300, {
+  const draw = width => wide(width, 96 * axes.length, across => base(across, 300, {
     marginLeft: 60, marginRight: 60, marginTop: 40, marginBottom: 30,
     x: { domain: names, type: 'point', axis: null }, y: { axis: null, domain: [0, 1] },
     marks: [
@@ -231,7 +238,7 @@ export function course(values, { fps, label, at: when, go, marks, colours }) {
   const points = values.flatMap((one, i) => one.errors.map((error, frame) => ({ time: frame / fps, error, name: one.name, i })));
   const draw = width => {
     const plot = Plot.plot(base(width, 120, {
-      marginTop: 12, marginBottom: 28, x: { label: 'seconds', labelAnchor: 'right', domain: [0, Math.max(values[0].errors.length - 1, 1) / fps] }, y: { label, grid: true, ticks: 3, zero: true, nice: true },
+      marginTop: 12, marginBottom: 28, x: { label: null, domain: [0, Math.max(values[0].errors.length - 1, 1) / fps] }, y: { label, grid: true, ticks: 3, zero: true, nice: true },
       marks: [
         Plot.rectX(marks, { x1: mark => mark.first / fps, x2: mark => mark.first / fps + 1, fill: 'var(--bad)', fillOpacity: (_, i) => (i ? 0.08 : 0.16) }),
         Plot.line(points, { x: 'time', y: 'error', z: 'i', stroke: point => colours[point.i], strokeWidth: 1.5 }),

@@ -1,7 +1,7 @@
 // The filter of runs: words, and conditions such as memory=gru, seed!=0, stream.MPJPE<6.3, tag=good; all must hold.
 
 const CONDITION = /^([\w.\- ]*?[\w.\-])(<=|>=|!=|=|<|>)(.*)$/;
-const OWN = ['id', 'name', 'status', 'kind', 'device', 'note', 'started', 'code'];
+const OWN = ['id', 'name', 'status', 'kind', 'device', 'note', 'started', 'code', 'data'];
 
 export function parse(text) {
   const words = text.match(/(?:[^\s"]|"[^"]*")+/g) ?? [];

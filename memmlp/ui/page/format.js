@@ -23,7 +23,7 @@ export function number(value, digits) {
   return text.replace('-', MINUS);
 }
 
-export function signed(value, digits = 2) {
+export function signed(value, digits = Math.abs(value) >= 1000 ? 0 : 2) {
   return value > 0 ? `+${number(value, digits)}` : number(value, digits);
 }
 
@@ -83,7 +83,7 @@ export function digitsOf(name) {
 
 export function metricNumber(name, value) {
   if (typeof value !== 'number') return DASH;
-  const digits = digitsOf(name);
+  const digits = Math.abs(value) >= 1000 ? 0 : digitsOf(name);
   return digits === 0 ? number(Math.round(value)) : number(value, digits);
 }
 

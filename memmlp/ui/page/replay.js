@@ -121,7 +121,7 @@ export class Replay {
     this.pieces = [...worst, whole];
     const speeds = h('select', { 'aria-label': 'Speed', onchange: event => { this.speed = Number(event.target.value); } }, [0.1, 0.25, 0.5, 1].map(speed => h('option', { value: speed, selected: speed === this.speed }, `${speed}×`)));
     const chart = course([mine, ...(theirs ? [theirs] : [])].map((one, i) => ({ errors: one.errors, name: i ? this.other.name : this.run.name })), {
-      fps: mine.fps, label: 'error [cm]', at: () => this.time, go: time => this.go(time), marks: mine.worst, colours: ['var(--series0)', 'var(--series1)'],
+      fps: mine.fps, label: 'error [cm] by second', at: () => this.time, go: time => this.go(time), marks: mine.worst, colours: ['var(--series0)', 'var(--series1)'],
     });
     this.chart = chart;
     const ramp = h('div', { class: 'scale' }, h('span', {}, '0'), h('i', { style: `background:linear-gradient(to right, ${body.heat.join(', ')})` }), h('span', {}, `${this.top}+ cm`));

@@ -18,10 +18,12 @@ export function state(status, title) {
 
 // The keys in which these runs differ; of several that differ alike (memory and its sizes) the first.
 export function differing(list, keys) {
-  const first = key => (key.endsWith('.name') ? 0 : key === 'seed' ? 1 : 2);
+  const everywhere = key => list.every(run => (run.config[key] ?? null) !== null);
+  const first = key => (key.endsWith('.name') ? 0 : key === 'seed' ? 1 : everywhere(key) ? 2 : 3);
   const seen = new Set();
   const found = [];
-  for (const key of [...keys].sort((a, b) => first(a) - first(b))) {
+  const rank = new Map(keys.map(key => [key, first(key)]));
+  for (const key of [...keys].sort((a, b) => rank.get(a) - rank.get(b))) {
     const places = new Map();
     const pattern = list.map(run => {
       const value = JSON.stringify(run.config[key] ?? null);
@@ -120,6 +122,12 @@ export function page() {
     const known = list.filter(run => run.status === 'done' && typeof run.metrics[metric] === 'number');
     const first = known.reduce((a, b) => (a && a.metrics[metric] <= b.metrics[metric] ? a : b), null);
     best.hidden = !first;
+    ui.sets = [...new Set(list.filter(run => run.status === 'done').map(run => run.data))];
+    if (ui.sets.length > 1) {
+      const chosen = data => { remember({ filter: `${place().query.get('filter') ?? ''} data=${data}`.trim() }); draw(); };
+      replace(best, `Of ${ui.sets.length} data sets, whose errors do not compare: `, ui.sets.slice(0, 5).map(data => h('button', { type: 'button', class: 'small', onclick: () => chosen(data) }, data || 'unknown', ' ', h('small', {}, number(list.filter(run => run.data === data).length)))));
+      return;
+    }
     if (first) replace(best, 'Best of these by ', metricText(metric), ': ', link(address('run', first.id), first.name), ' ', h('b', {}, metricNumber(metric, first.metrics[metric])), ' · ', link(address('run', first.id, { part: 'replay' }), 'its worst second'));
   }
 
@@ -148,7 +156,7 @@ export function page() {
     const known = {};
     for (const name of ui.columns.filter(one => about.metrics.includes(one) && !one.includes('GT'))) {
       const values = ui.list.map(run => run.metrics[name]).filter(value => typeof value === 'number');
-      if (values.length > 1) known[name] = Math.min(...values);
+      if (values.length > 1 && ui.sets.length < 2) known[name] = Math.min(...values);
     }
     const focused = document.activeElement?.dataset?.run;
     const shown = ui.list.slice(0, ui.drawn);

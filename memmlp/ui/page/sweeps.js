@@ -91,7 +91,7 @@ function effects(table, draw) {
   });
   const choose = changes => { remember(changes); draw(); };
   return section('Effects', h('div', { class: 'tools' }, choice('Metric', tested.map(one => [one, one]), metric, value => choose({ metric: value })), table.modes.length > 1 ? choice('Mode', table.modes.map(one => [one, one]), mode, value => choose({ mode: value })) : null),
-    h('p', { class: 'faint' }, `Difference from ‘${table.control}’, or from the arm’s own control, with its 95 % interval over seeds and clips; filled where it is significant after Holm’s correction. `, h('span', { class: 'diamond' }, '◇'), ' the paper’s difference. The band is the smallest effect of interest.'),
+    h('p', { class: 'faint' }, `Difference from ‘${table.control}’, or from the arm’s own control, with its 95 % interval over seeds and clips; filled where it is significant after Holm’s correction. `, h('span', { class: 'diamond' }, '◇'), ' the paper’s difference. Left is better. The band is the smallest effect of interest.'),
     forest(rows, { label: table.headings[metric].replace(/ ↓| ↑/, ''), smallest: table.smallest[metric] }));
 }
 
@@ -105,7 +105,7 @@ function results(table) {
 
 function cell(one, metric) {
   const effect = one.effect;
-  const lines = [h('span', { class: 'strong' }, one.mean === null ? DASH : metricNumber(metric, one.mean), one.sd === null ? null : h('small', { class: 'faint' }, ` ± ${number(one.sd, 2)}`))];
+  const lines = [h('span', { class: 'strong' }, one.mean === null ? DASH : metricNumber(metric, one.mean), one.sd === null ? null : h('small', { class: 'faint' }, ` ± ${number(one.sd, one.mean >= 1000 ? 0 : 2)}`))];
   if (effect) lines.push(h('span', { class: effect.holm !== null && effect.holm < effect.level ? 'strong' : '' }, signed(effect.mean), effect.low === null ? null : h('small', { class: 'faint' }, ` [${signed(effect.low)}, ${signed(effect.high)}]`)));
   if (effect?.verdict) lines.push(h('span', { class: `verdict ${effect.verdict}` }, effect.verdict));
   if (one.paper !== null) lines.push(h('small', { class: 'faint' }, `paper ${number(one.paper)}`, one.paper_effect === null ? null : ` (${signed(one.paper_effect)})`));
