@@ -38,7 +38,6 @@ def facts(folder: Path) -> dict[str, Any]:
     used = {name: config[name] for name in ACTING if name in config}
     reports = _reports(run, used, damage)
     recent = last_entries(run.metrics_path)
-    git = manifest.get("git") if isinstance(manifest.get("git"), dict) else {}
     return {
         "id": run.id,
         "kind": _word(manifest.get("kind")),
@@ -46,7 +45,7 @@ def facts(folder: Path) -> dict[str, Any]:
         "started": _word(manifest.get("started")),
         "finished": _word(manifest.get("finished")),
         "seconds": _seconds(manifest.get("seconds")),
-        "code": (_word(git.get("commit")) or _word(manifest.get("version")))[:7],
+        "code": _code(manifest),
         "data": _word(manifest.get("data"))[:8],
         "device": _word(manifest.get("gpu")) or _word(manifest.get("device")),
         "host": _word(manifest.get("host")),
@@ -180,6 +179,13 @@ def _metrics(run: Run, config: Mapping[str, Any], reports: Iterable[Mapping[str,
     return {
         key: value for key, value in found.items() if isinstance(value, int | float) and math.isfinite(value)
     }
+
+
+def _code(manifest: Mapping[str, Any]) -> str:
+    """Return the commit of the code that made the run, or its version."""
+    git = manifest.get("git")
+    commit = git.get("commit") if isinstance(git, dict) else None
+    return _word(commit or manifest.get("version"))[:7]
 
 
 def _seconds(value: object) -> float | None:

@@ -1,4 +1,4 @@
-"""All runs below an outputs folder: parsed once, parsed again when their files change, kept between starts."""
+"""All runs below an outputs folder: parsed again when their files change, kept between starts."""
 
 from __future__ import annotations
 

@@ -15,8 +15,8 @@ TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css"}
 HERE, PLAYER = "memmlp.ui", "memmlp.live.player"
 MODULES = {
     **{name: HERE for name in (
-        "main.js", "dom.js", "store.js", "format.js", "charts.js", "runs.js", "run.js", "sweeps.js", "searches.js",
-        "compare.js", "replay.js", "filter.js",
+        "main.js", "dom.js", "store.js", "format.js", "charts.js", "runs.js", "run.js", "sweeps.js",
+        "searches.js", "compare.js", "replay.js", "filter.js",
     )},
     **{name: PLAYER for name in (
         "stage.js", "three/three.module.min.js", "three/three.core.min.js", "three/OrbitControls.js",
@@ -45,7 +45,8 @@ def policy() -> str:
     digest = base64.b64encode(hashlib.sha256(inline[1].encode()).digest()).decode()
     return (
         f"default-src 'none'; script-src 'self' 'sha256-{digest}'; style-src 'self' 'unsafe-inline'; "
-        "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        "img-src 'self' data:; connect-src 'self'; base-uri 'none'; "
+        "form-action 'none'; frame-ancestors 'none'"
     )
 
 

@@ -145,8 +145,8 @@ def piece(
         seconds: its length.
 
     Returns:
-        `errors`, the mean over the joints of each frame of the clip, cm; `worst`, the worst seconds, each with
-        its first frame and its mean error, cm; and from frame `from` on, `truth` and `joints` as whole
+        `errors`, the mean over the joints of each frame of the clip, cm; `worst`, the worst seconds, each
+        with its first frame and its mean error, cm; and from frame `from` on, `truth` and `joints` as whole
         millimetres in the page's axes, 66 a frame.
     """
     distances = 100 * np.linalg.norm(joints - truth, axis=-1)

@@ -56,9 +56,15 @@ class Rows:
         ]
         gone = [run_id for run_id, when in removed.items() if when > generation]
         return {
-            "generation": now, "heads": str(hash(known)), "whole": whole, "keys": keys, "minor": minor(keys), "metrics": metrics,
-            "rows": rows, "removed": gone,
-        }  # fmt: skip
+            "generation": now,
+            "heads": str(hash(known)),
+            "whole": whole,
+            "keys": keys,
+            "minor": minor(keys),
+            "metrics": metrics,
+            "rows": rows,
+            "removed": gone,
+        }
 
 
 def row(

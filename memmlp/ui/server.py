@@ -105,11 +105,12 @@ class Handler(BaseHTTPRequestHandler):
             found = SimpleCookie(self.headers.get("Cookie", "")).get(f"{COOKIE}_{self.server.server_port}")
         except CookieError:
             return ""
-        return found.value if found else ""
+        return urllib.parse.unquote(found.value) if found else ""
 
     def _settle(self, token: str) -> None:
         """Put the token of the address into a cookie, so that it stands in no history."""
-        cookie = f"{COOKIE}_{self.server.server_port}={urllib.parse.quote(token)}; HttpOnly; SameSite=Strict; Path=/"
+        named = f"{COOKIE}_{self.server.server_port}={urllib.parse.quote(token)}"
+        cookie = f"{named}; HttpOnly; SameSite=Strict; Path=/"
         self._send(303, "text/plain", b"", {"Location": "/", "Set-Cookie": cookie})
 
     def _route(self, name: str, query: Mapping[str, str]) -> None:
@@ -183,9 +184,11 @@ class Handler(BaseHTTPRequestHandler):
     def _head(self, code: int, headers: Mapping[str, str]) -> None:
         self.send_response(code)
         safe = {
-            "Cache-Control": "no-store", "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer",
+            "Cache-Control": "no-store",
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",
             "Content-Security-Policy": self.server.policy,
-        }  # fmt: skip
+        }
         for name, value in (safe | dict(headers)).items():
             self.send_header(name, value)
         self.end_headers()
@@ -225,9 +228,9 @@ class Server(ThreadingHTTPServer):
         try:
             super().__init__((host, port), Handler)
         except (OSError, OverflowError) as error:
-            raise InputError(
-                f"--host {host} --port {port}: {getattr(error, 'strerror', None) or error}; allowed are this machine's addresses and free ports"
-            ) from None
+            reason = getattr(error, "strerror", None) or error
+            allowed = "allowed are this machine's addresses and free ports"
+            raise InputError(f"--host {host} --port {port}: {reason}; {allowed}") from None
 
     def server_bind(self) -> None:
         """Bind to the address, without asking a name server for its name."""

@@ -135,7 +135,7 @@ class Sweeps:
         return 1 - left / total if total else 0.0
 
     def _time_left(self, plan: Plan, states: Mapping[str, str]) -> float | None:
-        """Return about how many seconds the sweep needs, with as many workers as are at it; None if nobody is."""
+        """Return about how many seconds the workers that are at it still need; None if nobody is."""
         running = [task for task in plan.tasks if states[task.key] == "running"]
         paces = [pace for task in plan.tasks if (pace := _pace(self.index.runs.get(task.id))) is not None]
         if not running or not paces:
@@ -148,7 +148,7 @@ class Sweeps:
         return left * statistics.median(paces) / len(running)
 
     def table(self, plan: Plan) -> dict[str, Any]:
-        """Return the sweep's table with effects and verdicts; it is made again when one of its runs changed."""
+        """Return the table with effects and verdicts, made again when one of its runs changed."""
         with self.lock:
             stamp = [(entry.key, self.index.signatures.get(entry.id)) for entry in plan.entries]
             known = self.tables.get(plan.name)
@@ -206,12 +206,14 @@ def caption_of(sweep: Sweep) -> str:
 def of_plan(plan: Plan) -> Sweep:
     """Return a sweep with a plan's arms and seeds; its first arm is the control."""
     seeds = list(dict.fromkeys(entry.seed for entry in plan.entries)) or [0]
-    arms = {label: [] for label in dict.fromkeys(entry.label for entry in plan.entries)} or {"-": []}
+    arms: dict[str, list[str]] = {
+        label: [] for label in dict.fromkeys(entry.label for entry in plan.entries)
+    } or {"-": []}
     return parse_sweep(plan.name, {"title": plan.name, "seeds": seeds, "arms": arms})
 
 
 def _pace(facts: Mapping[str, Any] | None) -> float | None:
-    """Return a run's seconds a step: over its last entries while it trains, over all of it when it is done."""
+    """Return a run's seconds a step over its last entries; None where they don't tell."""
     recent = (facts or {}).get("recent") or []
     if len(recent) < 2 or recent[-1][0] <= recent[0][0]:
         return None

@@ -17,7 +17,7 @@ from memmlp.cli.bench.verdict_simulation import calibration
 
 @click.group("bench")
 def bench() -> None:
-    """Measure this machine: speed as rates and as ratios within one run, sweeps under kills, verdicts, pages."""
+    """Measure this machine: speed as rates and ratios within one run, sweeps under kills, verdicts, pages."""
 
 
 for command in (prepare, stream, latency, avatar, soak, tracking, chaos, chaos_tune, calibration, ui):

@@ -1,6 +1,9 @@
 // The filter of runs: words, and conditions such as memory=gru, seed!=0, stream.MPJPE<6.3, tag=good; all must hold.
 
+import { about } from './store.js';
+
 const CONDITION = /^([\w.\- ]*?[\w.\-])(<=|>=|!=|=|<|>)(.*)$/;
+const PLACES = ['sweep', 'arm', 'search', 'trial'];
 const OWN = ['id', 'name', 'status', 'kind', 'device', 'note', 'started', 'code', 'data'];
 
 export function parse(text) {
@@ -20,24 +23,24 @@ function test(word) {
     return run => run.text.includes(wanted);
   }
   const [, key, sign, wanted] = found;
-  return run => values(run, key).some(value => compare(value, sign, wanted)) !== (sign === '!=');
+  const values = reader(key);
+  return run => values(run).some(value => compare(value, sign, wanted)) !== (sign === '!=');
 }
 
-// The values of a run under a name, which may be the end or the beginning of a dotted key.
-function values(run, key) {
-  if (key === 'tag' || key === 'tags') return run.tags;
-  if (key === 'sweep' || key === 'search' || key === 'trial') return run.places.map(place => place[key]);
-  if (key === 'arm') return run.places.map(place => place.arm);
-  if (OWN.includes(key)) return [run[key]];
+// What gives a run's values under a name, which may be the end of a dotted key.
+function reader(key) {
+  if (key === 'tag' || key === 'tags') return run => run.tags;
+  if (PLACES.includes(key)) return run => run.places.map(place => place[key]).filter(value => value !== undefined);
+  if (OWN.includes(key)) return run => [run[key]];
   const near = name => name === key || name === `${key}.name`;
   const far = name => name.endsWith(`.${key}`) || name.replace('.rotation.', '.') === key;
   for (const fits of [near, far]) {
-    for (const group of [run.config, run.metrics]) {
-      const name = Object.keys(group).find(fits);
-      if (name !== undefined) return [group[name]];
+    for (const [group, names] of [['config', about.keys], ['metrics', about.metrics]]) {
+      const name = names.find(fits);
+      if (name !== undefined) return run => [run[group][name]];
     }
   }
-  return [];
+  return () => [];
 }
 
 function compare(value, sign, wanted) {

@@ -1,7 +1,7 @@
 // The way from the address to a page, and the bar above all pages.
 
 import { h, replace, link, empty, say } from './dom.js';
-import { alone, connection, follow, listen, load, place } from './store.js';
+import { alone, ask, connection, follow, listen, load, place } from './store.js';
 import * as runs from './runs.js';
 import * as run from './run.js';
 import * as compare from './compare.js';
@@ -86,4 +86,8 @@ try {
 await show();
 document.documentElement.dataset.ready = String(Math.round(performance.now()));
 follow();
+if (place().query.has('time')) { // memmlp bench ui measures
+  const { ready, filtered } = document.documentElement.dataset;
+  ask(`timing?${new URLSearchParams({ ready, filtered })}`);
+}
 if (alone) document.documentElement.dataset.alone = '';

@@ -26,7 +26,7 @@ export function differing(list, keys) {
   for (const key of [...keys].sort((a, b) => rank.get(a) - rank.get(b))) {
     const places = new Map();
     const pattern = list.map(run => {
-      const value = JSON.stringify(run.config[key] ?? null);
+      const value = run.cells[key];
       if (!places.has(value)) places.set(value, places.size);
       return places.get(value);
     });

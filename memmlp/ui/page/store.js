@@ -52,7 +52,8 @@ function readable(row) {
     row.id, row.name, row.status, row.kind, row.device, row.note, row.failure, ...row.tags,
     ...row.places.flatMap(place => Object.values(place).map(String)), ...about.keys.map((key, i) => `${key}=${row.config[i]}`),
   ];
-  return { ...row, config, metrics, text: words.join('\n').toLowerCase() };
+  const cells = Object.fromEntries(about.keys.map((key, i) => [key, JSON.stringify(row.config[i] ?? null)]));
+  return { ...row, config, cells, metrics, text: words.join('\n').toLowerCase() };
 }
 
 export const connection = () => state;
