@@ -91,8 +91,11 @@ class Handler(BaseHTTPRequestHandler):
         """Return whether a request may be answered: by its host, where it comes from, and its token."""
         if self.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
             return self.headers.get("Sec-Fetch-Mode") == "navigate" and self.path.partition("?")[0] == "/"
-        if self.server.token is None:
-            return self._host() in LOCAL  # another name that leads here is DNS rebinding
+        if self.server.token is None:  # another name that leads here is DNS rebinding
+            return self._host() in (
+                *LOCAL,
+                self.server.server_name,
+            )
         return secrets.compare_digest(
             (query.get("token") or self._cookie()).encode(), self.server.token.encode()
         )

@@ -26,7 +26,9 @@ def outputs(tmp_path: Path) -> Path:
 
 def made(outputs: Path) -> Sweep:
     """Make a finished sweep called "mine" of made-up runs."""
-    arms = {arm: {"overrides": [f"memory={arm}"], "paper": {"MPJPE": 6 * factor}} for arm, factor in ARMS.items()}
+    arms = {
+        arm: {"overrides": [f"memory={arm}"], "paper": {"MPJPE": 6 * factor}} for arm, factor in ARMS.items()
+    }
     sweep = parse_sweep("mine", {"title": "Mine", "seeds": list(SEEDS), "arms": arms, "metrics": ["MPJPE"]})
     entries, tasks = [], []
     for arm, factor in ARMS.items():
@@ -54,7 +56,9 @@ def begun(outputs: Path, name: str = "abcdef0123456789", step: int = 500) -> Run
     run = Run.of(outputs, name)
     run.folder.mkdir(parents=True)
     run.config_path.write_text("memory:\n  name: lstm\nseed: 7\noptim:\n  steps: 2000\n")
-    run.manifest_path.write_text(json.dumps({"id": name, "kind": "memmlp", "started": "2026-01-02T03:04:05+00:00"}))
+    run.manifest_path.write_text(
+        json.dumps({"id": name, "kind": "memmlp", "started": "2026-01-02T03:04:05+00:00"})
+    )
     for at in range(0, step + 1, 100):
         run.log(at, {"loss": 5 - at / 1000})
     return run

@@ -19,14 +19,16 @@ def test_facts_of_a_finished_run(outputs: Path):
     (run.folder / "notes.json").write_text(json.dumps({"tags": ["good", 7], "note": "<b>look</b>"}))
     found = facts(run.folder)
     assert (found["id"], found["done"], found["steps"], found["damage"]) == (run.id, True, 2000, [])
-    assert found["metrics"]["stream.rotation.MPJPE"] == pytest.approx(run.results["stream"]["rotation"]["MPJPE"])
+    assert found["metrics"]["stream.rotation.MPJPE"] == pytest.approx(
+        run.results["stream"]["rotation"]["MPJPE"]
+    )
     assert found["metrics"]["latency.median_ms"] == pytest.approx(0.64)
     assert (found["tags"], found["note"]) == (["good", "7"], "<b>look</b>")
     assert found["recent"][-1][0] == 2000
 
 
 @pytest.mark.parametrize(
-    "name, content, damaged",
+    ("name", "content", "damaged"),
     [
         ("manifest.json", b"{", "manifest.json"),
         ("config.yaml", b"a: [", "config.yaml"),

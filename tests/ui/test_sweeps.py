@@ -13,8 +13,8 @@ from memmlp.sweep.kept import keep, kept
 from memmlp.sweep.plan import Plan
 from memmlp.tables.build_table import collect, finished
 from memmlp.tables.formats import as_json
-from memmlp.tables.runs_of_plan import finder
 from memmlp.tables.measured_run import load
+from memmlp.tables.runs_of_plan import finder
 from memmlp.ui.index import Index
 from memmlp.ui.sweeps import NOT_KEPT, ROUNDS, Sweeps
 
@@ -34,7 +34,10 @@ def test_the_table_is_that_of_the_command(outputs: Path):
     assert shown["rows"] == table["rows"]
     (row,) = [row for row in shown["rows"] if row["label"] == "gru"]
     effect = row["cells"]["stream"]["MPJPE"]["effect"]
-    assert (effect["verdict"], row["cells"]["stream"]["MPJPE"]["paper_effect"]) == ("holds", pytest.approx(-1.2))
+    assert (effect["verdict"], row["cells"]["stream"]["MPJPE"]["paper_effect"]) == (
+        "holds",
+        pytest.approx(-1.2),
+    )
 
 
 def test_progress_and_time_left(outputs: Path, monkeypatch: pytest.MonkeyPatch):
@@ -42,7 +45,9 @@ def test_progress_and_time_left(outputs: Path, monkeypatch: pytest.MonkeyPatch):
     assert (before["counts"], before["share"], before["left"]) == ({"done": 6}, 1.0, None)
     run = run_of(outputs, "gru", 2)
     run.marker.unlink()
-    lines = [{"step": s, "phase": "train", "time": s / 100, "values": {"loss": 1}} for s in range(0, 1001, 100)]
+    lines = [
+        {"step": s, "phase": "train", "time": s / 100, "values": {"loss": 1}} for s in range(0, 1001, 100)
+    ]
     run.metrics_path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     monkeypatch.setattr(Run, "state", lambda self, complete: "done" if complete else "running")
     sweeps = sweeps_of(outputs)
