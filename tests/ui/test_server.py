@@ -82,9 +82,11 @@ def test_pages_of_a_run_a_sweep_and_curves(server: Server, outputs: Path):
 @pytest.mark.parametrize(
     "path",
     [
-        "/../../etc/passwd", "/plot/../../server.py", "/plot/%2e%2e/%2e%2e/server.py", "/server.py", "/api/run/" + "0" * 16,
+        "/../../etc/passwd", "/plot/../../server.py", "/plot/%2e%2e/%2e%2e/server.py", "/server.py",
+        "/api/run/" + "0" * 16,
         "/api/run/../x", "/api/sweeps/none", "/api/sweeps/..%2Fmine", "/api/searches/..%2F..", "/api/none",
-        "/files/", "/files/{id}/", "/files/{id}/DONE", "/files/{id}/model.safetensors", "/files/{id}/..%2F{id}%2Fconfig.yaml",
+        "/files/", "/files/{id}/", "/files/{id}/DONE", "/files/{id}/model.safetensors",
+        "/files/{id}/..%2F{id}%2Fconfig.yaml",
         "/files/{id}/evaluations/stream-0.json", "/files/..%2Fruns%2F{id}/config.yaml", "/files//etc/passwd",
     ],
 )  # fmt: skip
@@ -187,7 +189,7 @@ def test_news_come_when_something_changed(server: Server, outputs: Path):
 def test_a_port_that_is_taken_is_one_line(server: Server, outputs: Path):
     with pytest.raises(InputError, match=f"--port {server.server_port}: .*; allowed are"):
         Server(Answers(outputs), server.server_port)
-    with pytest.raises(InputError, match="--host nowhere.invalid"):
+    with pytest.raises(InputError, match=r"--host nowhere\.invalid"):
         Server(Answers(outputs), 0, "nowhere.invalid")
 
 
