@@ -216,7 +216,7 @@ export function parallel(trials, axes, { label }) {
   const lines = order.flatMap((trial, rank) => scales.filter(scale => trial.cells[scale.key] !== undefined && trial.cells[scale.key] !== null)
     .map(scale => ({ id: trial.id, axis: scale.name, y: scale.at(trial.cells[scale.key]), rank: (rank + 1) / order.length, best: rank === order.length - 1, text: trial.text })));
   const names = scales.map(scale => scale.name);
-  const draw = width => wide(width, 96 * axes.length, across => base(across, 300, {
+  const draw = width => wide(width, 124 * axes.length, across => base(across, 300, {
     marginLeft: 60, marginRight: 60, marginTop: 40, marginBottom: 30,
     x: { domain: names, type: 'point', axis: null }, y: { axis: null, domain: [0, 1] },
     marks: [
