@@ -6,13 +6,15 @@ import { number } from './format.js';
 const Plot = window.Plot;
 export const COLOURS = Array.from({ length: 10 }, (_, i) => `var(--series${i})`);
 
+let latest = 0; // the last chart's width: most are as wide, so that one that is drawn anew does not jump
+
 // A figure that is drawn again when its place changes its width. draw(width) returns an element.
 export function figure(label, draw, rows) {
   const frame = h('div', { class: 'plot' });
   const details = rows && h('details', { class: 'data' }, h('summary', {}, 'Data'), h('div'));
   details?.addEventListener('toggle', () => details.open && replace(details.lastChild, dataTable(rows())));
   const element = h('figure', { class: 'chart' }, frame, details);
-  let width = 0;
+  let width = latest;
   const render = () => {
     if (!width) return;
     const drawn = draw(width);
@@ -23,8 +25,9 @@ export function figure(label, draw, rows) {
   };
   new ResizeObserver(([entry]) => {
     const wide = Math.round(entry.contentRect.width);
-    if (wide && wide !== width) { width = wide; render(); }
+    if (wide && wide !== width) { width = latest = wide; render(); }
   }).observe(frame);
+  render();
   return element;
 }
 
