@@ -33,7 +33,7 @@ COMMANDS = {
     "tune": Command("tune", "tune", "Search loss weights, or other keys, by the errors on validation."),
     "table": Command("table", "table", "The paper's tables beside measured numbers."),
     "results": Command("results", "results", "Keep runs' results with the code; make pages of them."),
-    "report": Command("report", "report", "All tables and figures as one HTML page."),
+    "report": Command("report", "report", "The page of some sweeps, tables and figures, in one file."),
     "runs": Command("runs", "runs", "List, show, compare, tag, clean up and move runs."),
     "track": Command("track", "track", "Fill in what MLflow, TensorBoard or W&B lack of runs."),
     "mlflow": Command("track", "mlflow", "MLflow's page on the tracked runs."),
