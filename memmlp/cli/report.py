@@ -1,4 +1,4 @@
-"""`memmlp report`: all tables and figures as one HTML page."""
+"""`memmlp report`: sweeps, their runs, all tables and figures as one HTML file."""
 
 from __future__ import annotations
 
@@ -25,17 +25,23 @@ EVERY = ["all", "memory_control"]
     type=click.Path(path_type=Path, dir_okay=False),
     help="HTML file to write.  [default: report.html in --outputs]",
 )
+@click.option(
+    "--tables-only", is_flag=True, help="The tables and figures alone: a small page that prints well."
+)
+@click.option("--no-replays", is_flag=True, help="Leave out the worst seconds of the best runs, in 3D.")
 @outputs_option
-def report(words: tuple[str, ...], out: Path | None, outputs: Path) -> None:
-    """Write one page of tables, effects, accuracy against latency, training curves and runs.
+def report(
+    words: tuple[str, ...], out: Path | None, tables_only: bool, no_replays: bool, outputs: Path
+) -> None:
+    """Write what `memmlp ui` shows of some sweeps as one file, with their tables and figures.
 
-    The page needs no network. NAMES are those of `memmlp table`; without any, it has all tables of the paper
-    and the memory's controls. OVERRIDES are those that the sweeps were run with; they find the runs again.
+    The file needs no server and no network. NAMES are those of `memmlp table`; without any, it has all tables
+    of the paper and the memory's controls. OVERRIDES are those that the sweeps were run with; they find the
+    runs again. All searches below --outputs are in it, too.
     """
     from memmlp.cli.table import write
     from memmlp.config.packaged import packaged
-    from memmlp.report.html import page as written
-    from memmlp.report.html import published
+    from memmlp.report.html import fragment, page, published
     from memmlp.runs.environment import environment
     from memmlp.sweep.spec import load_sweep
 
@@ -46,7 +52,26 @@ def report(words: tuple[str, ...], out: Path | None, outputs: Path) -> None:
     git = environment()["git"] or {}
     code = f"{git.get('commit', environment()['version'])[:7]}{' with changes' if git.get('dirty') else ''}"
     when = datetime.now(UTC).strftime("Generated %Y-%m-%d %H:%M UTC")
-    write(out or outputs / "report.html", written(chapters, systems, when, code))
+    if tables_only:
+        text = page(chapters, systems, when, code)
+    else:
+        text = one_file(chapters, outputs, fragment(chapters, systems, when, code), not no_replays)
+    write(out or outputs / "report.html", text)
+
+
+def one_file(chapters: Sequence[Chapter], outputs: Path, extra: str, replays: bool) -> str:
+    """Return the page of these sweeps as one file, with further HTML beside it."""
+    from memmlp.cli.ui import predict
+    from memmlp.config.plan_sweep import sweep_folder
+    from memmlp.ui.answers import Answers
+    from memmlp.ui.one_file import Shown, written
+
+    answers = Answers(outputs, predict, kept=False)
+    shown = [Shown(sweep_folder(one.sweep, outputs).name, one.table) for one in chapters]
+    try:
+        return written(answers, shown, extra, replays)
+    finally:
+        answers.close()
 
 
 def chapters_of(names: Sequence[str], overrides: Sequence[str], outputs: Path) -> list[Chapter]:

@@ -42,6 +42,7 @@ def tune(
     1e-4, high: 1e-2, log: true}`; `search=NAME` takes conf/search/NAME.yaml), and the executor's of `memmlp
     sweep`. Started again, it goes on where it stopped.
     """
+    from memmlp.common.files import write_json
     from memmlp.search.study import Study
 
     setup = prepared(overrides, config_dir, outputs.absolute())
@@ -53,6 +54,7 @@ def tune(
     with lock.hold(wait=False) as mine:
         if not mine:
             raise InputError(f"search {setup.folder.name}: another process is at it; --status shows it")
+        write_json(setup.folder / "search.json", asdict(setup.search))
         study = Study.own(setup.search, setup.folder.name, setup.folder)
         search(setup, study, workers)
         leave(setup, study)

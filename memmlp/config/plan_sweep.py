@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json, write_json
 from memmlp.config.packaged import packaged
+from memmlp.sweep.kept import keep
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 from memmlp.sweep.spec import Arm, Sweep, load_sweep
 
@@ -67,6 +68,7 @@ def planned(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
     """
     path = sweep_folder(sweep, outputs) / "planned.json"
     stamp = _stamp(sweep, outputs)
+    keep(sweep, path.parent)
     kept = read_json(path)
     if kept.get("stamp") == stamp and all(_fresh(data, prepare) for data in kept["data"]):
         return Plan.load(path.with_name("plan.json"))

@@ -62,16 +62,7 @@ def page(chapters: Sequence[Chapter], published: Sequence[Point], generated: str
         generated: when the page is made, in words.
         commit: the commit of the code that makes it.
     """
-    entries = _entries(chapters)
-    sections = [
-        ("tables", "Tables", [as_html(chapter.table) for chapter in chapters]),
-        ("effects", "Effects", _effects(chapters)),
-        ("distributions", "Beyond the mean", _distributions(chapters)),
-        ("accuracy", "Accuracy and latency", _accuracy(chapters, published)),
-        ("training", "Training curves", _training(chapters)),
-        ("latency", "Latency", [_latency(entries)]),
-        ("runs", "Runs", [_runs(entries)]),
-    ]
+    entries, sections = _entries(chapters), _sections(chapters, published)
     template = resources.files("memmlp.report").joinpath("page.html").read_text(encoding="utf-8")
     fields = {
         "title": "Mem-MLP: measured and published",
@@ -82,6 +73,29 @@ def page(chapters: Sequence[Chapter], published: Sequence[Point], generated: str
     for name, text in fields.items():
         template = template.replace(f"{{{{{name}}}}}", text)
     return template
+
+
+def fragment(chapters: Sequence[Chapter], published: Sequence[Point], generated: str, commit: str) -> str:
+    """Return the same as part of a page that has a head and a style of its own."""
+    about = f"{generated}, code {commit}, {len(_entries(chapters))} finished runs"
+    body = "\n".join(_section(*section) for section in _sections(chapters, published))
+    return f'<h1>Measured and published</h1>\n<p class="about">{_text(about)}</p>\n{body}'
+
+
+def _sections(
+    chapters: Sequence[Chapter], published: Sequence[Point]
+) -> list[tuple[str, str, Sequence[str]]]:
+    """Return the names, titles and parts of the page's sections."""
+    entries = _entries(chapters)
+    return [
+        ("tables", "Tables", [as_html(chapter.table) for chapter in chapters]),
+        ("effects", "Effects", _effects(chapters)),
+        ("distributions", "Beyond the mean", _distributions(chapters)),
+        ("accuracy", "Accuracy and latency", _accuracy(chapters, published)),
+        ("training", "Training curves", _training(chapters)),
+        ("latency", "Latency", [_latency(entries)]),
+        ("runs", "Runs", [_runs(entries)]),
+    ]
 
 
 def published(accuracies: Sweep, latencies: Sweep) -> list[Point]:

@@ -103,8 +103,12 @@ class Run:
         One of the present recipes comes first, then one whose int8 file is accurate enough, then the last one
         made.
         """
+        return self.deployment_used(self.config)
+
+    def deployment_used(self, config: Mapping[str, Any]) -> DeploymentFolder:
+        """Return the same for a config that was read already."""
         made = [DeploymentFolder(path.parent) for path in self.deployments.glob("*/latency.json")]
-        own = [one for one in made if one.done and used_as_configured(one.settings, self.config)]
+        own = [one for one in made if one.done and used_as_configured(one.settings, config)]
         best = max(own, key=lambda one: (one.current, one.prefers_int8, one.made), default=None)
         return best or DeploymentFolder(self.deployments / "none")
 

@@ -131,14 +131,18 @@ def importances(study: Study) -> list[tuple[str, float]]:
 
     Empty with fewer than four complete trials or a single key.
     """
-    complete = [trial for trial in study.trials if trial.state == TrialState.COMPLETE]
-    if len(complete) < 4 or len(study.search.space) < 2:
+    return shares(study.study)
+
+
+def shares(study: optuna.Study) -> list[tuple[str, float]]:
+    """Return the same of a study alone."""
+    complete = [t for t in study.get_trials(deepcopy=False) if t.state == TrialState.COMPLETE]
+    if len(complete) < 4 or len(complete[0].params) < 2:
         return []
-    single = len(study.search.objectives) == 1
-    target = None if single else _first
+    target = None if len(study.directions) == 1 else _first
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = optuna.importance.get_param_importances(study.study, target=target)
+        found = optuna.importance.get_param_importances(study, target=target)
     return sorted(found.items(), key=lambda item: -item[1])
 
 

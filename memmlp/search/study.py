@@ -168,13 +168,18 @@ def storage(search: Search, folder: Path) -> BaseStorage:
     Raises:
         InputError: for a bad URL or a damaged journal.
     """
+    return opened(search.storage, folder)
+
+
+def opened(url: str | None, folder: Path) -> BaseStorage:
+    """Return the storage of a URL, or where that is None the journal in a folder. Raises InputError."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    if search.storage:
+    if url:
         try:
-            return get_storage(search.storage)
+            return get_storage(url)
         except Exception as error:
             reason = " ".join(str(error).split())[:200]
-            raise InputError(f"search.storage={search.storage}: {reason}") from None
+            raise InputError(f"search.storage={url}: {reason}") from None
     path = journal(folder)
     check_journal(path)
     try:

@@ -1,0 +1,81 @@
+"""`memmlp ui`: runs, sweeps and searches on a page of this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from memmlp.cli.options import outputs_option
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from memmlp.runs.run import Run
+
+
+@click.command("ui")
+@click.option(
+    "--port",
+    default=8787,
+    show_default=True,
+    type=click.IntRange(0, 65535),
+    help="Port of the page; 0 takes a free one.",
+)
+@click.option(
+    "--host",
+    default="127.0.0.1",
+    show_default=True,
+    help="Address to serve at. At another one than this machine's own, every request needs the token.",
+)
+@click.option("--token", help="The token at another address.  [default: a new one, which is printed]")
+@click.option("--no-browser", is_flag=True, help="Print the page's address, and open no browser.")
+@outputs_option
+def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path) -> None:
+    """Show runs, sweeps and searches on a page of this machine, which follows them while they go on.
+
+    The page only reads. Ctrl-C ends it. docs/guides/ui.md shows what is on it.
+    """
+    import webbrowser
+
+    from memmlp.common.errors import InputError
+    from memmlp.ui.answers import Answers
+    from memmlp.ui.server import Server, loopback
+
+    if token is not None and loopback(host):
+        raise InputError("--token: goes with --host; this machine's own address needs none")
+    if token is not None and len(token) < 16:
+        raise InputError(f"--token: {len(token)} characters; allowed are 16 or more")
+    with (
+        Server(Answers(outputs, predict), port, host, token) as server,
+        contextlib.suppress(KeyboardInterrupt),
+    ):
+        click.echo(f"{server.url}  runs in {outputs / 'runs'}; Ctrl-C ends")
+        if not no_browser:
+            webbrowser.open(server.url)
+        threading.Event().wait()
+
+
+def predict(run: Run, clip: str, mode: str) -> Mapping[str, np.ndarray]:
+    """Return what a run's network makes of a test clip (`prediction_arrays`), on one thread of the CPU.
+
+    Raises:
+        InputError: where the run's data is not prepared here any more, or there is no such clip.
+    """
+    import torch
+
+    from memmlp.common.errors import InputError
+    from memmlp.config.open_run import OpenedRun, clip_of, data_of, experiment_of
+    from memmlp.evaluation.predictions import predict_clip
+
+    torch.set_num_threads(1)  # trainings beside it need the others
+    experiment = experiment_of(run)
+    if experiment.data.digest() is None:
+        raise InputError(f"run {run.id}: its data is not prepared here; memmlp eval {run.id} prepares it")
+    opened = OpenedRun(run, experiment, data_of(run, experiment))
+    with torch.inference_mode():
+        return predict_clip(opened.network(), clip_of(opened.test, clip, "clip"), mode)

@@ -1,0 +1,40 @@
+"""A sweep kept beside its plan, so that its table can be shown without its file and without composing it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from memmlp.common.errors import InputError
+from memmlp.common.files import plain, read_json, write_json
+from memmlp.sweep.spec import Arm, Sweep
+
+NAME = "sweep.json"
+
+
+def keep(sweep: Sweep, folder: Path) -> None:
+    """Write the sweep into its folder, where it is not there as it is."""
+    content = plain(asdict(sweep))
+    if read_json(folder / NAME) != content:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / NAME, content)
+
+
+def kept(folder: Path) -> Sweep | None:
+    """Return the sweep of a folder; None where none was kept. Raises InputError where it is damaged."""
+    path = folder / NAME
+    if not path.exists():
+        return None
+    try:
+        content = json.loads(path.read_bytes())
+        content["arms"] = tuple(Arm(**_with_tuples(arm, ("overrides", "seeds"))) for arm in content["arms"])
+        return Sweep(**_with_tuples(content, ("notes", "base", "seeds", "arms", "metrics", "extra")))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: not a sweep ({error}); start the sweep again") from None
+
+
+def _with_tuples(fields: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
+    """Return the fields with some of them as tuples, which JSON turned into lists."""
+    return {**fields, **{name: tuple(fields[name]) for name in names if fields.get(name) is not None}}

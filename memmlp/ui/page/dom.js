@@ -1,0 +1,53 @@
+// Elements made of data. Data only ever becomes text or an attribute's value, never markup.
+
+// A new element: h('a', { href: '#', class: 'x', onclick: go }, 'text', child, ...).
+export function h(tag, properties = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(properties ?? {})) {
+    if (value === undefined || value === null || value === false) continue;
+    if (name.startsWith('on')) element.addEventListener(name.slice(2), value);
+    else if (name in element && typeof value !== 'string') element[name] = value;
+    else element.setAttribute(name, value === true ? '' : value);
+  }
+  element.append(...children.flat(Infinity).filter(child => child !== null && child !== undefined && child !== false));
+  return element;
+}
+
+export function replace(element, ...children) {
+  element.replaceChildren(...children.flat(Infinity).filter(child => child !== null && child !== undefined && child !== false));
+  return element;
+}
+
+export function link(href, ...children) {
+  return h('a', { href }, ...children);
+}
+
+// A group of buttons of which one is chosen.
+export function choice(label, options, chosen, choose) {
+  const buttons = options.map(([value, text]) =>
+    h('button', { type: 'button', 'aria-pressed': String(value === chosen), onclick: () => choose(value) }, text));
+  return h('div', { class: 'choice', role: 'group', 'aria-label': label }, buttons);
+}
+
+export function select(label, options, chosen, choose) {
+  const list = h('select', { onchange: event => choose(event.target.value) },
+    options.map(([value, text]) => h('option', { value, selected: value === chosen }, text)));
+  return h('label', { class: 'field' }, h('span', {}, label), list);
+}
+
+export function section(title, ...children) {
+  return h('section', {}, h('h2', {}, title), ...children);
+}
+
+export function empty(title, ...children) {
+  return h('div', { class: 'empty' }, h('p', { class: 'lead' }, title), ...children);
+}
+
+export function code(text) {
+  return h('code', {}, text);
+}
+
+// Tell those who don't see the page what changed on it.
+export function say(text) {
+  document.getElementById('said').textContent = text;
+}

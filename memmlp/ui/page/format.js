@@ -1,0 +1,96 @@
+// Numbers, times and names as text.
+
+const UNITS = {
+  MPJRE: '°', geodesic: '°', MPJPE: 'cm', 'Hand PE': 'cm', 'Upper PE': 'cm', 'Lower PE': 'cm', 'Root PE': 'cm',
+  MPJVE: 'cm/s', Jitter: '10² m/s³', 'GT Jitter': '10² m/s³', median_ms: 'ms', p95_ms: 'ms',
+};
+const COSTS = {
+  median_ms: 'latency', p95_ms: 'latency p95', ratio_to_yardstick: '× yardstick', parameters: 'parameters', macs: 'MACs',
+  onnx_bytes: 'ONNX bytes',
+};
+
+export const MINUS = '\u2212';
+export const DASH = '\u2013';
+
+export function number(value, digits) {
+  if (value === null || value === undefined || value === '') return DASH;
+  if (typeof value !== 'number' || !Number.isFinite(value)) return String(value);
+  let text;
+  if (digits !== undefined) text = value.toFixed(digits);
+  else if (Number.isInteger(value) && Math.abs(value) < 1e15) text = value.toLocaleString('en');
+  else if (Math.abs(value) >= 1e5 || Math.abs(value) < 1e-3) text = value.toExponential(2);
+  else text = String(Number(value.toPrecision(4)));
+  return text.replace('-', MINUS);
+}
+
+export function signed(value, digits = Math.abs(value) >= 1000 ? 0 : 2) {
+  return value > 0 ? `+${number(value, digits)}` : number(value, digits);
+}
+
+// A value of a config in few characters.
+export function word(value) {
+  if (value === null || value === undefined) return DASH;
+  if (typeof value === 'number') return value.toString().length > 8 ? number(value) : String(value).replace('-', MINUS);
+  return Array.isArray(value) ? value.map(word).join(', ') : String(value);
+}
+
+export function duration(seconds) {
+  if (seconds === null || seconds === undefined) return DASH;
+  if (seconds < 90) return `${Math.round(seconds)} s`;
+  if (seconds < 5400) return `${Math.round(seconds / 60)} min`;
+  if (seconds < 129600) return `${(seconds / 3600).toFixed(1)} h`;
+  return `${Math.round(seconds / 86400)} d`;
+}
+
+export function ago(text) {
+  const time = Date.parse(text);
+  if (Number.isNaN(time)) return DASH;
+  return `${duration(Math.max((Date.now() - time) / 1000, 0))} ago`;
+}
+
+export function date(text) {
+  const time = new Date(text);
+  return Number.isNaN(time.getTime()) ? DASH : time.toLocaleString(undefined, { dateStyle: 'medium', timeStyle: 'short' });
+}
+
+export function bytes(count) {
+  const units = ['B', 'kB', 'MB', 'GB'];
+  let size = count;
+  while (size >= 1000 && units.length > 1) { size /= 1000; units.shift(); }
+  return `${size >= 100 || units[0] === 'B' ? Math.round(size) : size.toFixed(1)} ${units[0]}`;
+}
+
+// "stream.rotation.MPJPE" -> its parts in words.
+export function metricWords(name) {
+  const parts = name.split('.');
+  const metric = parts.at(-1);
+  if (parts[0] === 'latency') return { metric: COSTS[metric] ?? metric, where: '', unit: UNITS[metric] ?? '' };
+  const where = parts.slice(0, -1).filter(part => part !== 'rotation').join(' ');
+  return { metric, where, unit: UNITS[metric] ?? '' };
+}
+
+export function metricText(name) {
+  const { metric, where, unit } = metricWords(name);
+  return `${where} ${metric}${unit ? ` [${unit}]` : ''}`.trim();
+}
+
+// The digits behind the point with which a metric is shown.
+export function digitsOf(name) {
+  const metric = name.split('.').at(-1);
+  if (metric === 'parameters' || metric === 'macs' || metric === 'onnx_bytes') return 0;
+  return metric === 'Jitter' || metric === 'MPJVE' || metric === 'GT Jitter' ? 1 : 2;
+}
+
+export function metricNumber(name, value) {
+  if (typeof value !== 'number') return DASH;
+  const digits = Math.abs(value) >= 1000 ? 0 : digitsOf(name);
+  return digits === 0 ? number(Math.round(value)) : number(value, digits);
+}
+
+// Short heads for dotted keys: the last word where no other key has it.
+export function shortKeys(keys) {
+  const last = key => (key.endsWith('.name') ? key.slice(0, -5) : key).split('.').at(-1);
+  const counts = new Map();
+  for (const key of keys) counts.set(last(key), (counts.get(last(key)) ?? 0) + 1);
+  return new Map(keys.map(key => [key, counts.get(last(key)) > 1 ? key.replace(/\.name$/, '') : last(key)]));
+}

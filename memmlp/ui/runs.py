@@ -1,0 +1,232 @@
+"""What the pages of runs are told: the table's rows, and everything about a single run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from memmlp.common.errors import InputError
+from memmlp.common.files import read_json
+from memmlp.runs.identity import NEUTRAL, flatten
+from memmlp.runs.lookup import is_trained
+from memmlp.runs.run import Run
+from memmlp.sweep.plan import Plan
+from memmlp.tables.measured_run import load
+from memmlp.ui.facts import read_config
+from memmlp.ui.index import Index
+from memmlp.ui.names import name
+
+SHOWN_FILES = (
+    "config.yaml",
+    "manifest.json",
+    "metrics.jsonl",
+    "code.patch",
+    "FAILED",
+    "notes.json",
+    "poses.png",
+)
+"""Files of a run that the page may show as they are."""
+
+MOST_FILES = 200
+
+
+class Rows:
+    """The rows of the table of runs, for a page that has some of them already."""
+
+    def __init__(self, index: Index, places: Callable[[], Mapping[str, Sequence[Mapping[str, Any]]]]):
+        self.index, self.places = index, places
+
+    def since(self, generation: int, heads: str = "") -> dict[str, Any]:
+        """Return the rows that changed after a generation, and which runs are gone.
+
+        `keys` and `metrics` are the heads of each row's `config` and `metrics`. Where they are not those that
+        the page knows (`heads`), all rows are told.
+        """
+        with self.index.lock:
+            runs, now, removed = dict(self.index.runs), self.index.generation, dict(self.index.removed)
+        where = self.places()
+        keys, metrics = differing(runs.values()), measured(runs.values())
+        known = "|".join([*keys, *metrics, str(sum(map(len, where.values())))])
+        whole = generation == 0 or heads != str(hash(known))
+        rows = [
+            row(run, keys, metrics, where.get(run_id, []))
+            for run_id, run in runs.items()
+            if whole or run["generation"] > generation
+        ]
+        gone = [run_id for run_id, when in removed.items() if when > generation]
+        return {
+            "generation": now,
+            "heads": str(hash(known)),
+            "whole": whole,
+            "keys": keys,
+            "minor": minor(keys),
+            "metrics": metrics,
+            "rows": rows,
+            "removed": gone,
+        }
+
+
+def row(
+    facts: Mapping[str, Any], keys: Sequence[str], metrics: Sequence[str], where: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return a run's row in the table."""
+    own = (
+        "id",
+        "kind",
+        "status",
+        "started",
+        "finished",
+        "seconds",
+        "device",
+        "tags",
+        "note",
+        "failure",
+        "damage",
+        "data",
+        "code",
+        "steps",
+        "recent",
+    )
+    return {
+        **{key: facts[key] for key in own},
+        "name": name(facts, where),
+        "places": list(where),
+        "config": [facts["config"].get(key) for key in keys],
+        "metrics": [_short(facts["metrics"].get(metric)) for metric in metrics],
+    }
+
+
+def differing(runs: Any) -> list[str]:
+    """Return the config keys in which runs differ, in the order of the configs."""
+    first: dict[str, Any] = {}
+    counts: dict[str, int] = {}
+    found: dict[str, None] = {}
+    total = 0
+    for run in runs:
+        total += bool(run["config"])
+        for key, value in run["config"].items():
+            counts[key] = counts.get(key, 0) + 1
+            if first.setdefault(key, value) != value:
+                found[key] = None
+    return [key for key in first if key in found or counts[key] < total]
+
+
+def minor(keys: Sequence[str]) -> list[str]:
+    """Return those keys that change no result, and the profile's, which others take over."""
+    groups = [name for name in NEUTRAL if name != "data"]
+    return [key for key in keys if any(key == name or key.startswith(f"{name}.") for name in groups)]
+
+
+def measured(runs: Any) -> list[str]:
+    """Return the names of all numbers that were measured of some run."""
+    return list(dict.fromkeys(metric for run in runs for metric in run["metrics"]))
+
+
+def _short(value: float | None) -> float | None:
+    return None if value is None else float(f"{value:.6g}")
+
+
+def page(
+    index: Index, plans: Sequence[Plan], every: Mapping[str, Sequence[Mapping[str, Any]]], run_id: str
+) -> dict[str, Any]:
+    """Return everything that a run's page shows. Raises KeyError for an unknown run.
+
+    Args:
+        index: the runs.
+        plans: the plans of all sweeps.
+        every: the places of all runs (`places`).
+        run_id: which run.
+    """
+    with index.lock:
+        facts = dict(index.runs[run_id])
+        known = dict(index.runs)
+    run = Run.of(index.outputs, run_id)
+    where = every.get(run_id, [])
+    control = control_of(plans, run_id, known)
+    return {
+        **facts,
+        "name": name(facts, where),
+        "places": where,
+        "config": whole_config(run),
+        "control": control
+        and {
+            "id": control,
+            "name": name(known[control], every.get(control, [])),
+            "config": whole_config(Run.of(index.outputs, control)),
+        },
+        "manifest": flatten(run.manifest),
+        "clips": clips(run),
+        "latency": latency(run),
+        "changed": verified(run),
+        "files": files(run.folder),
+    }
+
+
+def whole_config(run: Run) -> dict[str, Any]:
+    """Return the dotted keys of a run's config; empty where it can't be read."""
+    try:
+        return flatten(read_config(run.config_path))
+    except ValueError:
+        return {}
+
+
+def control_of(plans: Sequence[Plan], run_id: str, known: Mapping[str, Any]) -> str | None:
+    """Return the run of the same seed in the arm that the first sweep of a run names first; None for none."""
+    for plan in plans:
+        seeds = [entry.seed for entry in plan.entries if entry.id == run_id]
+        first = plan.entries[0].label if plan.entries else None
+        for entry in plan.entries:
+            if entry.label == first and entry.seed in seeds and entry.id != run_id and entry.id in known:
+                return entry.id
+    return None
+
+
+def clips(run: Run) -> list[dict[str, Any]]:
+    """Return the errors of each test clip by mode and branch; empty where they can't be read."""
+    if not is_trained(run):
+        return []
+    try:
+        found = load(run.folder).clips
+        own = {
+            report["name"]: report.get("frames")
+            for path in run.own_evaluations
+            for report in read_json(path).get("clips", [])
+        }
+    except (InputError, KeyError, TypeError):
+        return []
+    return [
+        {
+            "name": clip,
+            "frames": own.get(clip),
+            **{mode: errors[mode] for mode in ("stream", "window") if mode in errors},
+        }
+        for clip, errors in found.items()
+    ]
+
+
+def latency(run: Run) -> dict[str, Any]:
+    """Return the numbers of the deployment that the run prefers."""
+    try:
+        record = run.preferred_deployment.record
+    except InputError:
+        return {}
+    return {key: value for key, value in flatten(record).items() if isinstance(value, int | float | str)}
+
+
+def verified(run: Run) -> list[str]:
+    """Return the files of a finished run that are missing or were changed since."""
+    return run.verify() if run.done else []
+
+
+def files(folder: Path) -> list[dict[str, Any]]:
+    """Return the files of a run's folder, with their sizes."""
+    paths = sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
+    return [
+        {
+            "name": str(path.relative_to(folder)),
+            "bytes": path.stat().st_size,
+            "shown": path.name in SHOWN_FILES and path.parent == folder,
+        }
+        for path in paths[:MOST_FILES]
+    ]

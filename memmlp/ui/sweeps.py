@@ -1,0 +1,225 @@
+"""What the pages of sweeps are told: how far they are, how long it will take, effects and verdicts."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import threading
+import time
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from memmlp.common.errors import InputError
+from memmlp.sweep.board import name as task_name
+from memmlp.sweep.kept import kept
+from memmlp.sweep.plan import Entry, Plan, RunTask
+from memmlp.sweep.spec import Arm, Sweep, parse_sweep
+from memmlp.tables.build_table import collect, finished
+from memmlp.tables.formats import as_json
+from memmlp.tables.measured_run import Measured, load
+from memmlp.tables.table_text import caption, heading, legend
+from memmlp.ui.index import Index
+
+ROUNDS = "seeds were spent in rounds; memmlp table has their verdicts, these do not keep the 5 %"
+NOT_KEPT = "this sweep's file was not kept with it, so its first arm is the control; memmlp table has its own"
+
+
+class Sweeps:
+    """The sweeps below an outputs folder."""
+
+    def __init__(self, index: Index):
+        self.index = index
+        self.lock = threading.Lock()
+        self.plans: dict[Path, tuple[int, Plan]] = {}
+        self.tables: dict[str, tuple[Any, dict[str, Any]]] = {}
+        self.bad: dict[str, str] = {}
+
+    def known(self) -> list[Plan]:
+        """Return the plans of all sweeps, each under its folder's name, the last one changed first."""
+        found: dict[Path, tuple[int, Plan]] = {}
+        self.bad = {}
+        for path in self.index.outputs.glob("sweeps/*/plan.json"):
+            try:
+                changed = path.stat().st_mtime_ns
+                before = self.plans.get(path)
+                plan = before[1] if before and before[0] == changed else Plan.load(path)
+                found[path] = (changed, replace(plan, name=path.parent.name, outputs=self.index.outputs))
+            except (InputError, OSError) as error:
+                self.bad[path.parent.name] = str(error)
+        self.plans = found
+        return [plan for _, plan in sorted(found.values(), key=lambda one: -one[0])]
+
+    def stamp(self) -> str:
+        """Return a text that changes when a sweep comes, goes or is planned anew."""
+        return repr(sorted((str(path), changed) for path, (changed, _) in self.plans.items()))
+
+    def rows(self) -> dict[str, Any]:
+        """Return a row for each sweep."""
+        return {"sweeps": [self.progress(plan) for plan in self.known()], "damaged": self.bad}
+
+    def progress(self, plan: Plan) -> dict[str, Any]:
+        """Return how far a sweep is."""
+        states = self.states(plan)
+        counts = Counter(states.values())
+        sweep = self._kept(plan.name)
+        return {
+            "name": plan.name,
+            "title": caption_of(sweep) if sweep else plan.name,
+            "arms": len({entry.label for entry in plan.entries}),
+            "seeds": len({entry.seed for entry in plan.entries}),
+            "tasks": len(plan.tasks),
+            "counts": dict(counts),
+            "share": self._share(plan, states),
+            "left": self._time_left(plan, states),
+        }
+
+    def page(self, name: str) -> dict[str, Any]:
+        """Return everything that a sweep's page shows. Raises KeyError for an unknown sweep."""
+        plan = next((plan for plan in self.known() if plan.name == name), None)
+        if plan is None:
+            raise KeyError(name)
+        states = self.states(plan)
+        cells = [self._cell(plan, entry, states) for entry in plan.entries]
+        upstream = [self._upstream(plan, task, states) for task in plan.tasks if task.kind == "vqvae"]
+        return {**self.progress(plan), "cells": cells, "upstream": upstream, "table": self.table(plan)}
+
+    def states(self, plan: Plan) -> dict[str, str]:
+        """Return every task's state by its key, as `Plan.states` does, from what the index knows."""
+        states = {task.key: self._state(plan, task) for task in plan.tasks}
+        for task in plan.tasks:
+            if states[task.key] != "done" and states.get(task.upstream or "") == "failed":
+                states[task.key] = "blocked"
+        return states
+
+    def _state(self, plan: Plan, task: RunTask) -> str:
+        facts = self.index.runs.get(task.id)
+        if facts is None:
+            return "new"
+        if facts["status"] != "done":
+            return facts["status"]
+        run = plan.run_of(task)
+        return "done" if all(map(run.has, task.stages)) else run.state(False)
+
+    def _cell(self, plan: Plan, entry: Entry, states: Mapping[str, str]) -> dict[str, Any]:
+        facts = self.index.runs.get(entry.id, {})
+        recent = facts.get("recent") or [[0, 0, None]]
+        return {
+            "arm": entry.label, "seed": entry.seed, "id": entry.id, "state": states[entry.key],
+            "step": recent[-1][0], "steps": facts.get("steps"), "failure": facts.get("failure", ""),
+            "value": facts.get("metrics", {}).get("stream.rotation.MPJPE"),
+        }  # fmt: skip
+
+    def _upstream(self, plan: Plan, task: RunTask, states: Mapping[str, str]) -> dict[str, Any]:
+        return {"name": task_name(plan, task), "id": task.id, "state": states[task.key]}
+
+    def _left(self, task: RunTask, state: str) -> int:
+        """Return how many steps of a task's training are left."""
+        total = int(task.config["vqvae" if task.kind == "vqvae" else "optim"]["steps"] or 0)
+        facts = self.index.runs.get(task.id)
+        if state == "done" or facts is None or not facts["recent"]:
+            return 0 if state == "done" else total
+        return max(total - int(facts["recent"][-1][0]), 0)
+
+    def _share(self, plan: Plan, states: Mapping[str, str]) -> float:
+        """Return which part of all steps is done."""
+        total = sum(
+            self._left(task, "new")
+            if task.id not in self.index.runs
+            else int(self.index.runs[task.id]["steps"] or 0)
+            for task in plan.tasks
+        )
+        left = sum(self._left(task, states[task.key]) for task in plan.tasks)
+        return 1 - left / total if total else 0.0
+
+    def _time_left(self, plan: Plan, states: Mapping[str, str]) -> float | None:
+        """Return about how many seconds the workers that are at it still need; None if nobody is."""
+        running = [task for task in plan.tasks if states[task.key] == "running"]
+        paces = [pace for task in plan.tasks if (pace := _pace(self.index.runs.get(task.id))) is not None]
+        if not running or not paces:
+            return None
+        left = sum(
+            self._left(task, states[task.key])
+            for task in plan.tasks
+            if states[task.key] not in ("failed", "blocked")
+        )
+        return left * statistics.median(paces) / len(running)
+
+    def table(self, plan: Plan) -> dict[str, Any]:
+        """Return the table with effects and verdicts, made again when one of its runs changed."""
+        with self.lock:
+            stamp = [(entry.key, self.index.signatures.get(entry.id)) for entry in plan.entries]
+            known = self.tables.get(plan.name)
+            if known and known[0] == stamp:
+                return known[1]
+            made = self._table(plan)
+            self.tables[plan.name] = (stamp, made)
+            return made
+
+    def _table(self, plan: Plan) -> dict[str, Any]:
+        flags: list[str] = []
+        sweep = self._kept(plan.name)
+        if sweep is None:
+            sweep, flags = of_plan(plan), [NOT_KEPT]
+        if (self.index.outputs / "sweeps" / plan.name / "rounds.json").exists():
+            flags.append(ROUNDS)
+        entries = {(entry.label, entry.seed): entry for entry in plan.entries}
+
+        def find(arm: Arm, seed: int) -> Measured | None:
+            entry = entries.get((arm.label, seed))
+            if entry is None or not plan.complete(entry):
+                return None
+            try:
+                return load(plan.run_of(entry).folder, entry.stages)
+            except InputError as error:
+                flags.append(str(error))
+                return None
+
+        made = collect(sweep, finished(sweep, find))
+        return table_words(replace(made, flags=(*made.flags, *flags)))
+
+    def _kept(self, name: str) -> Sweep | None:
+        try:
+            return kept(self.index.outputs / "sweeps" / name)
+        except InputError:
+            return None
+
+
+def table_words(table: Any) -> dict[str, Any]:
+    """Return what a table holds, with its columns' heads and what explains it."""
+    words = json.loads(as_json(table))
+    return {
+        **words,
+        "caption": caption(table),
+        "headings": {m: heading(m) for m in table.metrics},
+        "legend": legend(table),
+    }
+
+
+def caption_of(sweep: Sweep) -> str:
+    """Return a sweep's title, with its table's number in the paper."""
+    return f"Table {sweep.table}: {sweep.title}" if sweep.table else sweep.title
+
+
+def of_plan(plan: Plan) -> Sweep:
+    """Return a sweep with a plan's arms and seeds; its first arm is the control."""
+    seeds = list(dict.fromkeys(entry.seed for entry in plan.entries)) or [0]
+    arms: dict[str, list[str]] = {
+        label: [] for label in dict.fromkeys(entry.label for entry in plan.entries)
+    } or {"-": []}
+    return parse_sweep(plan.name, {"title": plan.name, "seeds": seeds, "arms": arms})
+
+
+def _pace(facts: Mapping[str, Any] | None) -> float | None:
+    """Return a run's seconds a step over its last entries; None where they don't tell."""
+    recent = (facts or {}).get("recent") or []
+    if len(recent) < 2 or recent[-1][0] <= recent[0][0]:
+        return None
+    seconds = recent[-1][1] - recent[0][1]
+    return (
+        seconds / (recent[-1][0] - recent[0][0])
+        if 0 < seconds < 86400 and recent[-1][1] < time.time() + 60
+        else None
+    )

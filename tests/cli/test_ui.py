@@ -1,0 +1,18 @@
+"""`memmlp ui` refuses what it can't serve, in one line."""
+
+from __future__ import annotations
+
+import pytest
+from conftest import Memmlp, one_line
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--token", "a token of many letters"], "--token: goes with --host"),
+        (["--host", "0.0.0.0", "--token", "short"], "--token: 5 characters; allowed are 16 or more"),
+        (["--host", "nowhere.invalid"], "--host nowhere.invalid --port 8787"),
+    ],
+)
+def test_what_is_refused(memmlp: Memmlp, words: list[str], told: str):
+    assert one_line(memmlp("ui", "--no-browser", *words), told)

@@ -1,0 +1,64 @@
+"""Run folders of made-up numbers, a sweep of them, and servers on them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from fake_runs import fake_run
+
+from memmlp.runs.run import Run
+from memmlp.sweep.kept import keep
+from memmlp.sweep.plan import Entry, Plan, RunTask
+from memmlp.sweep.spec import Sweep, parse_sweep
+
+ARMS = {"none": 1.0, "gru": 0.8}
+SEEDS = (0, 1, 2)
+
+
+@pytest.fixture
+def outputs(tmp_path: Path) -> Path:
+    """An outputs folder with a finished sweep of two arms and three seeds."""
+    made(tmp_path / "outputs")
+    return tmp_path / "outputs"
+
+
+def made(outputs: Path) -> Sweep:
+    """Make a finished sweep called "mine" of made-up runs."""
+    arms = {
+        arm: {"overrides": [f"memory={arm}"], "paper": {"MPJPE": 6 * factor}} for arm, factor in ARMS.items()
+    }
+    sweep = parse_sweep("mine", {"title": "Mine", "seeds": list(SEEDS), "arms": arms, "metrics": ["MPJPE"]})
+    entries, tasks = [], []
+    for arm, factor in ARMS.items():
+        for seed in SEEDS:
+            config = {"memory": {"name": arm}, "seed": seed, "optim": {"steps": 2000, "lr": 1e-3}}
+            run = fake_run(outputs, arm, seed, factor, config=config, log=True)
+            entries.append(Entry(arm, seed, run.id))
+            tasks.append(RunTask(run.id, "memmlp", config))
+    folder = outputs / "sweeps" / "mine"
+    Plan("mine", outputs, tuple(entries), tuple(tasks)).save(folder / "plan.json")
+    keep(sweep, folder)
+    return sweep
+
+
+def run_of(outputs: Path, arm: str = "gru", seed: int = 0) -> Run:
+    """Return a run of that sweep."""
+    plan = Plan.load(outputs / "sweeps" / "mine" / "plan.json")
+    found = plan.run(arm, seed)
+    assert found is not None
+    return found
+
+
+def begun(outputs: Path, name: str = "abcdef0123456789", step: int = 500) -> Run:
+    """Make a run that trains: no marker, a log as far as a step."""
+    run = Run.of(outputs, name)
+    run.folder.mkdir(parents=True)
+    run.config_path.write_text("memory:\n  name: lstm\nseed: 7\noptim:\n  steps: 2000\n")
+    run.manifest_path.write_text(
+        json.dumps({"id": name, "kind": "memmlp", "started": "2026-01-02T03:04:05+00:00"})
+    )
+    for at in range(0, step + 1, 100):
+        run.log(at, {"loss": 5 - at / 1000})
+    return run

@@ -1,0 +1,112 @@
+"""Sweeps: how far they are, and the same verdicts as `memmlp table`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from ui.conftest import begun, run_of
+
+from memmlp.runs.run import Run
+from memmlp.sweep.kept import keep, kept
+from memmlp.sweep.plan import Plan
+from memmlp.tables.build_table import collect, finished
+from memmlp.tables.formats import as_json
+from memmlp.tables.measured_run import load
+from memmlp.tables.runs_of_plan import finder
+from memmlp.ui.index import Index
+from memmlp.ui.sweeps import NOT_KEPT, ROUNDS, Sweeps
+
+
+def sweeps_of(outputs: Path) -> Sweeps:
+    index = Index(outputs)
+    index.refresh()
+    return Sweeps(index)
+
+
+def test_the_table_is_that_of_the_command(outputs: Path):
+    folder = outputs / "sweeps" / "mine"
+    sweep, plan = kept(folder), Plan.load(folder / "plan.json")
+    assert sweep is not None
+    table = json.loads(as_json(collect(sweep, finished(sweep, finder(plan, load)))))
+    shown = sweeps_of(outputs).page("mine")["table"]
+    assert shown["rows"] == table["rows"]
+    (row,) = [row for row in shown["rows"] if row["label"] == "gru"]
+    effect = row["cells"]["stream"]["MPJPE"]["effect"]
+    assert (effect["verdict"], row["cells"]["stream"]["MPJPE"]["paper_effect"]) == (
+        "holds",
+        pytest.approx(-1.2),
+    )
+
+
+def test_progress_and_time_left(outputs: Path, monkeypatch: pytest.MonkeyPatch):
+    before = sweeps_of(outputs).progress(sweeps_of(outputs).known()[0])
+    assert (before["counts"], before["share"], before["left"]) == ({"done": 6}, 1.0, None)
+    run = run_of(outputs, "gru", 2)
+    run.marker.unlink()
+    lines = [
+        {"step": s, "phase": "train", "time": s / 100, "values": {"loss": 1}} for s in range(0, 1001, 100)
+    ]
+    run.metrics_path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    monkeypatch.setattr(Run, "state", lambda self, complete: "done" if complete else "running")
+    sweeps = sweeps_of(outputs)
+    found = sweeps.progress(sweeps.known()[0])
+    assert found["counts"] == {"done": 5, "running": 1}
+    assert found["share"] == pytest.approx(11 / 12)
+    assert found["left"] is not None
+    (cell,) = [cell for cell in sweeps.page("mine")["cells"] if cell["state"] == "running"]
+    assert (cell["arm"], cell["seed"], cell["step"], cell["steps"]) == ("gru", 2, 1000, 2000)
+
+
+def test_a_failed_run_and_its_reason(outputs: Path):
+    run = run_of(outputs, "none", 1)
+    run.marker.unlink()
+    run.fail("the loss was no number")
+    page = sweeps_of(outputs).page("mine")
+    (cell,) = [cell for cell in page["cells"] if cell["state"] == "failed"]
+    assert (cell["arm"], cell["seed"], cell["failure"]) == ("none", 1, "the loss was no number")
+
+
+def test_a_sweep_from_before_has_its_first_arm_as_control_and_says_so(outputs: Path):
+    (outputs / "sweeps" / "mine" / "sweep.json").unlink()
+    page = sweeps_of(outputs).page("mine")
+    assert NOT_KEPT in page["table"]["flags"]
+    assert page["table"]["control"] == "none"
+
+
+def test_rounds_are_flagged(outputs: Path):
+    (outputs / "sweeps" / "mine" / "rounds.json").write_text("{}")
+    assert ROUNDS in sweeps_of(outputs).page("mine")["table"]["flags"]
+
+
+def test_damage_is_told(outputs: Path):
+    bad = outputs / "sweeps" / "bad"
+    bad.mkdir()
+    (bad / "plan.json").write_text("{")
+    (run_of(outputs, "gru", 0).folder / "evaluations" / "stream-0.json").write_text("{")
+    sweeps = sweeps_of(outputs)
+    assert list(sweeps.rows()["damaged"]) == ["bad"]
+    assert any("cannot be read" in flag for flag in sweeps.page("mine")["table"]["flags"])
+    with pytest.raises(KeyError):
+        sweeps.page("bad")
+
+
+def test_a_table_is_made_again_when_a_run_changed(outputs: Path):
+    begun(outputs)
+    sweeps = sweeps_of(outputs)
+    first = sweeps.page("mine")["table"]
+    assert sweeps.page("mine")["table"] is first
+    run_of(outputs, "gru", 0).marker.unlink()
+    sweeps.index.refresh()
+    assert [row["found"] for row in sweeps.page("mine")["table"]["rows"]] == [[0, 1, 2], [1, 2]]
+
+
+def test_a_kept_sweep_is_the_sweep(outputs: Path):
+    folder = outputs / "sweeps" / "mine"
+    sweep = kept(folder)
+    assert sweep is not None
+    changed = sweep.with_overrides(["seed=4,5", "optim.lr=0.1"])
+    keep(changed, folder)
+    assert kept(folder) == changed
+    assert kept(folder.parent) is None
