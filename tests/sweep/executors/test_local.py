@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import subprocess
 import time
 from collections import Counter
 from functools import partial
@@ -52,7 +53,8 @@ def test_preempted_work_is_queued_again(tmp_path: Path):
 def test_each_worker_sees_its_own_gpus_and_a_new_one_those_of_the_dead(tmp_path: Path):
     """Two workers have a GPU each, four share them two by two, and without GPUs there is none."""
     go = tmp_path / "go"
-    work = partial(variable_once, str(go))
+    waits = f"while [ ! -e {go} ]; do sleep 0.05; done; echo $CUDA_VISIBLE_DEVICES"
+    work = partial(subprocess.getoutput, waits)
     executor = Local(tmp_path / "%j", [("0",), ("1",)])
     workers = executor.submit(work, 4)
     assert executor.gpus
@@ -70,12 +72,6 @@ def test_each_worker_sees_its_own_gpus_and_a_new_one_those_of_the_dead(tmp_path:
     until(lambda: not any(worker.alive() for worker in alive), "the workers end")
     seen = Counter(worker.complaint() for worker in alive)  # what they returned
     assert seen == {"0": 2, "1": 2, "": 1}
-
-
-def variable_once(path: str) -> str | None:
-    """What a worker itself has for its GPUs, once there is a file."""
-    until(Path(path).exists, "the test has looked at the processes")
-    return os.getenv("CUDA_VISIBLE_DEVICES")
 
 
 def variable(worker) -> str:
