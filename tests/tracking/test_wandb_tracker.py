@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from fake_tracker import a_run
+from processes import until
 
 from memmlp.common.files import write_json
 from memmlp.runs.metrics_log import MetricsLog
@@ -33,11 +34,16 @@ def _service_ends() -> Iterator[None]:
 
 
 def records(tracker: WandB, name: str) -> list[Any]:
-    """The records of the one offline run of that id."""
+    """The records of the one offline run of that id, once the client's own process has written the last."""
     from wandb.proto.wandb_internal_pb2 import Record
 
     (path,) = Path(tracker.place).glob(f"offline-run-*-{name}/run-{name}.wandb")
-    return [Record.FromString(data) for data in pieces(path.read_bytes())]
+
+    def read() -> list[Any] | None:
+        found = [Record.FromString(data) for data in pieces(path.read_bytes())]
+        return found if any(record.WhichOneof("record_type") == "exit" for record in found) else None
+
+    return until(read, "the run's exit is written")
 
 
 def pieces(content: bytes) -> Iterator[bytes]:
