@@ -86,7 +86,9 @@ def test_a_run_on_a_part_says_so_wherever_it_is_shown(home):
     for command in (["sweep"], ["table"]):
         assert flag in " ".join(run(home, *command, "s1.yaml", *words).split())
     run(home, "report", "s1.yaml", *words, "--out", "report.html")
-    assert (home / "report.html").read_text().count("87 % of the list") == 2
+    assert (home / "report.html").read_text().count(
+        "87 % of the list"
+    ) >= 2  # in the table's flags and the run
     run(home, "results", "save", "s1.yaml", *words, "--out", "kept")
     (record,) = json.loads((home / "kept" / "s1.json").read_text())["runs"].values()
     assert record["origin"]["partial"] == PART

@@ -33,6 +33,7 @@ PAUSES = (0.5, 3.0)  # seconds between kills of a sweep's processes
 LONG_PAUSES = (3.0, 9.0)  # of a search's, whose one controller has to start again in between
 
 SEARCH_SHARE = 0.25  # of all kills
+PATIENCE = 60.0  # seconds for the last workers to let go of their runs
 
 ENDS = ("complete", "pruned")  # how a trial may end whose runs can't fail
 
@@ -178,7 +179,15 @@ def storm(
             code = processes[index].poll()
             if code not in (None, 0) or (code == 0 and killed < kills):
                 processes[index] = launch()
+    await_release(outputs)
     return killed
+
+
+def await_release(outputs: Path) -> None:
+    """Wait until workers whose controllers have ended let go of their runs, but not for ever."""
+    end = time.monotonic() + PATIENCE
+    while any(Lock(folder).held for folder in outputs.glob("runs/*/")) and time.monotonic() < end:
+        time.sleep(0.1)
 
 
 def choose(processes: Sequence[subprocess.Popen[bytes]], outputs: Path, dice: random.Random) -> int | None:
