@@ -66,7 +66,10 @@ def test_the_wheel_has_what_the_commands_need(wheel: Path):
         }
         assert ours
         assert ours <= names
-    assert "memmlp/live/player/page/index.html" in names
+    package = {path.relative_to(ROOT) for path in (ROOT / "memmlp").rglob("*") if path.is_file()}
+    kept = {path.as_posix() for path in package if "__pycache__" not in path.parts}
+    assert {"memmlp/live/player/page/index.html", "memmlp/ui/page/index.html", "memmlp/py.typed"} <= kept
+    assert kept <= names
     assert not {name for name in names if name.startswith(("tests/", "docs/"))}
 
 
@@ -85,7 +88,10 @@ def test_it_works_outside_the_checkout(bin_folder: Path, tmp_path: Path):
     assert str(ROOT) not in where
     assert memmlp.__version__ in run(command, "--version", folder=tmp_path)
     run(command, "demo", *TINY, folder=tmp_path)
-    assert "runs" in run(command, "sweep", "14", *TINY, "--dry-run", folder=tmp_path)
+    assert "runs" in run(command, "sweep", "14", "profile=tiny", "--dry-run", folder=tmp_path)
+    (tmp_path / "mine.yaml").write_text("arms: {without: [memory=none]}")
+    said = run(command, "sweep", "mine.yaml", *TINY, "export.graph=off", folder=tmp_path)
+    assert "1 of 1 runs done" in said
     (made,) = (tmp_path / "outputs/runs").glob("*/deployments/*/step.onnx")
     said = run(
         python, "-c", f"import memmlp; print(memmlp.Stream({str(made)!r}).network.fps)", folder=tmp_path
