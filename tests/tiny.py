@@ -16,12 +16,14 @@ from memmlp.motion.features import motion_frames
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
+from memmlp.networks.baselines.ego_poser import EgoPoser
+from memmlp.networks.baselines.hmd_poser import HMDPoser
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import CodeMemory, JointCodeMemory, Memory, NoMemory, RecurrentMemory
 from memmlp.networks.predictor import Predictor, TwoBranch
 from memmlp.networks.vqvae import VQVAE
 from memmlp.networks.window_model import WindowModel
-from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss
+from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, TermsLoss
 
 SIZES = {"hidden": 16, "frames": 7}
 DEPTH = 4
@@ -99,11 +101,21 @@ BASELINES: dict[str, Callable[..., WindowModel]] = {
         AGRoLDiffusion, frames=7, width=16, depth=2, diffusion_steps=50, sampling_steps=3, noise_seed=0
     ),
     "avatar_poser": partial(AvatarPoser, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
+    "ego_poser": partial(EgoPoser, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
+    "hmd_poser": partial(
+        HMDPoser, frames=7, width=16, depth=2, layers=1, heads=4, feedforward=32, dropout=0.1, shape=0.1
+    ),
 }
-BASELINE_LOSSES: dict[str, type[Loss]] = {
+WINDOWLESS = ["hmd_poser"]
+"""Baselines without a window, which are streams in both modes of evaluation."""
+BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
     "agrol_mlp": AGRoLLoss,
     "agrol_diffusion": AGRoLLoss,
     "avatar_poser": AvatarPoserLoss,
+    "ego_poser": partial(TermsLoss, orientation=0.02, rotation=1.0, position=1.0),
+    "hmd_poser": partial(
+        TermsLoss, orientation=1.0, rotation=5.0, global_rotation=1.0, world_position=1.0, acceleration=0.5
+    ),
 }
 
 

@@ -19,6 +19,7 @@ from memmlp.config.schema.training import (
     BaselineLossConfig,
     NoHandConfig,
     TeacherForcingConfig,
+    TermsLossConfig,
 )
 
 
@@ -176,15 +177,16 @@ def _check_baseline(cfg: DictConfig) -> None:
 
 
 def _check_foreign_loss(cfg: DictConfig, predictor: str) -> None:
-    """Refuse the loss of a baseline for Mem-MLP, with one exception.
+    """Refuse the loss of a baseline for Mem-MLP, with two exceptions.
 
-    AGRoL's loss scores rotations alone, so a Mem-MLP that predicts nothing else may be trained with it.
+    AGRoL's loss and the library's terms score rotations alone, so a Mem-MLP that predicts nothing else may be
+    trained with them.
     """
-    if not _is(cfg.loss, AGRoLLossConfig):
+    if not _is(cfg.loss, AGRoLLossConfig) and not _is(cfg.loss, TermsLossConfig):
         raise InputError("loss: that of a baseline; allowed is loss=uncertainty or loss=manual")
     if not predictor.startswith("RotationOnly") or not _is(cfg.hand, NoHandConfig):
         raise InputError(
-            "loss=agrol is of rotations alone: allowed is predictor=rotation_only with hand=off, "
+            f"loss={cfg.loss.name} is of rotations alone: allowed is predictor=rotation_only with hand=off, "
             "or loss=uncertainty or loss=manual"
         )
 

@@ -22,8 +22,10 @@ from memmlp.config.schema.network import (
     AGRoLMLPConfig,
     AvatarPoserConfig,
     CodeMemoryConfig,
+    EgoPoserConfig,
     FrameConfig,
     GRUMemoryConfig,
+    HMDPoserConfig,
     JointCodeMemoryConfig,
     LSTMMemoryConfig,
     MemoryConfig,
@@ -47,6 +49,7 @@ from memmlp.config.schema.rules import (
     called,
     key,
     one_of,
+    optional,
     positive,
     target,
 )
@@ -64,6 +67,7 @@ from memmlp.config.schema.training import (
     RolloutConfig,
     StreamsConfig,
     TeacherForcingConfig,
+    TermsLossConfig,
     UncertaintyConfig,
 )
 
@@ -115,6 +119,7 @@ class ProfileConfig:
     avatar_poser_frames: int = at_least(2)
     avatar_poser_width: int = at_least(1)
     avatar_poser_feedforward: int = at_least(1)
+    ego_poser_frames: Optional[int] = optional(Within(2))
 
 
 @dataclass
@@ -202,6 +207,8 @@ SCHEMAS: dict[str, type] = {
     "model_agrol_mlp": AGRoLMLPConfig,
     "model_agrol_diffusion": AGRoLDiffusionConfig,
     "model_avatar_poser": AvatarPoserConfig,
+    "model_ego_poser": EgoPoserConfig,
+    "model_hmd_poser": HMDPoserConfig,
     "predictor_two_branch": TwoBranchConfig,
     "predictor_two_branch_memory": TwoBranchMemoryConfig,
     "predictor_rotation_only": RotationOnlyConfig,
@@ -220,6 +227,7 @@ SCHEMAS: dict[str, type] = {
     "loss_manual": ManualConfig,
     "loss_agrol": AGRoLLossConfig,
     "loss_avatar_poser": AvatarPoserLossConfig,
+    "loss_terms": TermsLossConfig,
     "hand_position": HandPositionConfig,
     "hand_fk": HandFKConfig,
     "hand_off": NoHandConfig,

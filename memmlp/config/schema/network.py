@@ -78,6 +78,21 @@ class AvatarPoserConfig(BaselineConfig):
 
 
 @dataclass
+class EgoPoserConfig(AvatarPoserConfig):
+    name: str = called("ego_poser")
+    _target_: str = target("memmlp.networks.baselines.ego_poser.EgoPoser")
+
+
+@dataclass
+class HMDPoserConfig(AvatarPoserConfig):
+    name: str = called("hmd_poser")
+    _target_: str = target("memmlp.networks.baselines.hmd_poser.HMDPoser")
+    width: int = at_least(4)
+    layers: int = at_least(1)
+    shape: float = at_least(0)
+
+
+@dataclass
 class PredictorConfig:
     """The predictor slot (conf/predictor)."""
 

@@ -12,11 +12,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from memmlp.motion.body import ROTATION
+from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP, TimedBlock
-from memmlp.networks.baselines.avatar_poser import AvatarPoser, EncoderLayer
+from memmlp.networks.baselines.avatar_poser import AvatarPoser
+from memmlp.networks.baselines.ego_poser import PLACES, EgoPoser, beside_head, places
+from memmlp.networks.baselines.encoder import EncoderLayer
+from memmlp.networks.baselines.hmd_poser import HMDPoser
 from memmlp.networks.layers import MLPBlock
 from memmlp.networks.memory import State
+from memmlp.networks.stream_model import StreamModel
 from memmlp.networks.streaming.ring import Ring, StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
@@ -54,6 +58,53 @@ class AvatarPoserStream(StreamingGraph):
         attended = last.attention.attend(ring.newest(query)[None], key[None], value[None])[0]
         newest = last.finish(ring.newest(h), attended)
         return self.normalizer.posed(self.model.read(newest), sparse), {"first": first}
+
+
+def newest_frame(layers: list[EncoderLayer], h: Tensor) -> Tensor:
+    """Apply encoder layers to (T, d), the last one for the newest frame (1, d) alone."""
+    *earlier, last = layers
+    for layer in earlier:
+        h = layer(h)
+    attention, newest = last.attention, h[-1:]
+    return last.finish(
+        newest, attention.attend(attention.query(newest), attention.key(h), attention.value(h))
+    )
+
+
+class EgoPoserStream(StreamingGraph):
+    """EgoPoser's streaming graph: what the embedding makes of each frame is carried, in order of time.
+
+    Which frames the slow view adds to which changes at every step, so nothing after that can be carried. The
+    movement since the window's first frame is linear, so the first frame's share of it is taken off the sum.
+    """
+
+    ends = ("model.embedding", "model.orientation", "model.rotation")
+    model: EgoPoser
+
+    def build(self, model: WindowModel) -> None:
+        """Make the graph's parts from a copy of the network."""
+        assert isinstance(model, EgoPoser)
+        self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))
+
+    def windows(self) -> State:
+        """Return zeros (T - 1, n): each earlier frame's embedding (n = d) and places on the floor (n = 6)."""
+        sizes = {"embedded": self.model.embedding.out_features, "places": PLACES}
+        return {name: torch.zeros(self.frames - 1, size) for name, size in sizes.items()}
+
+    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        local = beside_head(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
+        place = places(local)
+        entering = {"embedded": self.model.embedding(torch.cat([local, place], -1)), "places": place}
+        window = {
+            name: torch.cat([torch.where(state["count"] > 0, state[name], frame), frame])
+            for name, frame in entering.items()
+        }
+        slow, fast = self.model.views(window["embedded"])
+        first = F.linear(window["places"][:1], self.model.embedding.weight[:, SPARSE_DIM:])
+        newest = newest_frame(self.layers, slow + fast - 2 * first)
+        kept = {name: frames[1:] for name, frames in window.items()}
+        return self.normalizer.posed(self.model.read(newest), sparse), kept
 
 
 class AGRoLStream(StreamingGraph):
@@ -146,3 +197,35 @@ class AGRoLDiffusionStream(AGRoLStream):
             h = block.newest(h + shift, self.frames)
         block, shift = last
         return self.model.head(block.newest(h + shift, count))
+
+
+class FrameStream(StreamingGraph):
+    """The streaming graph of a network without a window: the network as it is, one frame a step."""
+
+    model: StreamModel
+
+    def build(self, model: WindowModel) -> None:
+        """Make the graph's parts from a copy of the network."""
+        assert isinstance(model, StreamModel)
+        self.model = model
+
+    def windows(self) -> State:
+        """Return the network's own state at a fresh start."""
+        return self.model.initial_state(1)
+
+    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        motion, kept = self.model.advance(sparse[None], state, 1)
+        return motion[0], kept
+
+
+class HMDPoserStream(FrameStream):
+    """HMD-Poser's streaming graph."""
+
+    ends = ("model.trackers", "model.hands", "model.others", "model.pose")
+    model: HMDPoser
+
+    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        features, kept = self.model.features(sparse[None], state)
+        return self.normalizer.posed(self.model.pose(features[0]), sparse), kept
