@@ -18,6 +18,7 @@ from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
 from memmlp.networks.baselines.ego_poser import EgoPoser
 from memmlp.networks.baselines.hmd_poser import HMDPoser
+from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import CodeMemory, JointCodeMemory, Memory, NoMemory, RecurrentMemory
 from memmlp.networks.predictor import Predictor, TwoBranch
@@ -105,8 +106,9 @@ BASELINES: dict[str, Callable[..., WindowModel]] = {
     "hmd_poser": partial(
         HMDPoser, frames=7, width=16, depth=2, layers=1, heads=4, feedforward=32, dropout=0.1, shape=0.1
     ),
+    "vae_hmd": partial(VAEHMD, frames=7, width=16, depth=2, latent=6, dropout=0.2, divergence=0.01),
 }
-WINDOWLESS = ["hmd_poser"]
+WINDOWLESS = ["hmd_poser", "vae_hmd"]
 """Baselines without a window, which are streams in both modes of evaluation."""
 BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
     "agrol_mlp": AGRoLLoss,
@@ -116,6 +118,7 @@ BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
     "hmd_poser": partial(
         TermsLoss, orientation=1.0, rotation=5.0, global_rotation=1.0, world_position=1.0, acceleration=0.5
     ),
+    "vae_hmd": partial(TermsLoss, "square", rotation=1.0, position=20.0, angle=0.1),
 }
 
 

@@ -37,6 +37,7 @@ from memmlp.config.schema.network import (
     RotationOnlyMemoryConfig,
     TwoBranchConfig,
     TwoBranchMemoryConfig,
+    VAEHMDConfig,
     VQVAEConfig,
 )
 from memmlp.config.schema.rules import (
@@ -209,6 +210,7 @@ SCHEMAS: dict[str, type] = {
     "model_avatar_poser": AvatarPoserConfig,
     "model_ego_poser": EgoPoserConfig,
     "model_hmd_poser": HMDPoserConfig,
+    "model_vae_hmd": VAEHMDConfig,
     "predictor_two_branch": TwoBranchConfig,
     "predictor_two_branch_memory": TwoBranchMemoryConfig,
     "predictor_rotation_only": RotationOnlyConfig,

@@ -93,6 +93,15 @@ class HMDPoserConfig(AvatarPoserConfig):
 
 
 @dataclass
+class VAEHMDConfig(BaselineConfig):
+    name: str = called("vae_hmd")
+    _target_: str = target("memmlp.networks.baselines.vae_hmd.VAEHMD")
+    latent: int = at_least(1)
+    dropout: float = fraction()
+    divergence: float = at_least(0)
+
+
+@dataclass
 class PredictorConfig:
     """The predictor slot (conf/predictor)."""
 

@@ -18,6 +18,7 @@ from memmlp.networks.baselines.avatar_poser import AvatarPoser
 from memmlp.networks.baselines.ego_poser import PLACES, EgoPoser, beside_head, places
 from memmlp.networks.baselines.encoder import EncoderLayer
 from memmlp.networks.baselines.hmd_poser import HMDPoser
+from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.layers import MLPBlock
 from memmlp.networks.memory import State
 from memmlp.networks.stream_model import StreamModel
@@ -229,3 +230,15 @@ class HMDPoserStream(FrameStream):
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
         features, kept = self.model.features(sparse[None], state)
         return self.normalizer.posed(self.model.pose(features[0]), sparse), kept
+
+
+class VAEHMDStream(FrameStream):
+    """VAE-HMD's streaming graph."""
+
+    ends = ("model.encoder.stem", "model.decoder.head")
+    model: VAEHMD
+
+    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) to world motion (1, 198); nothing is carried on."""
+        mean = self.model.latent(sparse).chunk(2, -1)[0]
+        return self.normalizer.posed(self.model.decoder(mean), sparse), {}
