@@ -18,6 +18,7 @@ from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
 from memmlp.networks.baselines.ego_poser import EgoPoser
 from memmlp.networks.baselines.hmd_poser import HMDPoser
+from memmlp.networks.baselines.rpm import RPM
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import CodeMemory, JointCodeMemory, Memory, NoMemory, RecurrentMemory
@@ -107,8 +108,11 @@ BASELINES: dict[str, Callable[..., WindowModel]] = {
         HMDPoser, frames=7, width=16, depth=2, layers=1, heads=4, feedforward=32, dropout=0.1, shape=0.1
     ),
     "vae_hmd": partial(VAEHMD, frames=7, width=16, depth=2, latent=6, dropout=0.2, divergence=0.01),
+    "rpm": partial(
+        RPM, frames=9, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, context=3, horizon=4
+    ),
 }
-WINDOWLESS = ["hmd_poser", "vae_hmd"]
+WINDOWLESS = ["hmd_poser", "vae_hmd", "rpm"]
 """Baselines without a window, which are streams in both modes of evaluation."""
 BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
     "agrol_mlp": AGRoLLoss,
@@ -119,6 +123,7 @@ BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
         TermsLoss, orientation=1.0, rotation=5.0, global_rotation=1.0, world_position=1.0, acceleration=0.5
     ),
     "vae_hmd": partial(TermsLoss, "square", rotation=1.0, position=20.0, angle=0.1),
+    "rpm": partial(TermsLoss, rotation=1.0, sixd_velocity=1.0, world_position=1.0, velocity=1.0),
 }
 
 

@@ -24,6 +24,7 @@ RECIPES: dict[str, int] = {
     "model.ego_poser": 1,
     "model.hmd_poser": 1,
     "model.vae_hmd": 1,
+    "model.rpm": 1,
     "memory.vq": 1,
     "memory.vq_joint": 1,
     "memory.no_codes": 1,

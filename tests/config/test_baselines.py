@@ -48,6 +48,12 @@ PUBLISHED = {
         + 3 * 27 + 2 * (2 * 27 + 2 * 9) + 2 * 27,  # the hands in the head's frame, now and before
     ),
     "vae_hmd": (853_958, 0.85, (27 + 60 + 30 + 132 + 12 * 256) * 256),
+    "rpm": (
+        9_889_412 - 512 * 513,  # the released code has a layer that nothing uses
+        9.63,
+        4 * 20 * (4 * 512**2 + 2 * 512 * 1024 + 2 * 20 * 512)
+        + (2 * 20 + 2 * 11) * 512**2 + 2 * 20 * 11 * 512 + (20 * 132 + 11 * 54 + 10 * 132) * 512,
+    ),
 }  # fmt: skip
 
 
@@ -116,6 +122,7 @@ REFUSED = [
     ),
     (["model=agrol_mlp", "loss.error=cube"], "loss.error=cube"),
     (["model=avatar_poser", "loss.anchor=foot"], "loss.anchor=foot"),
+    (["model=rpm", "model.frames=19"], "model.context + model.horizon = 20"),
     (["loss=terms"], "loss=terms is of rotations alone"),
     (["model=agrol_mlp", "loss=terms", "loss.jerk=-1"], "loss.jerk=-1"),
     (["model=agrol_mlp", "loss=terms", "loss.jerks=1"], "loss.jerks"),
@@ -135,7 +142,7 @@ def test_what_makes_no_sense_is_refused_in_one_line(overrides, word):
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("profile", ["tiny", "small", "paper"])
 def test_profiles_and_the_papers_experiment_fit(name, profile):
-    cfg = composed([f"model={name}", "experiment=paper", f"profile={profile}", "model.frames=9"])
-    assert cfg.model.frames == 9
+    cfg = composed([f"model={name}", "experiment=paper", f"profile={profile}", "model.frames=21"])
+    assert cfg.model.frames == 21
     assert (cfg.memory, cfg.predictor, cfg.hand) == (None, None, None)
     assert build_experiment(cfg).config["model"]["_target_"].startswith("memmlp.networks.baselines.")

@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from memmlp.common.errors import InputError
 from memmlp.config.schema.config import SCHEMAS, Config
-from memmlp.config.schema.network import BaselineConfig
+from memmlp.config.schema.network import BaselineConfig, RPMConfig
 from memmlp.config.schema.training import (
     AGRoLLossConfig,
     BaselineLossConfig,
@@ -168,6 +168,10 @@ def _check_baseline(cfg: DictConfig) -> None:
     if cfg.model.width % cfg.model.get("heads", 1):
         raise InputError(
             f"model.heads={cfg.model.heads}: allowed is a divisor of model.width={cfg.model.width}"
+        )
+    if _is(cfg.model, RPMConfig) and cfg.model.frames < (least := cfg.model.context + cfg.model.horizon):
+        raise InputError(
+            f"model.frames={cfg.model.frames}: allowed is at least model.context + model.horizon = {least}"
         )
     steps = cfg.model.get("diffusion_steps", 1)
     if cfg.model.get("sampling_steps", 1) > steps:

@@ -35,6 +35,7 @@ from memmlp.config.schema.network import (
     PredictorConfig,
     RotationOnlyConfig,
     RotationOnlyMemoryConfig,
+    RPMConfig,
     TwoBranchConfig,
     TwoBranchMemoryConfig,
     VAEHMDConfig,
@@ -121,6 +122,8 @@ class ProfileConfig:
     avatar_poser_width: int = at_least(1)
     avatar_poser_feedforward: int = at_least(1)
     ego_poser_frames: Optional[int] = optional(Within(2))
+    rpm_frames: Optional[int] = optional(Within(2))
+    rpm_feedforward: Optional[int] = optional(Within(1))
 
 
 @dataclass
@@ -210,6 +213,7 @@ SCHEMAS: dict[str, type] = {
     "model_avatar_poser": AvatarPoserConfig,
     "model_ego_poser": EgoPoserConfig,
     "model_hmd_poser": HMDPoserConfig,
+    "model_rpm": RPMConfig,
     "model_vae_hmd": VAEHMDConfig,
     "predictor_two_branch": TwoBranchConfig,
     "predictor_two_branch_memory": TwoBranchMemoryConfig,

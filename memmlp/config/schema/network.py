@@ -102,6 +102,14 @@ class VAEHMDConfig(BaselineConfig):
 
 
 @dataclass
+class RPMConfig(AvatarPoserConfig):
+    name: str = called("rpm")
+    _target_: str = target("memmlp.networks.baselines.rpm.RPM")
+    context: int = at_least(1)
+    horizon: int = at_least(1)
+
+
+@dataclass
 class PredictorConfig:
     """The predictor slot (conf/predictor)."""
 

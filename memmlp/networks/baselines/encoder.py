@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -47,15 +49,23 @@ class EncoderLayer(nn.Module):
         heads: number of attention heads.
         feedforward: width of the feed-forward's hidden layer.
         dropout: dropout rate of both parts' outputs and of the hidden layer.
+        activation: what follows the hidden layer.
     """
 
-    def __init__(self, width: int, heads: int, feedforward: int, dropout: float):
+    def __init__(
+        self,
+        width: int,
+        heads: int,
+        feedforward: int,
+        dropout: float,
+        activation: Callable[[Tensor], Tensor] = F.relu,
+    ):
         super().__init__()
         self.attention = Attention(width, heads)
         self.attention_norm = nn.LayerNorm(width)
         self.widen, self.narrow = nn.Linear(width, feedforward), nn.Linear(feedforward, width)
         self.norm = nn.LayerNorm(width)
-        self.dropout = Dropout(dropout)
+        self.dropout, self.activation = Dropout(dropout), activation
 
     def forward(self, h: Tensor) -> Tensor:
         """Map features (B, T, d) or (T, d) to the same shape."""
@@ -64,5 +74,5 @@ class EncoderLayer(nn.Module):
     def finish(self, h: Tensor, attended: Tensor) -> Tensor:
         """Apply what follows the attention, frame by frame, to its inputs and outputs (..., d)."""
         h = self.attention_norm(h + self.dropout(attended))
-        wide = self.dropout(F.relu(self.widen(h)))
+        wide = self.dropout(self.activation(self.widen(h)))
         return self.norm(h + self.dropout(self.narrow(wide)))

@@ -11,6 +11,7 @@ from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
 from memmlp.networks.baselines.ego_poser import EgoPoser
 from memmlp.networks.baselines.hmd_poser import HMDPoser
+from memmlp.networks.baselines.rpm import RPM
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.streaming.baselines import (
@@ -19,6 +20,7 @@ from memmlp.networks.streaming.baselines import (
     AvatarPoserStream,
     EgoPoserStream,
     HMDPoserStream,
+    RPMStream,
     VAEHMDStream,
 )
 from memmlp.networks.streaming.mem_mlp import MemMLPStream
@@ -32,6 +34,7 @@ STREAMS: dict[type[WindowModel], type[StreamingGraph]] = {
     AvatarPoser: AvatarPoserStream,
     EgoPoser: EgoPoserStream,
     HMDPoser: HMDPoserStream,
+    RPM: RPMStream,
     VAEHMD: VAEHMDStream,
     AGRoLMLP: AGRoLMLPStream,
     AGRoLDiffusion: AGRoLDiffusionStream,

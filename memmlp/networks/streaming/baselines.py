@@ -18,6 +18,7 @@ from memmlp.networks.baselines.avatar_poser import AvatarPoser
 from memmlp.networks.baselines.ego_poser import PLACES, EgoPoser, beside_head, places
 from memmlp.networks.baselines.encoder import EncoderLayer
 from memmlp.networks.baselines.hmd_poser import HMDPoser
+from memmlp.networks.baselines.rpm import RPM
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.layers import MLPBlock
 from memmlp.networks.memory import State
@@ -242,3 +243,10 @@ class VAEHMDStream(FrameStream):
         """Map world inputs (1, 54) to world motion (1, 198); nothing is carried on."""
         mean = self.model.latent(sparse).chunk(2, -1)[0]
         return self.normalizer.posed(self.model.decoder(mean), sparse), {}
+
+
+class RPMStream(FrameStream):
+    """RPM's streaming graph."""
+
+    ends = ("model.motion", "model.sparse", "model.head")
+    model: RPM
