@@ -15,6 +15,7 @@ from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.features import motion_frames
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP
+from memmlp.networks.baselines.avatar_jlm import AvatarJLM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
 from memmlp.networks.baselines.ego_poser import EgoPoser
 from memmlp.networks.baselines.hmd_poser import HMDPoser
@@ -108,6 +109,9 @@ BASELINES: dict[str, Callable[..., WindowModel]] = {
         HMDPoser, frames=7, width=16, depth=2, layers=1, heads=4, feedforward=32, dropout=0.1, shape=0.1
     ),
     "vae_hmd": partial(VAEHMD, frames=7, width=16, depth=2, latent=6, dropout=0.2, divergence=0.01),
+    "avatar_jlm": partial(
+        AvatarJLM, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, coarse=1.0
+    ),
     "rpm": partial(
         RPM, frames=9, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, context=3, horizon=4
     ),
@@ -123,6 +127,7 @@ BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
         TermsLoss, orientation=1.0, rotation=5.0, global_rotation=1.0, world_position=1.0, acceleration=0.5
     ),
     "vae_hmd": partial(TermsLoss, "square", rotation=1.0, position=20.0, angle=0.1),
+    "avatar_jlm": partial(TermsLoss, rotation=2.0, position=5.0, velocity_3=16.0, contact=20.0, hand=5.0),
     "rpm": partial(TermsLoss, rotation=1.0, sixd_velocity=1.0, world_position=1.0, velocity=1.0),
 }
 

@@ -25,6 +25,7 @@ RECIPES: dict[str, int] = {
     "model.hmd_poser": 1,
     "model.vae_hmd": 1,
     "model.rpm": 1,
+    "model.avatar_jlm": 1,
     "memory.vq": 1,
     "memory.vq_joint": 1,
     "memory.no_codes": 1,

@@ -48,6 +48,13 @@ PUBLISHED = {
         + 3 * 27 + 2 * (2 * 27 + 2 * 9) + 2 * 27,  # the hands in the head's frame, now and before
     ),
     "vae_hmd": (853_958, 0.85, (27 + 60 + 30 + 132 + 12 * 256) * 256),
+    "avatar_jlm": (
+        63_807_240,
+        63.81,
+        41 * ((396 + 1024 + 132) * 1024 + 22 * 9 * 512 + 1024 * 512 + (45 * 512 + 132) * 1024)
+        + 12 * 41 * 45 * (4 * 512**2 + 2 * 512 * 2048) + 6 * 41 * 45 * 2 * (45 + 41) * 512
+        + 41 * 22 * 27,  # the coarse pose of each frame
+    ),
     "rpm": (
         9_889_412 - 512 * 513,  # the released code has a layer that nothing uses
         9.63,

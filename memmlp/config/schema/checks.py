@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from memmlp.common.errors import InputError
 from memmlp.config.schema.config import SCHEMAS, Config
-from memmlp.config.schema.network import BaselineConfig, RPMConfig
+from memmlp.config.schema.network import AvatarJLMConfig, BaselineConfig, RPMConfig
 from memmlp.config.schema.training import (
     AGRoLLossConfig,
     BaselineLossConfig,
@@ -169,6 +169,8 @@ def _check_baseline(cfg: DictConfig) -> None:
         raise InputError(
             f"model.heads={cfg.model.heads}: allowed is a divisor of model.width={cfg.model.width}"
         )
+    if _is(cfg.model, AvatarJLMConfig) and cfg.model.width % 4:
+        raise InputError(f"model.width={cfg.model.width}: allowed with AvatarJLM is a multiple of 4")
     if _is(cfg.model, RPMConfig) and cfg.model.frames < (least := cfg.model.context + cfg.model.horizon):
         raise InputError(
             f"model.frames={cfg.model.frames}: allowed is at least model.context + model.horizon = {least}"

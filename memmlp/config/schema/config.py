@@ -20,6 +20,7 @@ from memmlp.config.schema.data import (
 from memmlp.config.schema.network import (
     AGRoLDiffusionConfig,
     AGRoLMLPConfig,
+    AvatarJLMConfig,
     AvatarPoserConfig,
     CodeMemoryConfig,
     EgoPoserConfig,
@@ -214,6 +215,7 @@ SCHEMAS: dict[str, type] = {
     "model_ego_poser": EgoPoserConfig,
     "model_hmd_poser": HMDPoserConfig,
     "model_rpm": RPMConfig,
+    "model_avatar_jlm": AvatarJLMConfig,
     "model_vae_hmd": VAEHMDConfig,
     "predictor_two_branch": TwoBranchConfig,
     "predictor_two_branch_memory": TwoBranchMemoryConfig,

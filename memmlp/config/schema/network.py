@@ -110,6 +110,14 @@ class RPMConfig(AvatarPoserConfig):
 
 
 @dataclass
+class AvatarJLMConfig(AvatarPoserConfig):
+    name: str = called("avatar_jlm")
+    _target_: str = target("memmlp.networks.baselines.avatar_jlm.AvatarJLM")
+    width: int = at_least(4)
+    coarse: float = at_least(0)
+
+
+@dataclass
 class PredictorConfig:
     """The predictor slot (conf/predictor)."""
 

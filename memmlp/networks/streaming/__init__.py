@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from memmlp.common.errors import InputError
 from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP
+from memmlp.networks.baselines.avatar_jlm import AvatarJLM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
 from memmlp.networks.baselines.ego_poser import EgoPoser
 from memmlp.networks.baselines.hmd_poser import HMDPoser
@@ -17,6 +18,7 @@ from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.streaming.baselines import (
     AGRoLDiffusionStream,
     AGRoLMLPStream,
+    AvatarJLMStream,
     AvatarPoserStream,
     EgoPoserStream,
     HMDPoserStream,
@@ -34,6 +36,7 @@ STREAMS: dict[type[WindowModel], type[StreamingGraph]] = {
     AvatarPoser: AvatarPoserStream,
     EgoPoser: EgoPoserStream,
     HMDPoser: HMDPoserStream,
+    AvatarJLM: AvatarJLMStream,
     RPM: RPMStream,
     VAEHMD: VAEHMDStream,
     AGRoLMLP: AGRoLMLPStream,

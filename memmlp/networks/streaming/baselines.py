@@ -14,6 +14,7 @@ from torch import Tensor
 
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP, TimedBlock
+from memmlp.networks.baselines.avatar_jlm import TOKENS, AvatarJLM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
 from memmlp.networks.baselines.ego_poser import PLACES, EgoPoser, beside_head, places
 from memmlp.networks.baselines.encoder import EncoderLayer
@@ -250,3 +251,48 @@ class RPMStream(FrameStream):
 
     ends = ("model.motion", "model.sparse", "model.head")
     model: RPM
+
+
+class AvatarJLMStream(StreamingGraph):
+    """AvatarJLM's streaming graph: the tokens of each frame are carried, in order of time.
+
+    Their places change at every step and attention looks both ways, so the layers are computed anew; the last
+    one, over time, for the newest frame alone.
+    """
+
+    ends = ("model.embedding", "model.coarse", "model.regressor")
+    model: AvatarJLM
+    layers: list[EncoderLayer]
+
+    def build(self, model: WindowModel) -> None:
+        """Make the graph's parts from a copy of the network."""
+        assert isinstance(model, AvatarJLM)
+        self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))
+
+    def windows(self) -> State:
+        """Return zeros (T - 1, 45 d): each earlier frame's tokens, without places."""
+        return {"tokens": torch.zeros(self.frames - 1, self.model.joint_places.numel())}
+
+    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+        entering = self.model.tokens(encoded).flatten(1)
+        window = torch.cat([torch.where(state["count"] > 0, state["tokens"], entering), entering])
+        h = self.model.placed(window.unflatten(-1, (TOKENS, -1)))
+        first = h[:, -1:]
+        for index, layer in enumerate(self.layers[:-1]):
+            turned = h if index % 2 == 0 else h.transpose(0, 1)
+            made = attended(layer, turned, turned)
+            h = self.model.renewed(made if index % 2 == 0 else made.transpose(0, 1), first)
+        by_token = h.transpose(0, 1)
+        newest = attended(self.layers[-1], by_token[:, -1:], by_token).transpose(0, 1)
+        features = self.model.renewed(newest, first[-1:]).flatten(1)
+        return self.normalizer.posed(self.model.regressor(features), sparse), {"tokens": window[1:]}
+
+
+def attended(layer: EncoderLayer, h: Tensor, seen: Tensor) -> Tensor:
+    """Apply an encoder layer to (N, n, d), which sees (N, m, d), by products of plain matrices."""
+    attention, flat, all_seen = layer.attention, h.flatten(0, 1), seen.flatten(0, 1)
+    query = attention.query(flat).view(h.shape)
+    key, value = (part(all_seen).view(seen.shape) for part in (attention.key, attention.value))
+    return layer.finish(flat, attention.attend(query, key, value).flatten(0, 1)).view(h.shape)
