@@ -60,6 +60,17 @@ def test_the_inputs_token_is_renewed_and_teaches_the_embedding_nothing():
     assert slope is None or not slope.any()
 
 
+class Always(torch.nn.Module):
+    """The same, whatever is asked."""
+
+    def __init__(self, made: torch.Tensor):
+        super().__init__()
+        self.made = made
+
+    def forward(self, _: torch.Tensor) -> torch.Tensor:
+        return self.made
+
+
 @torch.no_grad()
 def test_the_coarse_poses_loss_is_of_joints_relative_to_the_head():
     """With the true rotations as the coarse pose it is nothing."""
@@ -67,7 +78,7 @@ def test_the_coarse_poses_loss_is_of_joints_relative_to_the_head():
     truth = TRUTH.double()
     true = model.normalizer.encode(truth)[..., SPARSE_DIM:][..., ROTATION]
     coarse = model.coarse
-    model.coarse = lambda embedded: true
+    model.coarse = Always(true)
     assert float(model.auxiliary_losses(truth)["coarse"]) < 1e-6
     model.coarse = coarse
     assert float(model.auxiliary_losses(truth)["coarse"]) > 0.1

@@ -51,7 +51,7 @@ def test_training_predicts_the_last_frames_after_free_running(monkeypatch):
     model, steps = tiny.baseline("rpm"), []
     rolled = model.rolled
     model.rolled = lambda *given: (steps.append((torch.is_grad_enabled(), given)), rolled(*given))[1]
-    monkeypatch.setattr(torch, "rand", lambda *size, **rest: torch.tensor([[0.1], [0.9]]))
+    monkeypatch.setattr(torch, "rand_like", lambda like: torch.tensor([[0.1], [0.9]]))
     for running in range(3):
         steps.clear()
         monkeypatch.setattr(torch, "randint", lambda high, size, running=running: torch.tensor(running))

@@ -19,7 +19,7 @@ def learned(pick: float, monkeypatch) -> vae_hmd.VAEHMD:
     for name, parameter in model.named_parameters():
         if name.endswith("share"):
             parameter.data.fill_(0.5)
-    monkeypatch.setattr(torch, "rand", lambda *size, **rest: torch.full(size, pick))
+    monkeypatch.setattr(torch, "rand_like", lambda like: torch.full_like(like, pick))
     motion, _ = model.learn(TRUTH[..., :SPARSE_DIM], {}, TRUTH)
     motion[..., ROTATION].square().sum().backward()
     return model
