@@ -4,7 +4,7 @@
 `window` is AGRoL's: non-overlapping windows whose T frames all count; the tail window is shifted back and its
 overlap dropped. A network that recalls the window which ended one frame before is led through each window
 frame by frame, so that it recalls what it was trained on: in one call it would get the window of T frames
-ago. Its result for a window is the last call's output.
+ago. Its result for a window is the last call's output. A network without a window is a stream in both.
 """
 
 from __future__ import annotations
@@ -35,6 +35,10 @@ class Evaluable(Protocol):
     def shift(self) -> int:
         """By how many frames the network's own past, which it sees, ends before the newest frame; else 0."""
 
+    @property
+    def windowless(self) -> bool:
+        """Whether the network has no window, so that both modes are the stream."""
+
     def initial_state(self, batch: int = 1) -> State:
         """Return the state of a fresh start."""
 
@@ -49,6 +53,8 @@ def stream(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
 
 def window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
     """Predict the world motion (N, 198) of clips (N, 252), by non-overlapping windows."""
+    if network.windowless:
+        return stream(network, clips)
     if 0 < network.shift < network.frames:
         return frame_by_frame(network, clips, network.frames)
     return window_by_window(network, clips)

@@ -13,12 +13,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from memmlp.common.errors import InputError
 from memmlp.config.schema.config import SCHEMAS, Config
-from memmlp.config.schema.network import BaselineConfig
+from memmlp.config.schema.network import AvatarJLMConfig, BaselineConfig, RPMConfig
 from memmlp.config.schema.training import (
     AGRoLLossConfig,
     BaselineLossConfig,
     NoHandConfig,
     TeacherForcingConfig,
+    TermsLossConfig,
 )
 
 
@@ -168,6 +169,12 @@ def _check_baseline(cfg: DictConfig) -> None:
         raise InputError(
             f"model.heads={cfg.model.heads}: allowed is a divisor of model.width={cfg.model.width}"
         )
+    if _is(cfg.model, AvatarJLMConfig) and cfg.model.width % 4:
+        raise InputError(f"model.width={cfg.model.width}: allowed with AvatarJLM is a multiple of 4")
+    if _is(cfg.model, RPMConfig) and cfg.model.frames < (least := cfg.model.context + cfg.model.horizon):
+        raise InputError(
+            f"model.frames={cfg.model.frames}: allowed is at least model.context + model.horizon = {least}"
+        )
     steps = cfg.model.get("diffusion_steps", 1)
     if cfg.model.get("sampling_steps", 1) > steps:
         raise InputError(
@@ -176,15 +183,16 @@ def _check_baseline(cfg: DictConfig) -> None:
 
 
 def _check_foreign_loss(cfg: DictConfig, predictor: str) -> None:
-    """Refuse the loss of a baseline for Mem-MLP, with one exception.
+    """Refuse the loss of a baseline for Mem-MLP, with two exceptions.
 
-    AGRoL's loss scores rotations alone, so a Mem-MLP that predicts nothing else may be trained with it.
+    AGRoL's loss and the library's terms score rotations alone, so a Mem-MLP that predicts nothing else may be
+    trained with them.
     """
-    if not _is(cfg.loss, AGRoLLossConfig):
+    if not _is(cfg.loss, AGRoLLossConfig) and not _is(cfg.loss, TermsLossConfig):
         raise InputError("loss: that of a baseline; allowed is loss=uncertainty or loss=manual")
     if not predictor.startswith("RotationOnly") or not _is(cfg.hand, NoHandConfig):
         raise InputError(
-            "loss=agrol is of rotations alone: allowed is predictor=rotation_only with hand=off, "
+            f"loss={cfg.loss.name} is of rotations alone: allowed is predictor=rotation_only with hand=off, "
             "or loss=uncertainty or loss=manual"
         )
 

@@ -20,10 +20,13 @@ from memmlp.config.schema.data import (
 from memmlp.config.schema.network import (
     AGRoLDiffusionConfig,
     AGRoLMLPConfig,
+    AvatarJLMConfig,
     AvatarPoserConfig,
     CodeMemoryConfig,
+    EgoPoserConfig,
     FrameConfig,
     GRUMemoryConfig,
+    HMDPoserConfig,
     JointCodeMemoryConfig,
     LSTMMemoryConfig,
     MemoryConfig,
@@ -33,8 +36,10 @@ from memmlp.config.schema.network import (
     PredictorConfig,
     RotationOnlyConfig,
     RotationOnlyMemoryConfig,
+    RPMConfig,
     TwoBranchConfig,
     TwoBranchMemoryConfig,
+    VAEHMDConfig,
     VQVAEConfig,
 )
 from memmlp.config.schema.rules import (
@@ -47,6 +52,7 @@ from memmlp.config.schema.rules import (
     called,
     key,
     one_of,
+    optional,
     positive,
     target,
 )
@@ -64,6 +70,7 @@ from memmlp.config.schema.training import (
     RolloutConfig,
     StreamsConfig,
     TeacherForcingConfig,
+    TermsLossConfig,
     UncertaintyConfig,
 )
 
@@ -115,6 +122,9 @@ class ProfileConfig:
     avatar_poser_frames: int = at_least(2)
     avatar_poser_width: int = at_least(1)
     avatar_poser_feedforward: int = at_least(1)
+    ego_poser_frames: Optional[int] = optional(Within(2))
+    rpm_frames: Optional[int] = optional(Within(2))
+    rpm_feedforward: Optional[int] = optional(Within(1))
 
 
 @dataclass
@@ -202,6 +212,11 @@ SCHEMAS: dict[str, type] = {
     "model_agrol_mlp": AGRoLMLPConfig,
     "model_agrol_diffusion": AGRoLDiffusionConfig,
     "model_avatar_poser": AvatarPoserConfig,
+    "model_ego_poser": EgoPoserConfig,
+    "model_hmd_poser": HMDPoserConfig,
+    "model_rpm": RPMConfig,
+    "model_avatar_jlm": AvatarJLMConfig,
+    "model_vae_hmd": VAEHMDConfig,
     "predictor_two_branch": TwoBranchConfig,
     "predictor_two_branch_memory": TwoBranchMemoryConfig,
     "predictor_rotation_only": RotationOnlyConfig,
@@ -220,6 +235,7 @@ SCHEMAS: dict[str, type] = {
     "loss_manual": ManualConfig,
     "loss_agrol": AGRoLLossConfig,
     "loss_avatar_poser": AvatarPoserLossConfig,
+    "loss_terms": TermsLossConfig,
     "hand_position": HandPositionConfig,
     "hand_fk": HandFKConfig,
     "hand_off": NoHandConfig,

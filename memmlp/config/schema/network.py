@@ -78,6 +78,46 @@ class AvatarPoserConfig(BaselineConfig):
 
 
 @dataclass
+class EgoPoserConfig(AvatarPoserConfig):
+    name: str = called("ego_poser")
+    _target_: str = target("memmlp.networks.baselines.ego_poser.EgoPoser")
+
+
+@dataclass
+class HMDPoserConfig(AvatarPoserConfig):
+    name: str = called("hmd_poser")
+    _target_: str = target("memmlp.networks.baselines.hmd_poser.HMDPoser")
+    width: int = at_least(4)
+    layers: int = at_least(1)
+    shape: float = at_least(0)
+
+
+@dataclass
+class VAEHMDConfig(BaselineConfig):
+    name: str = called("vae_hmd")
+    _target_: str = target("memmlp.networks.baselines.vae_hmd.VAEHMD")
+    latent: int = at_least(1)
+    dropout: float = fraction()
+    divergence: float = at_least(0)
+
+
+@dataclass
+class RPMConfig(AvatarPoserConfig):
+    name: str = called("rpm")
+    _target_: str = target("memmlp.networks.baselines.rpm.RPM")
+    context: int = at_least(1)
+    horizon: int = at_least(1)
+
+
+@dataclass
+class AvatarJLMConfig(AvatarPoserConfig):
+    name: str = called("avatar_jlm")
+    _target_: str = target("memmlp.networks.baselines.avatar_jlm.AvatarJLM")
+    width: int = at_least(4)
+    coarse: float = at_least(0)
+
+
+@dataclass
 class PredictorConfig:
     """The predictor slot (conf/predictor)."""
 

@@ -8,9 +8,23 @@ from __future__ import annotations
 
 from memmlp.common.errors import InputError
 from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP
+from memmlp.networks.baselines.avatar_jlm import AvatarJLM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
+from memmlp.networks.baselines.ego_poser import EgoPoser
+from memmlp.networks.baselines.hmd_poser import HMDPoser
+from memmlp.networks.baselines.rpm import RPM
+from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
-from memmlp.networks.streaming.baselines import AGRoLDiffusionStream, AGRoLMLPStream, AvatarPoserStream
+from memmlp.networks.streaming.baselines import (
+    AGRoLDiffusionStream,
+    AGRoLMLPStream,
+    AvatarJLMStream,
+    AvatarPoserStream,
+    EgoPoserStream,
+    HMDPoserStream,
+    RPMStream,
+    VAEHMDStream,
+)
 from memmlp.networks.streaming.mem_mlp import MemMLPStream
 from memmlp.networks.streaming.ring import StreamingGraph
 from memmlp.networks.window_model import WindowModel
@@ -20,6 +34,11 @@ __all__ = ["StreamingGraph", "streaming"]
 STREAMS: dict[type[WindowModel], type[StreamingGraph]] = {
     MemMLP: MemMLPStream,
     AvatarPoser: AvatarPoserStream,
+    EgoPoser: EgoPoserStream,
+    HMDPoser: HMDPoserStream,
+    AvatarJLM: AvatarJLMStream,
+    RPM: RPMStream,
+    VAEHMD: VAEHMDStream,
     AGRoLMLP: AGRoLMLPStream,
     AGRoLDiffusion: AGRoLDiffusionStream,
 }
