@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from memmlp.cli.options import outputs_option
+from memmlp.cli.options import outputs_option, plugins_option
 from memmlp.cli.workers import Workers, hire, worker_options
 from memmlp.common.errors import InputError
 from memmlp.common.lease import Lock
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     help="Folder of your own configs, searched beside memmlp's; it may name classes of yours.",
 )
+@plugins_option
 @outputs_option
 def tune(
     overrides: tuple[str, ...], workers: Workers, status: bool, config_dir: Path | None, outputs: Path
