@@ -173,10 +173,11 @@ def report(shown: Shown, words: Sequence[str], chosen: Sweep) -> None:
     from memmlp.cli.rounds import closing
     from memmlp.cli.table import SHOWN_MODES, of_plan, on_screen
     from memmlp.cli.track import show_in_trackers
+    from memmlp.config import plugins
     from memmlp.config.plan_sweep import orphans, sweep_folder
     from memmlp.tables.measured_run import load
 
-    plan, known = shown.plan, shown.rounds
+    plan, known, words = shown.plan, shown.rounds, [*words, *plugins.words()]
     states = plan.states()
     failed = [task for task in plan.tasks if states[task.key] in ("failed", "blocked")]
     command = " ".join(["memmlp sweep", *words])

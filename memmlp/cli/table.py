@@ -185,10 +185,13 @@ def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, 
     """Return the sweeps of some names, with the overrides, and the command that runs each."""
     from memmlp.config.packaged import packaged
     from memmlp.config.plan_sweep import find_sweep
+    from memmlp.config.plugins import words
 
     tables = sorted(path.stem for path in packaged("sweeps").glob("table*.yaml"))
     every = [one for name in names for one in (tables if name == "all" else [name])]
-    return [(find_sweep(one, overrides), " ".join(["memmlp sweep", one, *overrides])) for one in every]
+    return [
+        (find_sweep(one, overrides), " ".join(["memmlp sweep", one, *overrides, *words()])) for one in every
+    ]
 
 
 def on_screen(tables: Sequence[Table]) -> None:

@@ -229,6 +229,17 @@ def check_allowed(config: Mapping[str, Any], recorded: Mapping[str, Any], where:
     for name in dict.fromkeys(named_here):
         if name not in _active:
             raise InputError(f"{where}: {_refusal(str(name), recorded)}")
+    for path in foreign(config):
+        if not _defined(path, owner(path)):
+            raise InputError(f"{where}: {path}: allowed is what {owner(path)} defines itself")
+
+
+def _defined(path: str, name: str) -> bool:
+    """Return whether a package defines what lies at a path, and does not only import it: mine.os.system."""
+    from memmlp.config.instantiate import located
+
+    module = getattr(located(path, name), "__module__", "") or ""
+    return module.split(".")[0] == name.split(".")[0]
 
 
 def _refusal(name: str, recorded: Mapping[str, Any]) -> str:

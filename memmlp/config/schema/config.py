@@ -283,10 +283,11 @@ def _restored(group: str, content: Mapping[str, Any]) -> Any:
     """
     if group == "tracking":
         return _trackers(content)
-    if group == "data":
+    option = SCHEMAS.get(f"{group}_{content.get('name')}")
+    ours = option is None or option.__module__.startswith("memmlp.")
+    if group == "data" and ours:
         schema = SynthDataConfig if content["synth"] else DATA[content["split"]["name"]]
         return OmegaConf.merge(OmegaConf.structured(schema), _bare(content))
-    option = SCHEMAS.get(f"{group}_{content.get('name')}")
     return OmegaConf.merge(OmegaConf.structured(option or GROUPS[group]), _content(option, content))
 
 

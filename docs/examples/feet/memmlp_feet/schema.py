@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from memmlp.config.schema.network import MemoryConfig
 from memmlp.config.schema.rules import EachOf, Within, at_least, called, key, one_of, target
 
+# ruff: noqa: RUF009
+
 
 @dataclass
 class MeanMemoryConfig(MemoryConfig):
