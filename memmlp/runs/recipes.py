@@ -3,7 +3,8 @@
 A run's identity holds the numbers of the components that it uses. Whoever changes what a component computes
 raises its number in the same commit: the runs that used it then have an outdated recipe and are made again,
 and no others. `tests/test_golden.py` computes a few steps of every component and fails until that is done.
-Moving or renaming code changes no number.
+Moving or renaming code changes no number. Packages of one's own add numbers for their components
+(memmlp.config.plugins).
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ def _show(value: Any) -> str:
     return str(list(value)) if OmegaConf.is_list(value) else str(value)
 
 
-SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand")
+SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term")
 
 
 def _check_names(cfg: DictConfig) -> None:
@@ -97,7 +97,9 @@ def _check_names(cfg: DictConfig) -> None:
     for slot in SLOTS:
         node = cfg[slot]
         path = node.get("_target_") if node is not None else None
-        if path and not path.startswith("memmlp.") and f"{slot}_{node.name}" in SCHEMAS:
+        schema = SCHEMAS.get(f"{slot}_{node.name}") if path else None
+        ours = schema is not None and schema.__module__.startswith("memmlp.")
+        if path and ours and not path.startswith("memmlp."):
             raise InputError(f"{slot}.name={node.name}: allowed for {path} is a name of its own")
     for name, node in cfg.tracking.items():
         if node.name != name:
@@ -153,7 +155,7 @@ def _check_baseline(cfg: DictConfig) -> None:
     Nothing may be set that concerns these, and its sizes must fit each other.
     """
     name = cfg.model._target_.rsplit(".", 1)[-1]
-    for group in ("memory", "predictor", "hand"):
+    for group in ("memory", "predictor", "hand", "term"):
         if cfg[group] is not None:
             raise InputError(f"{group}: {name} has none; allowed is a command line without {group}=...")
     if not _is(cfg.loss, BaselineLossConfig):

@@ -9,6 +9,7 @@ from omegaconf import MISSING
 
 from memmlp.config.schema.rules import (
     EachOf,
+    OneOfOrPath,
     Text,
     Within,
     at_least,
@@ -29,7 +30,7 @@ from memmlp.config.schema.rules import (
 class FrameConfig:
     """The space in which the network sees the motion (conf/frame)."""
 
-    coordinates: str = one_of("heading", "head_relative", "world")
+    coordinates: str = key(OneOfOrPath(("heading", "head_relative", "world")))
     normalize: bool = key()
 
 

@@ -153,6 +153,18 @@ class NoHandConfig(HandConfig):
 
 
 @dataclass
+class TermConfig:
+    """One more term of Mem-MLP's loss, of one's own (conf/term); null for none.
+
+    `weight` acts with fixed weights alone (loss=manual).
+    """
+
+    name: str = key(Text())
+    _target_: str = MISSING
+    weight: float = at_least(0)
+
+
+@dataclass
 class OptimConfig:
     """How the network is trained (conf/optim)."""
 

@@ -29,7 +29,7 @@ from memmlp.networks.streaming.mem_mlp import MemMLPStream
 from memmlp.networks.streaming.ring import StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
-__all__ = ["StreamingGraph", "streaming"]
+__all__ = ["StreamingGraph", "has_stream", "streaming"]
 
 STREAMS: dict[type[WindowModel], type[StreamingGraph]] = {
     MemMLP: MemMLPStream,
@@ -49,11 +49,21 @@ def streaming(model: WindowModel) -> StreamingGraph:
 
     Raises:
         InputError: if the network has none: where estimates of past frames change at each step
-            (`memory.history=latest`), nothing can be carried.
+            (`memory.history=latest`), nothing can be carried, and a part of one's own may have no graph.
     """
-    if not model.settled:
+    if getattr(getattr(model, "memory", None), "history", None) == "latest":
         raise InputError(
             "memory.history=latest: its estimates change at each step, which no streaming graph can carry; "
             "allowed is export.graph=naive, or memory.history=first"
         )
+    if not has_stream(model):
+        raise InputError(
+            "export.graph=streaming: a part of one's own has none; allowed is export.graph=naive"
+        )
     return STREAMS[type(model)](model)
+
+
+def has_stream(model: WindowModel) -> bool:
+    """Return whether there is a streaming graph of a network; of parts of one's own there may be none."""
+    graph = STREAMS.get(type(model))
+    return graph is not None and model.settled and graph.fits(model)

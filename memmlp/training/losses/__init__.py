@@ -2,7 +2,7 @@
 
 from memmlp.training.losses.baselines import AGRoLLoss, AvatarPoserLoss
 from memmlp.training.losses.loss import Fixed, Loss, Manual, Terms, Uncertainty, Weighting, joints
-from memmlp.training.losses.mem_mlp import HandFK, HandPosition, MotionLoss, NoHand, l1
+from memmlp.training.losses.mem_mlp import HandFK, HandPosition, MotionLoss, NoHand, Term, l1
 from memmlp.training.losses.terms import TermsLoss
 
 __all__ = [
@@ -15,6 +15,7 @@ __all__ = [
     "Manual",
     "MotionLoss",
     "NoHand",
+    "Term",
     "Terms",
     "TermsLoss",
     "Uncertainty",

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from memmlp.common.errors import InputError
 from memmlp.motion.body import N_JOINTS, POSITION
 from memmlp.motion.normalizer import Normalizer
 
@@ -25,8 +26,15 @@ class Fixed(nn.Module):
         super().__init__()
         self.values = values
 
-    def build(self, names: list[str]) -> None:
-        """Do nothing, since there is nothing to learn."""
+    def build(self, names: list[str], own: Mapping[str, float] | None = None) -> None:
+        """Take the weights of terms of one's own, by name; there is nothing to learn.
+
+        Raises:
+            InputError: for a term that has no weight.
+        """
+        self.values = {**(own or {}), **self.values}
+        if lacking := [name for name in names if name not in self.values]:
+            raise InputError(f"loss: term '{lacking[0]}' has no weight; allowed are {', '.join(self.values)}")
 
     def parameter_groups(self) -> list[dict]:
         """Return no parameters, since there is nothing to learn."""
@@ -75,8 +83,8 @@ class Uncertainty(nn.Module):
         self.lr = lr
         self.s = nn.ParameterDict()
 
-    def build(self, names: list[str]) -> None:
-        """Make a parameter s, starting at 0, for each term."""
+    def build(self, names: list[str], own: Mapping[str, float] | None = None) -> None:
+        """Make a parameter s, starting at 0, for each term; `own` is of fixed weights, and not used."""
         self.s = nn.ParameterDict({name: nn.Parameter(torch.zeros(())) for name in names})
 
     def parameter_groups(self) -> list[dict]:
