@@ -108,7 +108,6 @@ class RecurrentMemory(FeatureMemory):
     """
 
     recurrence: ClassVar[type[Recurrence]]
-    settled = True
 
     def __init__(
         self,

@@ -26,8 +26,7 @@ class Memory(nn.Module):
             without a past.
         length: how many past frames of inputs the buffer holds; the last one directly precedes the new ones.
         frames: T, the window's length.
-        settled: whether what is recalled of a frame never changes, so that a stream may compute it once. A
-            memory of one's own that does not say so is exported as it was trained.
+        settled: whether what is recalled of a frame never changes, so that a stream may compute it once.
     """
 
     uses_codes: ClassVar[bool] = False
@@ -35,7 +34,7 @@ class Memory(nn.Module):
     shift: int
     length: int
     frames: int
-    settled: bool = False
+    settled: bool = True
 
     def block(self, layer: int) -> nn.Module:
         """Make the backbone's block of a layer (1-based)."""
@@ -92,8 +91,6 @@ class NoMemory(Memory):
         depth: the backbone's L; not used here.
         codes: the frozen VQ-VAE; not used here.
     """
-
-    settled = True
 
     def __init__(self, *, hidden: int, frames: int, depth: int, codes: VQVAE | None = None):
         super().__init__()
