@@ -113,6 +113,9 @@ def config_page() -> str:
     for group in sorted(path.name for path in conf.iterdir() if path.is_dir()):
         if group not in ("profile", "search"):
             parts += group_section(conf / group, defaults.get(group))
+    empty = (name for name in defaults if "/" not in name and name != "_self_" and not (conf / name).is_dir())
+    for group in sorted(empty):
+        parts += [f"## {group}", "Empty here: [packages of your own](../guides/components.md) add options."]
     parts += [
         "## search",
         "Of `memmlp tune`, as `search.KEY=VALUE`; [searches](../guides/searches.md) explains them.",

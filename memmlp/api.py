@@ -370,6 +370,8 @@ def _frame(rows: Iterable[dict[str, Any]]) -> pd.DataFrame:
         raise InputError(
             "per_clip: needs pandas, pip install 'memmlp[notebook]'; allowed without: results"
         ) from None
-    frame = pd.DataFrame(list(rows), columns=list(COLUMNS))
+    every = list(rows)
+    own = {name: None for row in every for name in row if name not in COLUMNS}  # metrics of one's own
+    frame = pd.DataFrame(every, columns=[*COLUMNS, *own])
     frame.attrs["units"] = dict(UNITS)
     return frame

@@ -14,6 +14,7 @@ import processes
 import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
+from own_package import on_path  # noqa: F401
 from remembered import remember
 
 
@@ -73,6 +74,7 @@ def clean(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in (
         "MEMMLP_OUTPUTS",
         "MEMMLP_TRACEBACK",
+        "MEMMLP_PLUGINS",
         "MLFLOW_TRACKING_URI",
         "HYDRA_FULL_ERROR",
         "COMP_LINE",

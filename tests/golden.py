@@ -56,8 +56,10 @@ from memmlp.training.losses import (
     MotionLoss,
     NoHand,
     Terms,
+    TermsLoss,
     Uncertainty,
 )
+from memmlp.training.losses.terms import ERRORS, TERMS
 from memmlp.training.network import MotionTask
 from memmlp.training.optim import Optim, vqvae_optim
 from memmlp.training.rollout import OwnPredictions, PersistentStreams, Rollout, TeacherForcing
@@ -342,6 +344,11 @@ CASES: dict[str, Callable[[], Numbers]] = {
         f"{anchor} {name}": value
         for anchor in ("pelvis", "head")
         for name, value in loss(partial(AvatarPoserLoss, anchor=anchor)).items()
+    },
+    "loss.terms": lambda: {
+        f"{error} {name}": value
+        for error in ERRORS
+        for name, value in loss(partial(TermsLoss, error, **dict.fromkeys(TERMS, 0.5))).items()
     },
     "hand.position": lambda: hand(HandPosition()),
     "hand.fk": lambda: hand(HandFK()),

@@ -14,10 +14,12 @@ import pytest
 import yaml
 from command_lines import ROOT, Line, blocks, inline_lines, shell_lines, takes
 from omegaconf import OmegaConf
+from own_package import PACKAGE
 
 from memmlp.cli.main import COMMANDS
 from memmlp.config.build import build_loss
 from memmlp.config.compose import composed
+from memmlp.config.plugins import activate
 from memmlp.motion.importing.skeleton import SkeletonMap
 from memmlp.runs.identity import flatten
 from memmlp.sweep.spec import load_sweep
@@ -41,8 +43,10 @@ def ids(lines: list[Line]) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("line", LINES, ids=ids(LINES))
-def test_a_command_line_is_taken(line: Line, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_command_line_is_taken(line: Line, on_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
+    if PACKAGE in line.text:
+        activate([PACKAGE])
     checks(line.text)
 
 

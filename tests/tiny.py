@@ -15,13 +15,18 @@ from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.features import motion_frames
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP
+from memmlp.networks.baselines.avatar_jlm import AvatarJLM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
+from memmlp.networks.baselines.ego_poser import EgoPoser
+from memmlp.networks.baselines.hmd_poser import HMDPoser
+from memmlp.networks.baselines.rpm import RPM
+from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import CodeMemory, JointCodeMemory, Memory, NoMemory, RecurrentMemory
 from memmlp.networks.predictor import Predictor, TwoBranch
 from memmlp.networks.vqvae import VQVAE
 from memmlp.networks.window_model import WindowModel
-from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss
+from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, TermsLoss
 
 SIZES = {"hidden": 16, "frames": 7}
 DEPTH = 4
@@ -99,11 +104,31 @@ BASELINES: dict[str, Callable[..., WindowModel]] = {
         AGRoLDiffusion, frames=7, width=16, depth=2, diffusion_steps=50, sampling_steps=3, noise_seed=0
     ),
     "avatar_poser": partial(AvatarPoser, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
+    "ego_poser": partial(EgoPoser, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
+    "hmd_poser": partial(
+        HMDPoser, frames=7, width=16, depth=2, layers=1, heads=4, feedforward=32, dropout=0.1, shape=0.1
+    ),
+    "vae_hmd": partial(VAEHMD, frames=7, width=16, depth=2, latent=6, dropout=0.2, divergence=0.01),
+    "avatar_jlm": partial(
+        AvatarJLM, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, coarse=1.0
+    ),
+    "rpm": partial(
+        RPM, frames=9, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, context=3, horizon=4
+    ),
 }
-BASELINE_LOSSES: dict[str, type[Loss]] = {
+WINDOWLESS = ["hmd_poser", "vae_hmd", "rpm"]
+"""Baselines without a window, which are streams in both modes of evaluation."""
+BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
     "agrol_mlp": AGRoLLoss,
     "agrol_diffusion": AGRoLLoss,
     "avatar_poser": AvatarPoserLoss,
+    "ego_poser": partial(TermsLoss, orientation=0.02, rotation=1.0, position=1.0),
+    "hmd_poser": partial(
+        TermsLoss, orientation=1.0, rotation=5.0, global_rotation=1.0, world_position=1.0, acceleration=0.5
+    ),
+    "vae_hmd": partial(TermsLoss, "square", rotation=1.0, position=20.0, angle=0.1),
+    "avatar_jlm": partial(TermsLoss, rotation=2.0, position=5.0, velocity_3=16.0, contact=20.0, hand=5.0),
+    "rpm": partial(TermsLoss, rotation=1.0, sixd_velocity=1.0, world_position=1.0, velocity=1.0),
 }
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.options import device_option, outputs_option
+from memmlp.cli.options import device_option, outputs_option, plugins_option
 
 
 @click.command("eval")
@@ -25,6 +25,7 @@ from memmlp.cli.options import device_option, outputs_option
 )
 @click.option("--again", is_flag=True, help="Measure again what was measured before.")
 @device_option
+@plugins_option
 @outputs_option
 def evaluate(
     run: str,

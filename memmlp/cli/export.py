@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import outputs_option
+from memmlp.cli.options import outputs_option, plugins_option
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -57,6 +57,7 @@ if TYPE_CHECKING:
 @click.option(
     "--clips", default=1, show_default=True, help="How many test clips the file is checked on; 0 for all."
 )
+@plugins_option
 @outputs_option
 def export(
     run: str,

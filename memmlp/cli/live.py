@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from memmlp.cli.options import Finite, outputs_option
+from memmlp.cli.options import Finite, outputs_option, plugins_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -59,6 +59,7 @@ PORT = click.IntRange(1, 65535)
 @click.option(
     "--send", is_flag=True, help="Send the clip once, to the port of --udp or --osc, and show no page."
 )
+@plugins_option
 @outputs_option
 def live(
     network: str,

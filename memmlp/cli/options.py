@@ -53,6 +53,39 @@ outputs_option = click.option(
     help="Folder in which runs and caches of data are kept.",
 )
 
+
+def _use(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
+    """Use the packages of one's own that the option names, and those of the environment."""
+    from memmlp.config.plugins import activate, listed
+
+    if not ctx.resilient_parsing:
+        activate(listed(value or ""))
+
+
+def _search(ctx: click.Context, param: click.Parameter, value: Path | None) -> None:
+    """Search the option's folder of configs while the command runs."""
+    from memmlp.config.plugins import searching
+
+    if not ctx.resilient_parsing:
+        ctx.with_resource(searching(value))
+
+
+plugins_option = click.option(
+    "--plugins",
+    metavar="NAMES",
+    callback=_use,
+    expose_value=False,
+    help="Packages with components of your own, commas between; also MEMMLP_PLUGINS. Their code is run.",
+)
+
+config_dir_option = click.option(
+    "--config-dir",
+    type=click.Path(path_type=Path, file_okay=False, exists=True),
+    callback=_search,
+    expose_value=False,
+    help="Folder of your own configs, searched beside memmlp's; it may name classes of yours.",
+)
+
 format_option = click.option(
     "--format",
     "format_",

@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import PATH, device_option, format_option, outputs_option, strict_option
+from memmlp.cli.options import (
+    PATH,
+    device_option,
+    format_option,
+    outputs_option,
+    plugins_option,
+    strict_option,
+)
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
@@ -32,6 +39,7 @@ if TYPE_CHECKING:
 )  # fmt: skip
 @strict_option
 @device_option
+@plugins_option
 @outputs_option
 def predict(
     run: str,

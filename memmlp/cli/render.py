@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import Finite, outputs_option
+from memmlp.cli.options import Finite, outputs_option, plugins_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -60,6 +60,7 @@ POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions
     type=click.IntRange(1, 20),
     help="How many poses a PNG shows, evenly spaced over the piece.",
 )
+@plugins_option
 @outputs_option
 def render(
     runs: tuple[str, ...],

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import outputs_option
+from memmlp.cli.options import config_dir_option, outputs_option, plugins_option
 
 if TYPE_CHECKING:
     from memmlp.report.html import Chapter
@@ -29,6 +29,8 @@ EVERY = ["all", "memory_control"]
     "--tables-only", is_flag=True, help="The tables and figures alone: a small page that prints well."
 )
 @click.option("--no-replays", is_flag=True, help="Leave out the worst seconds of the best runs, in 3D.")
+@config_dir_option
+@plugins_option
 @outputs_option
 def report(
     words: tuple[str, ...], out: Path | None, tables_only: bool, no_replays: bool, outputs: Path

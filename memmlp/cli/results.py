@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import outputs_option
+from memmlp.cli.options import config_dir_option, outputs_option, plugins_option
 from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,6 +38,8 @@ def results() -> None:
     help="Folder into which the file of results is written.",
 )
 @click.option("--name", "stem", help="Name of the file, without its ending.  [default: the sweep's name]")
+@config_dir_option
+@plugins_option
 @outputs_option
 def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | None, outputs: Path) -> None:
     """Keep a sweep's results in one small file.
@@ -54,7 +56,7 @@ def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | N
     from memmlp.tables.rounds import as_json
     from memmlp.tables.runs_of_plan import finder
 
-    sweep = find_sweep(name).with_overrides(overrides)
+    sweep = find_sweep(name, overrides)
     known = shown(sweep, overrides, outputs.absolute())
     found = finished(known.sweep, finder(known.plan, functools.cache(load)))
     words = tuple(word for word in overrides if not word.startswith("seed="))

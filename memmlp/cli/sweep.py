@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import outputs_option
+from memmlp.cli.options import config_dir_option, outputs_option, plugins_option
 from memmlp.cli.workers import Workers, hire, worker_options
 from memmlp.common.errors import InputError
 
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     "--max-seeds", type=int, help="Most seeds that an arm may get, with --until-decided.  [default: 13]"
 )
 @click.option("--yes", is_flag=True, hidden=True)
+@config_dir_option
+@plugins_option
 @outputs_option
 def sweep(
     name: str,
@@ -70,7 +72,7 @@ def sweep(
     rounds.check(overrides, until_decided, max_seeds)
     if again and (until_decided or status or dry_run):
         raise InputError("--again: allowed is without --until-decided, --status and --dry-run")
-    chosen = find_sweep(name).with_overrides(overrides)
+    chosen = find_sweep(name, overrides)
     outputs = outputs.absolute()
     known = rounds.begun(chosen, outputs, max_seeds) if until_decided else None
     spent = known.spent(chosen) if known else chosen
@@ -171,10 +173,11 @@ def report(shown: Shown, words: Sequence[str], chosen: Sweep) -> None:
     from memmlp.cli.rounds import closing
     from memmlp.cli.table import SHOWN_MODES, of_plan, on_screen
     from memmlp.cli.track import show_in_trackers
+    from memmlp.config import plugins
     from memmlp.config.plan_sweep import orphans, sweep_folder
     from memmlp.tables.measured_run import load
 
-    plan, known = shown.plan, shown.rounds
+    plan, known, words = shown.plan, shown.rounds, [*words, *plugins.words()]
     states = plan.states()
     failed = [task for task in plan.tasks if states[task.key] in ("failed", "blocked")]
     command = " ".join(["memmlp sweep", *words])

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from memmlp.cli.options import outputs_option
+from memmlp.cli.options import config_dir_option, outputs_option, plugins_option
 from memmlp.common.errors import InputError
 from memmlp.sweep.spec import BRANCHES
 
@@ -60,6 +60,8 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
 @click.option(
     "--plan", is_flag=True, help="Show how many seeds it would take to see the paper's effects on this data."
 )
+@config_dir_option
+@plugins_option
 @outputs_option
 def table(
     name: str,
@@ -183,12 +185,12 @@ def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, 
     """Return the sweeps of some names, with the overrides, and the command that runs each."""
     from memmlp.config.packaged import packaged
     from memmlp.config.plan_sweep import find_sweep
+    from memmlp.config.plugins import words
 
     tables = sorted(path.stem for path in packaged("sweeps").glob("table*.yaml"))
     every = [one for name in names for one in (tables if name == "all" else [name])]
     return [
-        (find_sweep(one).with_overrides(overrides), " ".join(["memmlp sweep", one, *overrides]))
-        for one in every
+        (find_sweep(one, overrides), " ".join(["memmlp sweep", one, *overrides, *words()])) for one in every
     ]
 
 

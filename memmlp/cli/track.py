@@ -98,7 +98,7 @@ def show_in_trackers(plan: Plan, folder: Path, table: Table) -> None:
 @click.option("--port", default=5000, show_default=True)
 @outputs_option
 def mlflow(port: int, outputs: Path) -> None:
-    """Open MLflow's page on the tracked runs (needs pip install 'memmlp[ui]')."""
+    """Open MLflow's page on the tracked runs (needs pip install 'memmlp[mlflow]')."""
     from memmlp.tracking.mlflow_tracker import MLflow
 
     store = MLflow(None, outputs).place
@@ -108,5 +108,5 @@ def mlflow(port: int, outputs: Path) -> None:
     except ImportError:
         program = None
     if program is None:
-        raise InputError("mlflow: its page is not installed; pip install 'memmlp[ui]'")
+        raise InputError("mlflow: its page is not installed; pip install 'memmlp[mlflow]'")
     os.execv(program, [program, "ui", "--backend-store-uri", store, "--port", str(port)])

@@ -87,5 +87,7 @@ def metrics_table(results: Errors, title: str = "test clips") -> Table:
         table.add_column(f"{mode}\n{branch}", justify="right")
     for name, unit in UNITS.items():
         values = [results[mode][branch].get(name) for mode, branch in columns]
+        if all(value is None for value in values):  # a metric of one's own that was not asked for
+            continue
         table.add_row(name, unit, *("-" if value is None else f"{float(value):.2f}" for value in values))
     return table

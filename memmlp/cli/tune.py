@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from memmlp.cli.options import outputs_option
+from memmlp.cli.options import outputs_option, plugins_option
 from memmlp.cli.workers import Workers, hire, worker_options
 from memmlp.common.errors import InputError
 from memmlp.common.lease import Lock
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     help="Folder of your own configs, searched beside memmlp's; it may name classes of yours.",
 )
+@plugins_option
 @outputs_option
 def tune(
     overrides: tuple[str, ...], workers: Workers, status: bool, config_dir: Path | None, outputs: Path
@@ -93,11 +94,15 @@ def prepared(words: Sequence[str], config_dir: Path | None, outputs: Path) -> Se
         InputError: naming the key that is wrong.
     """
     from memmlp.config.plan_sweep import digest
+    from memmlp.config.plugins import activate, named
     from memmlp.search.spec import parse_search
 
+    activate(named(words))
     own = [word for word in words if word.lstrip("+~").partition("=")[0].split(".")[0] == "search"]
     rest = tuple(word for word in words if word not in own)
-    wanted = parse_search(_search_config(own, config_dir))
+    content = _search_config(own, config_dir)
+    activate(named(map(str, content.get("base") or ())))
+    wanted = parse_search(content)
     setup = Setup(wanted, rest, outputs, outputs / "tune" / wanted.name, config_dir)
     base = _check_space(setup)
     counted = {**asdict(wanted), "n_trials": None, "storage": None}

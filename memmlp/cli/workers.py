@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 ENGINES = ("local", "slurm", "ray", "debug")  # the last one is for finding bugs
 WITHOUT = {"cpu", "mps"}  # devices of runs that no GPU need be given to
 SETTINGS = ("slurm", "ray")  # executors with words of their own
+OWN = "executor"  # the words executor.KEY=VALUE are for one that is the path of a class
 
 
 @dataclass(frozen=True)
@@ -168,15 +169,17 @@ def split_executor(words: Iterable[str]) -> tuple[str, dict[str, str], tuple[str
         key, _, value = word.partition("=")
         if key == "executor":
             engine = value
-        elif key.split(".")[0] in SETTINGS and "." in key:
+        elif key.split(".")[0] in (*SETTINGS, OWN) and "." in key:
             own.append((key, value))
         else:
             rest.append(word)
-    if engine not in ENGINES:
-        raise InputError(f"executor={engine}: allowed is local, slurm or ray")
+    if engine not in ENGINES and "." not in engine:
+        raise InputError(f"executor={engine}: allowed is local, slurm or ray, or the path of your own class")
     for key, _ in own:
-        if key.split(".")[0] != engine:
-            raise InputError(f"{key}: goes with executor={key.split('.')[0]}")
+        group = key.split(".")[0]
+        if group != (OWN if "." in engine else engine):
+            goes = "a class of your own, executor=PATH" if group == OWN else f"executor={group}"
+            raise InputError(f"{key}: goes with {goes}")
     return engine, {key.partition(".")[2]: value for key, value in own}, tuple(rest)
 
 
@@ -197,6 +200,10 @@ def executor(workers: Workers, folder: Path, shared: list[Share], gpus: bool) ->
         from memmlp.sweep.executors.ray_cluster import Ray
 
         return Ray(workers.settings(), gpus)
+    if "." in workers.engine:
+        from memmlp.config.instantiate import located
+
+        return located(workers.engine, "executor")(logs(folder), workers.words)
     from memmlp.sweep.executors.local import Debug, Local
 
     return Debug(logs(folder)) if workers.engine == "debug" else Local(logs(folder), shared)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,14 +16,17 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from memmlp.common.errors import InputError
+from memmlp.common.plugin import METRICS
+from memmlp.config import plugins
 from memmlp.config.build_motion import build_motion, shares
 from memmlp.config.compose import composed
-from memmlp.config.instantiate import built
+from memmlp.config.instantiate import built, located
 from memmlp.config.readable_name import readable_name
 from memmlp.config.schema import check, restored
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK, LBFGS, NoIK
+from memmlp.evaluation.metrics import OwnMetric
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.coordinates import Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
@@ -38,11 +41,10 @@ from memmlp.networks.vqvae import VQVAE
 from memmlp.networks.window_model import WindowModel
 from memmlp.pipeline.devices import device
 from memmlp.pipeline.experiment import Experiment
-from memmlp.runs.identity import flatten
 from memmlp.runs.lookup import check_trained
 from memmlp.runs.run import Run
 from memmlp.tracking.feed import Tracking
-from memmlp.training.losses import Loss, MotionLoss
+from memmlp.training.losses import Loss, MotionLoss, Term
 from memmlp.training.network import NetworkTraining
 from memmlp.training.optim import Optim, vqvae_optim
 from memmlp.training.vqvae import VQVAETraining
@@ -59,10 +61,12 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
             its device.
 
     Raises:
-        InputError: where the config's device is not there.
+        InputError: where the config's device, or the code of a component of one's own, is not there.
     """
     outputs = Path(cfg.paths.outputs)
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    config["plugins"] = plugins.used(config)
+    metrics = build_metrics(cfg.evaluation.metrics)
     return Experiment(
         config=config,
         outputs=outputs,
@@ -82,9 +86,14 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
             optim=Optim(**config["optim"]),
             weighting=cfg.data.weighting,
             shares=shares(cfg.data),
+            metrics=metrics,
         ),
         evaluation=Evaluation(
-            modes=list(cfg.evaluation.modes), batch=cfg.evaluation.batch, ik=build_ik(cfg), seed=cfg.seed
+            modes=list(cfg.evaluation.modes),
+            batch=cfg.evaluation.batch,
+            ik=build_ik(cfg),
+            seed=cfg.seed,
+            metrics=metrics,
         ),
         deployment=build_deployment(cfg),
         predictions=Path(cfg.save_predictions) if cfg.save_predictions else None,
@@ -110,7 +119,7 @@ def build_tracking(cfg: DictConfig) -> Tracking:
 
 def build_architecture(cfg: DictConfig) -> Architecture:
     """Build the architecture of a checked config, which makes and loads its network."""
-    space = {"coordinates": COORDINATES[cfg.frame.coordinates](), "normalize": cfg.frame.normalize}
+    space = {"coordinates": build_coordinates(cfg.frame.coordinates), "normalize": cfg.frame.normalize}
     vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in VQVAE_SETTINGS})
     if "_target_" in cfg.model:
         return BaselineArchitecture(**space, vqvae=vqvae, network=built(cfg.model))
@@ -127,6 +136,26 @@ def build_architecture(cfg: DictConfig) -> Architecture:
     )
 
 
+def build_coordinates(name: str) -> World:
+    """Build the coordinates of that name, or of that path of a class of one's own."""
+    if name in COORDINATES:
+        return COORDINATES[name]()
+    found = located(name, "frame.coordinates")
+    if not (isinstance(found, type) and issubclass(found, World)):
+        raise InputError(
+            f"frame.coordinates={name}: allowed is a class that extends {World.__module__}.World"
+        )
+    return found()
+
+
+def build_metrics(names: Iterable[str]) -> dict[str, OwnMetric]:
+    """Return the metrics of one's own with these names."""
+    own = {name: METRICS[name] for name in names}
+    return {
+        name: OwnMetric(located(metric.function, f"metric {name}"), metric.of) for name, metric in own.items()
+    }
+
+
 def memory_class(cfg: DictConfig) -> type[Memory]:
     """Return the class in the memory slot."""
     return get_class(cfg.memory._target_)
@@ -135,13 +164,21 @@ def memory_class(cfg: DictConfig) -> type[Memory]:
 def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
     """Return a function that makes the loss for the branches that a network has.
 
-    Mem-MLP's loss is put together from the weighting, the hand term and the branches. A baseline's loss is
-    complete and ignores the branches.
+    Mem-MLP's loss is put together from the weighting, the hand term, a term of one's own and the branches. A
+    baseline's loss is complete and ignores the branches.
+
+    Raises:
+        InputError: for a term beside a complete loss.
     """
     loss = built(cfg.loss)
     if isinstance(loss, Loss):
+        if cfg.term is not None:
+            raise InputError(
+                f"term={cfg.term.name}: loss={cfg.loss.name} is a whole loss; allowed is term=null"
+            )
         return lambda branches: loss
-    return partial(MotionLoss, loss, built(cfg.hand))
+    term = built(cfg.term) if cfg.term is not None else Term()
+    return partial(MotionLoss, loss, built(cfg.hand), term=term)
 
 
 def build_deployment(cfg: DictConfig) -> Deployment | None:
@@ -174,12 +211,12 @@ def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
         overrides: KEY=VALUE words that replace keys of its config.
 
     Raises:
-        InputError: where the run is not finished, its config does not fit this version, or an override is
-            wrong.
+        InputError: where the run is not finished, its config does not fit this version, an override is
+            wrong, or code of one's own is not here or nobody said that it may be imported.
     """
     check_trained(run)
-    if foreign := sorted(name for name in _targets(run.config) if not name.startswith("memmlp.")):
-        raise InputError(f"{run.config_path}: {', '.join(foreign)}: allowed are classes of memmlp")
+    plugins.activate(plugins.named(overrides))
+    plugins.check_allowed(run.config, run.manifest.get("plugins") or {}, f"run {run.id}")
     try:
         cfg = restored(run.config)
     except (OmegaConfBaseException, KeyError, TypeError, ValueError) as error:
@@ -189,11 +226,6 @@ def config_of(run: Run, overrides: Sequence[str] = ()) -> DictConfig:
         _override(cfg, word)
     check(cfg)
     return cfg
-
-
-def _targets(tree: Mapping[str, Any]) -> list[str]:
-    """Return the paths of all classes that a config names."""
-    return [str(value) for key, value in flatten(tree).items() if key.rsplit(".", 1)[-1] == "_target_"]
 
 
 def _override(cfg: DictConfig, word: str) -> None:

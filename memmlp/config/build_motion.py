@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
-from memmlp.config.instantiate import built
+from memmlp.config.instantiate import built, located
 from memmlp.motion.preparing.cache import ClipFolder
 from memmlp.motion.preparing.folders import Folders, Root
 from memmlp.motion.preparing.source import MotionSource
@@ -19,26 +20,34 @@ from memmlp.motion.preparing.splits import MixedSplit, SeededSplit, Split
 def build_motion(cfg: DictConfig) -> MotionSource:
     """Build the source of an experiment's motion.
 
-    A synthetic folder's name holds its length and seed, so that other settings never find stale files.
+    A synthetic folder's name holds its length and seed, or the settings of a generator of one's own, so that
+    other settings never find stale files.
 
     Raises:
-        InputError: if a list of groups can't be read, or two folders of a list have one name.
+        InputError: if a list of groups can't be read, two folders of a list have one name, or there is no
+            such generator.
     """
     data = cfg.data
     root, split = _clips(data)
-    generate = None
-    if data.synth is not None:
+    generate: Callable[[Path], object] | None = None
+    if data.synth is not None and "_target_" in data.synth:
+        settings = {str(key): value for key, value in data.synth.items() if key != "_target_"}
+        root = Path(data.root) / "-".join(f"{key}{value}" for key, value in settings.items())
+        generate = partial(located(data.synth._target_, "data.synth"), **settings)
+    elif data.synth is not None:
         root = Path(data.root) / f"{data.synth.minutes:g}min-seed{data.synth.seed}"
-        minutes, seed = data.synth.minutes, data.synth.seed
-
-        def generate(folder: Path) -> None:
-            from memmlp.motion.synthetic import synthesize
-
-            synthesize(folder, minutes=minutes, seed=seed)
+        generate = partial(_synthesize, minutes=data.synth.minutes, seed=data.synth.seed)
 
     source = ClipFolder(root, split, str(data.body), data.min_frames, data.strict)
     caches = Path(cfg.paths.outputs) / "cache"
     return MotionSource(source, generate, caches, partial=data.get("partial", False))
+
+
+def _synthesize(folder: Path, minutes: float, seed: int) -> None:
+    """Make synthetic motion; imported here, since that needs torch."""
+    from memmlp.motion.synthetic import synthesize
+
+    synthesize(folder, minutes=minutes, seed=seed)
 
 
 def shares(data: DictConfig) -> Mapping[str, float] | None:

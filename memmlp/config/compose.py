@@ -12,12 +12,15 @@ from hydra import compose, version
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path, get_args_parser
-from hydra.core.config_search_path import SearchPathQuery
+from hydra.core.config_search_path import ConfigSearchPath, SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
 from memmlp.common.errors import InputError
+from memmlp.config import plugins
 from memmlp.config.explain import explain
 from memmlp.config.packaged import packaged
 from memmlp.config.schema import check, register
@@ -37,7 +40,18 @@ def parse(argv: Sequence[str]) -> tuple[argparse.Namespace, argparse.ArgumentPar
     args = parser.parse_intermixed_args(list(argv))
     if args.experimental_rerun:
         raise InputError("--experimental-rerun: unpickles a file; allowed are overrides")
+    plugins.activate(plugins.named(args.overrides))
+    Plugins.instance().register(OwnConfigs)
     return args, parser
+
+
+class OwnConfigs(SearchPathPlugin):
+    """Tells Hydra, wherever it composes, of the folders of configs that are searched beside memmlp's."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Add the folders, after memmlp's own."""
+        for provider, folder in plugins.folders():
+            search_path.append(provider, f"file://{folder}")
 
 
 def _refuse(message: str) -> NoReturn:
@@ -75,7 +89,18 @@ def preflight(args: argparse.Namespace) -> list[DictConfig]:
             with _explained(overrides):
                 configs.append(compose(args.config_name or CONFIG, overrides))
             check(configs[-1])
+            _check_plugins(configs[-1])
     return configs
+
+
+def _check_plugins(cfg: DictConfig) -> None:
+    """Check that the packages of one's own were known before the config was composed."""
+    for name in cfg.plugins:
+        if name not in plugins.active():
+            raise InputError(
+                f"plugins=[{name}]: a config file tells it too late; allowed is on the command line, "
+                f"in the base of a sweep or search, or {plugins.VARIABLE}={name}"
+            )
 
 
 HELP = """memmlp train trains, evaluates, exports and times one configuration.

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from hydra.utils import instantiate
+from hydra.errors import InstantiationException
+from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig
+
+from memmlp.common.errors import InputError
 
 
 def built(node: DictConfig, **given: Any) -> Any:
@@ -13,6 +16,25 @@ def built(node: DictConfig, **given: Any) -> Any:
 
     All keys of the option but `name` become arguments, and so do those in `given`. An option with `_partial_`
     gives a partial constructor, which is called once the rest of the arguments is known.
+
+    Raises:
+        InputError: naming the class, where there is none or its constructor refuses the arguments.
     """
     own = {key: value for key, value in node.items() if key != "name"}
-    return instantiate(own, _convert_="all", **given)
+    try:
+        return instantiate(own, _convert_="all", **given)
+    except InstantiationException as error:
+        raise InputError(f"{own['_target_']}: cannot be built: {_reason(error)}") from error
+
+
+def _reason(error: InstantiationException) -> str:
+    """Return in one line what went wrong in building a component."""
+    return str(error.__cause__ or error).splitlines()[0]
+
+
+def located(path: str, key: str) -> Any:
+    """Return the class or function at a dotted path. Raises InputError, naming the key, for none."""
+    try:
+        return get_object(path)
+    except (ImportError, ValueError, InstantiationException) as error:
+        raise InputError(f"{key}: {path}: {str(error).splitlines()[0]}") from error

@@ -74,8 +74,10 @@ def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
     from omegaconf import OmegaConf
 
     from memmlp.config.build import build_experiment
+    from memmlp.config.plugins import activate
     from memmlp.pipeline.run_stages import run_experiment, vqvae_run
 
+    activate(task.config.get("plugins") or ())
     experiment = build_experiment(OmegaConf.create(dict(task.config)))
     check_identity(experiment, task)
     if chosen := experiment.config["threads"] or threads:

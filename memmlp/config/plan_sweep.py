@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json, write_json
 from memmlp.config.packaged import packaged
+from memmlp.config.plugins import activate, named, texts
 from memmlp.sweep.kept import keep
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
 from memmlp.sweep.spec import Arm, Sweep, load_sweep
@@ -26,21 +27,33 @@ if TYPE_CHECKING:
     from memmlp.pipeline.experiment import Experiment
 
 
-def find_sweep(name: str) -> Sweep:
+def find_sweep(name: str, overrides: Sequence[str] = ()) -> Sweep:
     """Load the sweep of a path, of a shipped file's name, or of a table's number.
+
+    Packages of one's own that its base or the overrides name are in use afterwards.
+
+    Args:
+        name: the path, name or number.
+        overrides: the command line's overrides (see `Sweep.with_overrides`).
 
     Raises:
         InputError: where there is none, or the file is wrong.
     """
+    activate(named(overrides))
+    return load_sweep(_path(name), lambda base: activate(named(base))).with_overrides(overrides)
+
+
+def _path(name: str) -> Path:
+    """Return the file of a sweep. Raises InputError where there is no shipped one of that name."""
     if is_path(name):
-        return load_sweep(Path(name))
+        return Path(name)
     folder = packaged("sweeps")
     stem = f"table{int(name):02d}" if name.isdecimal() else name
     path = folder / f"{stem}.yaml"
     if not path.is_file():
         known = ", ".join(sorted(file.stem for file in folder.glob("*.yaml")))
         raise InputError(f"sweep '{name}': no such sweep; allowed are a path ending in .yaml, or {known}")
-    return load_sweep(path)
+    return path
 
 
 def is_path(name: str) -> bool:
@@ -172,12 +185,13 @@ def _fresh(data: dict[str, Any], prepare: bool) -> bool:
 def _stamp(sweep: Sweep, outputs: Path) -> str:
     """Return a digest of everything but the data that a plan follows from.
 
-    That is the sweep, the outputs folder, the configs, and the package's code.
+    That is the sweep, the outputs folder, the configs, and the package's code, with those of one's own.
     """
     package = Path(__file__).parent.parent
     files = [*packaged("conf").rglob("*.yaml"), *package.rglob("*.py")]
-    texts = [(str(file), file.read_text(encoding="utf-8")) for file in sorted(files)]
-    return digest([asdict(sweep), str(outputs), texts])
+    ours = [(str(file), file.read_text(encoding="utf-8")) for file in sorted(files)]
+    own = texts()
+    return digest([asdict(sweep), str(outputs), ours, *([own] if own else [])])
 
 
 def _remember(sweep: Sweep, plan: Plan, path: Path) -> None:

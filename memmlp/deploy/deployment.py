@@ -12,7 +12,7 @@ from memmlp.deploy import latency
 from memmlp.deploy.export import export
 from memmlp.deploy.parity import TOLERANCE, parity
 from memmlp.deploy.quantization import compared, quantise
-from memmlp.networks.streaming import StreamingGraph, streaming
+from memmlp.networks.streaming import StreamingGraph, has_stream, streaming
 from memmlp.networks.window_model import WindowModel
 from memmlp.runs.deployment_folder import DeploymentFolder
 
@@ -20,7 +20,7 @@ from memmlp.runs.deployment_folder import DeploymentFolder
 GRAPHS: dict[str, Callable[[WindowModel], WindowModel | StreamingGraph]] = {
     "naive": lambda model: model,
     "streaming": streaming,
-    "auto": lambda model: streaming(model) if model.settled else model,
+    "auto": lambda model: streaming(model) if has_stream(model) else model,
 }
 """`streaming` computes each frame's own share once, `naive` is the network as it was trained, `auto` the
 first of them that there is."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch
 
 from memmlp.evaluation import modes
 from memmlp.evaluation.ik import IK
+from memmlp.evaluation.metrics import OwnMetrics
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks.window_model import WindowModel
@@ -27,12 +28,14 @@ class Evaluation:
         batch: how many clips are evaluated side by side, at most.
         ik: inverse kinematics, whose result is reported as a branch beside the network's own.
         seed: seed of the draws of a blend that is sampled.
+        metrics: metrics of one's own, by name.
     """
 
     modes: Sequence[str]
     batch: int
     ik: IK
     seed: int
+    metrics: OwnMetrics = field(default_factory=dict)
 
     def report(self, model: WindowModel, test: MotionDataset, mode: str) -> dict[str, Any]:
         """Compute the metrics in a mode.
@@ -41,7 +44,7 @@ class Evaluation:
             "mean", the metrics by branch, and "clips", a row for each clip with its metrics by branch.
         """
         torch.manual_seed(self.seed)  # a mode's result does not depend on which modes came before it
-        found = modes.evaluate(model, test, [mode], self.batch, self.ik)
+        found = modes.evaluate(model, test, [mode], self.batch, self.ik, self.metrics)
         facts = ("name", "group", "source", "frames")
         rows = [{key: row[key] for key in facts if key in row} | row[mode] for row in found["clips"]]
         return {"mean": found["mean"][mode], "clips": rows}

@@ -6,10 +6,13 @@ Positions (N, 22, 3) are metres in the world at 60 Hz; rotations (N, 22, 3, 3) a
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from memmlp.common.errors import InputError
 from memmlp.motion.body import FPS, HANDS, LOWER, ROOT, UPPER
 from memmlp.motion.geometry import geodesic_angle, matrix_to_axis_angle
 
@@ -66,3 +69,36 @@ def positions_report(predicted: Tensor, truth: Tensor) -> dict[str, float]:
 def rotations_report(predicted: Tensor, truth: Tensor) -> dict[str, float]:
     """Return the rotation metrics of one clip by name."""
     return {"MPJRE": float(mpjre(predicted, truth)), "geodesic": float(geodesic(predicted, truth))}
+
+
+@dataclass(frozen=True)
+class OwnMetric:
+    """A metric of one's own.
+
+    Attributes:
+        function: maps prediction and truth of one clip to one number.
+        of: what it is given: "positions" (N, 22, 3) or "rotations" (N, 22, 3, 3).
+    """
+
+    function: Callable[[Tensor, Tensor], Tensor]
+    of: str
+
+
+OwnMetrics = Mapping[str, OwnMetric]
+
+
+def own_report(own: OwnMetrics, of: str, predicted: Tensor, truth: Tensor) -> dict[str, float]:
+    """Return the metrics of one's own that are given positions, or those given rotations, of one clip.
+
+    Raises:
+        InputError: naming the metric, where it returns no number.
+    """
+    return {name: _number(name, one, predicted, truth) for name, one in own.items() if one.of == of}
+
+
+def _number(name: str, metric: OwnMetric, predicted: Tensor, truth: Tensor) -> float:
+    value = metric.function(predicted, truth)
+    try:
+        return float(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"metric {name}: returned no number: {error}") from error

@@ -4,7 +4,7 @@
 `window` is AGRoL's: non-overlapping windows whose T frames all count; the tail window is shifted back and its
 overlap dropped. A network that recalls the window which ended one frame before is led through each window
 frame by frame, so that it recalls what it was trained on: in one call it would get the window of T frames
-ago. Its result for a window is the last call's output.
+ago. Its result for a window is the last call's output. A network without a window is a stream in both.
 """
 
 from __future__ import annotations
@@ -35,6 +35,10 @@ class Evaluable(Protocol):
     def shift(self) -> int:
         """By how many frames the network's own past, which it sees, ends before the newest frame; else 0."""
 
+    @property
+    def windowless(self) -> bool:
+        """Whether the network has no window, so that both modes are the stream."""
+
     def initial_state(self, batch: int = 1) -> State:
         """Return the state of a fresh start."""
 
@@ -49,6 +53,8 @@ def stream(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
 
 def window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
     """Predict the world motion (N, 198) of clips (N, 252), by non-overlapping windows."""
+    if network.windowless:
+        return stream(network, clips)
     if 0 < network.shift < network.frames:
         return frame_by_frame(network, clips, network.frames)
     return window_by_window(network, clips)
@@ -103,7 +109,12 @@ MODE_FUNCTIONS: dict[str, Callable[[Evaluable, Sequence[Tensor]], list[Tensor]]]
 
 
 def evaluate(
-    network: Evaluable, dataset: MotionDataset, modes: Sequence[str], batch: int, ik: IK | None = None
+    network: Evaluable,
+    dataset: MotionDataset,
+    modes: Sequence[str],
+    batch: int,
+    ik: IK | None = None,
+    own: metrics.OwnMetrics | None = None,
 ) -> dict[str, Any]:
     """Compute the metrics of a split: `{"mean": {mode: {branch: {metric: value}}}, "clips": [...]}`.
 
@@ -115,6 +126,7 @@ def evaluate(
         modes: the evaluation modes.
         batch: how many clips are evaluated side by side, at most.
         ik: inverse kinematics, whose result is a further branch.
+        own: metrics of one's own.
     """
     clips = dataset.clips()
     rows: list[dict[str, Any]] = [
@@ -125,7 +137,7 @@ def evaluate(
         row["source"] = source
     for mode in modes:
         for row, clip, motion in zip(rows, clips, predict(network, clips, mode, batch), strict=True):
-            row[mode] = clip_report(network.normalizer, motion, clip, ik)
+            row[mode] = clip_report(network.normalizer, motion, clip, ik, own)
     return {"mean": {mode: _mean([row[mode] for row in rows]) for mode in modes}, "clips": rows}
 
 
@@ -136,24 +148,34 @@ def predict(network: Evaluable, clips: Sequence[Tensor], mode: str, batch: int) 
 
 
 def clip_report(
-    normalizer: Normalizer, motion: Tensor, truth: Tensor, ik: IK | None = None
+    normalizer: Normalizer,
+    motion: Tensor,
+    truth: Tensor,
+    ik: IK | None = None,
+    own: metrics.OwnMetrics | None = None,
 ) -> dict[str, dict[str, float]]:
     """Return the metrics of both branches and of `ik`'s result, for motion (N, 198) and truth (N, 252)."""
     sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
-    position = metrics.positions_report(joint_positions(motion), joint_positions(target))
-    report = {"rotation": rotations_report(normalizer, motion, truth), "position": position}
+    positions = joint_positions(motion), joint_positions(target)
+    position = metrics.positions_report(*positions) | metrics.own_report(own or {}, "positions", *positions)
+    report = {"rotation": rotations_report(normalizer, motion, truth, own), "position": position}
     solved = (ik or NoIK()).solutions(normalizer, motion, sparse)
-    return report | {name: rotations_report(normalizer, result, truth) for name, result in solved.items()}
+    return report | {name: rotations_report(normalizer, one, truth, own) for name, one in solved.items()}
 
 
-def rotations_report(normalizer: Normalizer, motion: Tensor, truth: Tensor) -> dict[str, float]:
+def rotations_report(
+    normalizer: Normalizer, motion: Tensor, truth: Tensor, own: metrics.OwnMetrics | None = None
+) -> dict[str, float]:
     """Return the metrics of the rotations of motion (N, 198) against the truth (N, 252).
 
     The positions that they are measured by follow by forward kinematics, the head on its tracker.
     """
     sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
-    report = metrics.rotations_report(local_rotations(motion), local_rotations(target))
-    return report | metrics.positions_report(normalizer.pose(motion, sparse), joint_positions(target))
+    rotations = local_rotations(motion), local_rotations(target)
+    positions = normalizer.pose(motion, sparse), joint_positions(target)
+    report = metrics.rotations_report(*rotations) | metrics.positions_report(*positions)
+    report |= metrics.own_report(own or {}, "rotations", *rotations)
+    return report | metrics.own_report(own or {}, "positions", *positions)
 
 
 def local_rotations(motion: Tensor) -> Tensor:
@@ -176,10 +198,13 @@ def chunks(dataset: MotionDataset, length: int, least: int) -> list[Tensor]:
 
 
 @torch.no_grad()
-def quick_stream(network: Evaluable, pieces: Sequence[Tensor]) -> dict[str, float]:
+def quick_stream(
+    network: Evaluable, pieces: Sequence[Tensor], own: metrics.OwnMetrics | None = None
+) -> dict[str, float]:
     """Return the stream-mode metrics, means over pieces of clips, for validation during training."""
     motions = stream(network, pieces)
-    mean = _mean([clip_report(network.normalizer, m, p) for m, p in zip(motions, pieces, strict=True)])
+    pairs = zip(motions, pieces, strict=True)
+    mean = _mean([clip_report(network.normalizer, motion, piece, own=own) for motion, piece in pairs])
     return {f"{branch} {name}": value for branch, values in mean.items() for name, value in values.items()}
 
 

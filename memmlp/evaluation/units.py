@@ -1,9 +1,15 @@
-"""The field's metrics by name: their units, and the smallest differences that matter. Lower is better."""
+"""The field's metrics by name: their units, and the smallest differences that matter. Lower is better.
+
+Metrics of one's own come in addition, where a package has some (memmlp.config.plugins).
+"""
 
 UNITS = {
     "MPJRE": "deg", "geodesic": "deg", "MPJPE": "cm", "Hand PE": "cm", "Upper PE": "cm", "Lower PE": "cm",
     "Root PE": "cm", "MPJVE": "cm/s", "Jitter": "10^2 m/s^3", "GT Jitter": "10^2 m/s^3",
 }  # fmt: skip
+
+HIGHER: set[str] = set()
+"""Metrics of one's own of which more is better; of the field's, less is."""
 
 SMALLEST = {
     "MPJRE": 0.05, "geodesic": 0.1, "MPJPE": 0.1, "Hand PE": 0.1, "Upper PE": 0.05, "Lower PE": 0.2,

@@ -43,6 +43,11 @@ class WindowModel(nn.Module):
         return True
 
     @property
+    def windowless(self) -> bool:
+        """Whether the network has no window and is a stream in both evaluation modes (see StreamModel)."""
+        return False
+
+    @property
     def length(self) -> int:
         """How many past frames of inputs the buffer holds; the last one directly precedes the new ones."""
         return self.frames - 1

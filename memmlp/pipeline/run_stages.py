@@ -24,6 +24,7 @@ from memmlp.evaluation.predictions import save_predictions
 from memmlp.motion.preparing.source import Prepared
 from memmlp.pipeline.devices import described
 from memmlp.pipeline.experiment import Experiment
+from memmlp.runs.environment import packages_of_ones_own
 from memmlp.runs.evaluation_file import read_report, write_report
 from memmlp.runs.identity import Identity, deployment_settings, evaluation_recipes, evaluation_settings
 from memmlp.runs.run import Run
@@ -210,7 +211,7 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
             settings = evaluation_settings(experiment.config, mode, experiment.data.grouped)
             name = experiment.evaluations[mode]
             report = {"mode": mode, "run": run.manifest["id"], "name": name, "settings": settings}
-            report |= {"recipes": evaluation_recipes(settings), **machine(experiment)}
+            report |= {"recipes": evaluation_recipes(settings), **machine(experiment), **own_code(experiment)}
             write_report(run.evaluation(name), report | experiment.evaluation.report(model, test, mode))
         if not run.picture.exists():
             picture(model, test, run.picture)
@@ -235,7 +236,7 @@ def begin(experiment: Experiment, run: Run, identity: Identity, config: dict[str
     """Begin a training: write its config, and into its manifest its identity and what it runs on."""
     above = identity.upstream.id if identity.upstream else None
     facts = {"recipes": identity.recipes, "what": identity.what, **machine(experiment)}
-    facts["processes"] = parallel.size()
+    facts |= {"processes": parallel.size(), **own_code(experiment)}
     counting = {**(identity.upstream.config if identity.upstream else {}), **identity.config}
     facts |= {"name": experiment.called(identity.kind, counting), "user": user()}
     run.begin(identity.kind, config, data=identity.data, upstream=above, **facts)
@@ -246,6 +247,12 @@ def user() -> str | None:
     with contextlib.suppress(KeyError, OSError, ImportError):
         return getpass.getuser()
     return None
+
+
+def own_code(experiment: Experiment) -> dict[str, Any]:
+    """Return version and digest of the packages of one's own that the experiment uses; empty without any."""
+    packages = experiment.config.get("plugins")
+    return {"plugins": packages_of_ones_own(packages)} if packages else {}
 
 
 def partial_words(experiment: Experiment, data: Prepared) -> str | None:

@@ -10,6 +10,8 @@ import os
 import platform
 import re
 import subprocess
+import sys
+from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -93,14 +95,57 @@ def changes() -> str:
     return ""
 
 
-@functools.cache
-def sources() -> dict[str, str]:
+def sources(packages: Iterable[str] = ()) -> dict[str, str]:
     """Return a digest of the code of each file that a run's numbers come from.
 
-    Comments and docstrings do not count.
+    Comments and docstrings do not count. Files of packages of one's own are named PACKAGE:FILE.
     """
+    own = {f"{name}:{file}": digest for name in packages for file, digest in package_sources(name).items()}
+    return _sources() | own
+
+
+@functools.cache
+def _sources() -> dict[str, str]:
+    """Return the digests of this package's files."""
     files = [path for path in sorted(PACKAGE.rglob("*.py")) if _counts(path.relative_to(PACKAGE))]
     return {path.relative_to(PACKAGE).as_posix(): code_digest(path.read_text("utf-8")) for path in files}
+
+
+def package_sources(name: str) -> dict[str, str]:
+    """Return a digest of each Python file of a package of one's own; empty where it is not here."""
+    module = sys.modules.get(name)  # what was imported is what computes
+    if module is None:
+        return {}
+    if folders := [Path(folder) for folder in getattr(module, "__path__", ())]:
+        files = {path.relative_to(root).as_posix(): path for root in folders for path in root.rglob("*.py")}
+    else:
+        files = {Path(path).name: Path(path) for path in [module.__file__] if path}
+    return {file: _own_digest(path) for file, path in sorted(files.items())}
+
+
+def _own_digest(path: Path) -> str:
+    """Return a digest of a file's code; of its bytes where it is no Python of this version."""
+    try:
+        return code_digest(path.read_text("utf-8"))
+    except (SyntaxError, ValueError):
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+
+
+def packages_of_ones_own(names: Iterable[str]) -> dict[str, dict[str, str | None]]:
+    """Return the version and a digest of the code of some packages, by name."""
+
+    def digest(name: str) -> str:
+        return hashlib.sha256(repr(package_sources(name)).encode()).hexdigest()[:12]
+
+    return {name: {"version": _own_version(name), "digest": digest(name)} for name in names}
+
+
+def _own_version(name: str) -> str | None:
+    """Return the version that a package tells of itself, or that of the distribution which it came with."""
+    if version := getattr(sys.modules.get(name), "__version__", None):
+        return str(version)
+    distributions = metadata.packages_distributions().get(name.split(".")[0], [])
+    return _version(distributions[0]) if distributions else None
 
 
 def _counts(path: Path) -> bool:

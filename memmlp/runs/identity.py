@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.files import plain
+from memmlp.common.plugin import METRICS
 from memmlp.runs.recipes import recipes
 
 NEUTRAL = (
@@ -29,6 +30,7 @@ NEUTRAL = (
     "device",  # recorded, and flagged where runs that are compared differ in it
     "threads",
     "force",
+    "plugins",  # says which packages are looked at; what is used of them has its path in the config
     "save_predictions",
     "optim.checkpoint_every",
     "optim.log_every",
@@ -51,7 +53,7 @@ INFERENCE = ("memory.blend", "memory.history", "model.sampling_steps")
 ID = re.compile(r"[0-9a-f]{16}")
 """What the id of a run looks like."""
 
-SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand")
+SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term")
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,8 @@ def evaluation_name(settings: Mapping[str, Any]) -> str:
 def evaluation_recipes(settings: Mapping[str, Any]) -> dict[str, int]:
     """Return the recipe numbers of the components that an evaluation uses."""
     solver = [f"ik.{settings['ik']}"] if settings["ik"] != "off" else []
-    return recipes(["metrics", f"mode.{settings['mode']}", *solver])
+    own = [f"metric.{name}" for name in settings.get("metrics", ())]
+    return recipes(["metrics", f"mode.{settings['mode']}", *solver, *own])
 
 
 def evaluation_settings(config: Mapping[str, Any], mode: str, grouped: str | None = None) -> dict[str, Any]:
@@ -133,7 +136,13 @@ def evaluation_settings(config: Mapping[str, Any], mode: str, grouped: str | Non
     solver = {"ik": ik} | ({"ik_iterations": group.get("ik_iterations")} if ik != "off" else {})
     groups = _groups(config.get("data") or {}) | ({"groups_file": grouped} if grouped else {})
     drawn = {"batch": group.get("batch")} if inference(config).get("memory.blend") == "sampled" else {}
-    return {"mode": mode, **solver, **inference(config), **groups, **drawn}
+    measured = {"metrics": own} if (own := _own_metrics(group.get("metrics") or ())) else {}
+    return {"mode": mode, **solver, **inference(config), **groups, **drawn, **measured}
+
+
+def _own_metrics(names: Iterable[str]) -> dict[str, str]:
+    """Return the paths of the functions of metrics of one's own, by name."""
+    return {name: METRICS[name].function if name in METRICS else "" for name in sorted(names)}
 
 
 def _groups(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -241,6 +250,8 @@ def _unused(config: Mapping[str, Any]) -> Iterable[str]:
         yield "optim.drop_at"
     if config.get("vqvae", {}).get("codebook", "ema") != "ema":
         yield "vqvae.decay"
+    if (config.get("loss") or {}).get("name") == "uncertainty":
+        yield "term.weight"  # it is learned
 
 
 def _below(key: str, names: Iterable[str]) -> bool:

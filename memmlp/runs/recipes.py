@@ -3,7 +3,8 @@
 A run's identity holds the numbers of the components that it uses. Whoever changes what a component computes
 raises its number in the same commit: the runs that used it then have an outdated recipe and are made again,
 and no others. `tests/test_golden.py` computes a few steps of every component and fails until that is done.
-Moving or renaming code changes no number.
+Moving or renaming code changes no number. Packages of one's own add numbers for their components
+(memmlp.config.plugins).
 """
 
 from __future__ import annotations
@@ -21,6 +22,11 @@ RECIPES: dict[str, int] = {
     "model.agrol_mlp": 1,
     "model.agrol_diffusion": 1,
     "model.avatar_poser": 1,
+    "model.ego_poser": 1,
+    "model.hmd_poser": 1,
+    "model.vae_hmd": 1,
+    "model.rpm": 1,
+    "model.avatar_jlm": 1,
     "memory.vq": 1,
     "memory.vq_joint": 1,
     "memory.no_codes": 1,
@@ -47,6 +53,7 @@ RECIPES: dict[str, int] = {
     "loss.manual": 1,
     "loss.agrol": 1,
     "loss.avatar_poser": 1,
+    "loss.terms": 1,
     "hand.position": 1,
     "hand.fk": 1,
     "hand.off": 1,

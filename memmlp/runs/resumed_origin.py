@@ -30,4 +30,8 @@ def joined(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any
     found["sources"] = {
         name: digest if known.get(name) == digest else "mixed" for name, digest in after["sources"].items()
     }
+    for name, package in (before.get("plugins") or {}).items():
+        now = (after.get("plugins") or {}).get(name, package)
+        if now["digest"] != package["digest"]:
+            found["plugins"] = {**found["plugins"], name: {**now, "digest": "mixed"}}
     return found

@@ -192,7 +192,8 @@ class Run:
             config: the resolved config.
             data: digest of the prepared data.
             upstream: id of the run whose artifact this one uses.
-            facts: further entries of the manifest, such as recipes, device and threads.
+            facts: further entries of the manifest, such as recipes, device and threads, and the packages of
+                one's own that it uses (`plugins`).
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         atomic_write(self.config_path, yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
@@ -200,7 +201,7 @@ class Run:
             atomic_write(self.folder / "code.patch", patch)
         identity = {"id": self.id, "kind": kind, "data": data, "upstream": upstream}
         before = self.manifest if self.checkpoint.exists() else {}
-        made = joined(before, {**facts, **environment(), "sources": sources()})
+        made = joined(before, {**facts, **environment(), "sources": sources(facts.get("plugins", ()))})
         self.attempt("training")
         times = {"started": self.manifest.get("started", now()), "finished": None}
         self.write_manifest(identity | times | made)
@@ -247,7 +248,9 @@ class Run:
         """
         found = read_json(self.results_path)
         for report in map(read_report, self.own_evaluations):
-            found[report["mode"]] = {**found.get(report["mode"], {}), **report["mean"]}
+            branches = found.setdefault(report["mode"], {})
+            for branch, errors in report["mean"].items():  # those of one's own metrics may be in one alone
+                branches[branch] = {**branches.get(branch, {}), **errors}
         latency = self.preferred_deployment.record
         return found | ({"latency": latency} if latency else {})
 
@@ -263,9 +266,12 @@ class Run:
 
     @property
     def changed_sources(self) -> list[str]:
-        """The package's files whose code differs from what made the run; empty if that is not known."""
-        before = self.manifest.get("sources", {})
-        return sorted(name for name, digest in sources().items() if before and before.get(name) != digest)
+        """The files whose code differs from what made the run, those of one's own packages that are in use
+        too; empty if that is not known.
+        """
+        before, packages = self.manifest.get("sources", {}), self.manifest.get("plugins", ())
+        now_here = sources(packages).items() if before else ()
+        return sorted(name for name, digest in now_here if before.get(name) != digest)
 
     def log(self, step: int, values: Mapping[str, float], phase: str = "train") -> None:
         """Append one line to the metrics log, in one write: a kill damages at most that line."""

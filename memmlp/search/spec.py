@@ -28,7 +28,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from memmlp.common.errors import InputError
-from memmlp.evaluation.units import UNITS
+from memmlp.evaluation.units import HIGHER, UNITS
 
 SAMPLERS = ("tpe", "random")
 PRUNERS = ("median", "none")
@@ -248,6 +248,10 @@ def _term(part: str, text: str) -> tuple[float, str]:
         raise InputError(
             f"search.objectives: '{text}'; allowed is a sum of [WEIGHT*][{' or '.join(BRANCHES)}] METRIC "
             f"with a metric of {names}"
+        )
+    if metric in HIGHER:
+        raise InputError(
+            f"search.objectives: '{text}'; of {metric} more is better, and objectives are lowered"
         )
     weight = float(match[1] or 1)
     if not 0 < weight < math.inf:

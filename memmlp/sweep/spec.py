@@ -22,7 +22,7 @@ import difflib
 import itertools
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -205,8 +205,16 @@ class UniqueKeys(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def load_sweep(path: Path) -> Sweep:
-    """Read a sweep file. Raises InputError, naming file and key, where it is wrong."""
+def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: None) -> Sweep:
+    """Read a sweep file.
+
+    Args:
+        path: the file.
+        prepare: told the base before the rest is checked, which may name metrics of one's own.
+
+    Raises:
+        InputError: naming file and key, where it is wrong.
+    """
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), UniqueKeys)
     except OSError as error:
@@ -214,6 +222,8 @@ def load_sweep(path: Path) -> Sweep:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
     try:
+        base = content.get("base") if isinstance(content, Mapping) else None
+        prepare([word for word in base if isinstance(word, str)] if isinstance(base, list) else [])
         return parse_sweep(path.stem, content)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

@@ -50,6 +50,7 @@ def flags(
         yield from _differing(what, [(getattr(run.origin, attribute), label) for label, run in every])
     yield from _partial(every)
     yield from _recipes(every)
+    yield from _own_code(every)
     changed = [label for label, run in every if run.origin.changed]
     if changed:
         yield f"made by code with uncommitted changes: {_quoted(changed)}"
@@ -182,6 +183,13 @@ def _recipes(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
         yield from _differing(
             f"recipe of {name}", [(str(r.origin.recipes[name]), label) for r, label in having]
         )
+
+
+def _own_code(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
+    """Flag packages of one's own of which several arms use other versions or code."""
+    for name in sorted({name for _, run in every for name in run.origin.plugins}):
+        having = [(run.origin.plugins[name], label) for label, run in every if name in run.origin.plugins]
+        yield from _differing(f"code of {name}", having)
 
 
 def _replicates(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:

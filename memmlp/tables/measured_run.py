@@ -40,6 +40,7 @@ class Origin:
         recipes: the recipe number of each component.
         vqvae: the id of the VQ-VAE's run; None where there is none.
         partial: which part of its protocol's list the data is, in words; None where it is all of it.
+        plugins: version and digest of the code of each package of one's own that it uses.
     """
 
     code: str
@@ -56,6 +57,7 @@ class Origin:
     recipes: Mapping[str, int] = field(default_factory=dict)
     vqvae: str | None = None
     partial: str | None = None
+    plugins: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -161,15 +163,21 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     sources: dict[str, str] = {}
     reports = list(map(_read, _evaluations(run, stages)))
     for report in reports:
-        means.setdefault(report["mode"], {}).update(report["mean"])
+        _join(means.setdefault(report["mode"], {}), report["mean"])
         for clip in report["clips"]:
-            clips.setdefault(clip["name"], {}).setdefault(report["mode"], {}).update(clip)
+            _join(clips.setdefault(clip["name"], {}).setdefault(report["mode"], {}), clip)
             groups |= {clip["name"]: clip["group"]} if clip.get("group") else {}
             sources |= {clip["name"]: clip["source"]} if clip.get("source") else {}
     deployments = [run.deployment(name) for name in stages or () if run.deployment(name).done]
     latency = (deployments or [run.preferred_deployment])[-1].record
     origin = _evaluated(_origin(manifest), reports)
     return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run, sources)
+
+
+def _join(known: dict[str, Any], more: Mapping[str, Any]) -> None:
+    """Add what a report has: facts, and the errors of each branch, of which another may have others."""
+    for name, value in more.items():
+        known[name] = {**known.get(name, {}), **value} if isinstance(value, Mapping) else value
 
 
 def _evaluations(run: Run, stages: Sequence[str] | None) -> list[Path]:
@@ -231,6 +239,10 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
         recipes=manifest.get("recipes") or {},
         vqvae=manifest.get("upstream"),
         partial=manifest.get("partial"),
+        plugins={
+            name: f"{one['version'] or 'no version'} ({one['digest']})"
+            for name, one in (manifest.get("plugins") or {}).items()
+        },
     )
 
 
@@ -243,7 +255,14 @@ def _evaluated(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Origin:
         found[name] = ", ".join(dict.fromkeys([getattr(origin, name), *known]))
     for other in others:
         found["recipes"] = {**found.get("recipes", origin.recipes), **other.recipes}
+        found["plugins"] = _both(found.get("plugins", origin.plugins), other.plugins)
     return replace(origin, **found)
+
+
+def _both(known: Mapping[str, str], more: Mapping[str, str]) -> dict[str, str]:
+    """Return the code of packages by name; where two differ, both."""
+    words = {name: dict.fromkeys([*([known[name]] if name in known else []), more[name]]) for name in more}
+    return {**known, **{name: ", ".join(each) for name, each in words.items()}}
 
 
 def _number(errors: Errors, mode: str, branch: str, metric: str) -> float | None:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from memmlp.evaluation.units import UNITS
+from memmlp.evaluation.units import HIGHER, UNITS
 from memmlp.statistics import Verdict
 from memmlp.sweep.spec import COSTS
 from memmlp.tables.table import Cell, Row, Table
@@ -60,7 +60,11 @@ def grids(table: Table) -> list[Grid]:
 
 def heading(metric: str) -> str:
     """Return a metric's name with its unit and the direction that is better."""
-    words = (metric, f"[{unit(metric)}]" if unit(metric) else "", "↑" if metric == "FPS" else "↓")
+    words = (
+        metric,
+        f"[{unit(metric)}]" if unit(metric) else "",
+        "↑" if metric == "FPS" or metric in HIGHER else "↓",
+    )
     return " ".join(word for word in words if word)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -11,6 +11,7 @@ from torch import nn
 
 from memmlp.common import parallel
 from memmlp.evaluation import modes
+from memmlp.evaluation.metrics import OwnMetrics
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.preparing.source import Prepared
@@ -37,6 +38,7 @@ class NetworkTraining:
         optim: steps, learning rates and intervals.
         weighting: how training windows are drawn, "frames" or "clips" (see WindowSampler).
         shares: how often a window is of each source (see WindowSampler).
+        metrics: metrics of one's own, measured at validations.
     """
 
     seed: int
@@ -45,6 +47,7 @@ class NetworkTraining:
     optim: Optim
     weighting: str
     shares: Mapping[str, float] | None = None
+    metrics: OwnMetrics = field(default_factory=dict)
 
     def train(
         self,
@@ -81,7 +84,7 @@ class NetworkTraining:
             dataset,
             self.optim,
             self.seed,
-            validate=lambda network: modes.quick_stream(network, pieces),
+            validate=lambda network: modes.quick_stream(network, pieces, self.metrics),
             weighting=self.weighting,
             shares=self.shares,
         )

@@ -20,6 +20,7 @@ from memmlp.runs.identity import NEUTRAL, flatten
 FOLDERS = packaged("conf").glob("*/")
 GROUPS = {folder.name: sorted(path.stem for path in folder.glob("*.yaml")) for folder in FOLDERS}
 del GROUPS["search"]  # of `memmlp tune`
+OF_TERMS = [path.stem for path in packaged("conf").glob("loss/*.yaml") if "loss_terms" in path.read_text()]
 OPTIONS = [f"{group}={name}" for group, names in GROUPS.items() for name in names]
 
 
@@ -35,6 +36,7 @@ def needed(tmp_path: Path) -> dict[str, list[str]]:
         "predictor=rotation_only": ["hand=fk"],
         "loss=agrol": ["model=agrol_mlp"],
         "loss=avatar_poser": ["model=avatar_poser"],
+        **{f"loss={name}": ["model=agrol_mlp"] for name in OF_TERMS},
         "predictor=rotation_only_memory": ["hand=fk"],
     }
 

@@ -77,6 +77,11 @@ def test_inner_layers_are_int8_and_the_ends_are_not(pair, tmp_path, network):
     ends = {
         "mem_mlp": {"model.stem.weight", "model.predictor.rotation.linear.weight"},
         "avatar_poser": {"model.model.embedding.weight", "model.model.orientation.0.weight"},
+        "ego_poser": {"model.model.embedding.weight", "model.model.orientation.0.weight"},
+        "hmd_poser": {"model.model.pose.0.weight"},
+        "avatar_jlm": {"model.model.regressor.0.weight", "model.model.regressor.3.weight"},
+        "rpm": {"model.model.head.weight"},
+        "vae_hmd": {"model.model.encoder.stem.weight", "model.model.decoder.head.weight"},
     }.get(network, {"model.model.head.weight"})
     assert {kinds[name] for name in ends} == {onnx.TensorProto.FLOAT}
 

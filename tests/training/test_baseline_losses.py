@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from plain_body import posed
 
-from memmlp.motion.body import MOTION_DIM, PARENTS, ROTATION, SPARSE_DIM, SPARSE_POSITION
+from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.coordinates import World
 from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss
 
@@ -54,22 +55,6 @@ def test_avatar_posers_loss_compares_bodies_at_the_pelvis_or_at_the_tracker(anch
     assert (float(AvatarPoserLoss()(motion, truth, sparse, normalizer)[0]) == float(loss)) == (
         anchor == "pelvis"
     )
-
-
-def posed(rotation: np.ndarray) -> np.ndarray:
-    """Return the joints (22, 3) of local 6D rotations (132,), the pelvis at the origin."""
-    turns, places = [], []
-    for joint, sixd in enumerate(rotation.reshape(22, 2, 3).astype(np.float64)):
-        x = sixd[0] / np.linalg.norm(sixd[0])
-        y = sixd[1] - (x @ sixd[1]) * x
-        y /= np.linalg.norm(y)
-        local, parent = np.stack([x, y, np.cross(x, y)], 1), PARENTS[joint]
-        rest = tiny.REST.numpy()
-        turns.append(local if parent < 0 else turns[parent] @ local)
-        places.append(
-            np.zeros(3) if parent < 0 else places[parent] + turns[parent] @ (rest[joint] - rest[parent])
-        )
-    return np.array(places)
 
 
 def test_avatar_posers_loss_on_positions_reaches_the_rotations():

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from memmlp.cli.options import config_dir_option, plugins_option
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -51,6 +53,8 @@ VARIANTS = ("naive", "streaming", "int8")
     help="Show instead where the time of one network goes: NETWORK:VARIANT, such as mem_mlp_41:int8.",
 )
 @click.argument("overrides", nargs=-1)
+@config_dir_option
+@plugins_option
 def latency(
     rounds: int, steps: int, models: str, file: Path | None, profile: str | None, overrides: tuple[str, ...]
 ) -> None:

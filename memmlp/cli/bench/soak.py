@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import outputs_option
+from memmlp.cli.options import outputs_option, plugins_option
 
 if TYPE_CHECKING:
     from memmlp.live.soak import TrackedMotion
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     "--onnx", type=click.Path(path_type=Path), help="ONNX file to stream with.  [default: the run's own]"
 )
 @click.option("--hours", default=1.0, show_default=True, help="Least length of the streamed motion, hours.")
+@plugins_option
 @outputs_option
 def soak(run: str | None, onnx: Path | None, hours: float, outputs: Path) -> None:
     """Stream for hours of motion without a reset.

@@ -13,12 +13,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from memmlp.common.errors import InputError
 from memmlp.config.schema.config import SCHEMAS, Config
-from memmlp.config.schema.network import BaselineConfig
+from memmlp.config.schema.network import AvatarJLMConfig, BaselineConfig, RPMConfig
 from memmlp.config.schema.training import (
     AGRoLLossConfig,
     BaselineLossConfig,
     NoHandConfig,
     TeacherForcingConfig,
+    TermsLossConfig,
 )
 
 
@@ -88,7 +89,7 @@ def _show(value: Any) -> str:
     return str(list(value)) if OmegaConf.is_list(value) else str(value)
 
 
-SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand")
+SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term")
 
 
 def _check_names(cfg: DictConfig) -> None:
@@ -96,7 +97,9 @@ def _check_names(cfg: DictConfig) -> None:
     for slot in SLOTS:
         node = cfg[slot]
         path = node.get("_target_") if node is not None else None
-        if path and not path.startswith("memmlp.") and f"{slot}_{node.name}" in SCHEMAS:
+        schema = SCHEMAS.get(f"{slot}_{node.name}") if path else None
+        ours = schema is not None and schema.__module__.startswith("memmlp.")
+        if path and ours and not path.startswith("memmlp."):
             raise InputError(f"{slot}.name={node.name}: allowed for {path} is a name of its own")
     for name, node in cfg.tracking.items():
         if node.name != name:
@@ -152,7 +155,7 @@ def _check_baseline(cfg: DictConfig) -> None:
     Nothing may be set that concerns these, and its sizes must fit each other.
     """
     name = cfg.model._target_.rsplit(".", 1)[-1]
-    for group in ("memory", "predictor", "hand"):
+    for group in ("memory", "predictor", "hand", "term"):
         if cfg[group] is not None:
             raise InputError(f"{group}: {name} has none; allowed is a command line without {group}=...")
     if not _is(cfg.loss, BaselineLossConfig):
@@ -168,6 +171,12 @@ def _check_baseline(cfg: DictConfig) -> None:
         raise InputError(
             f"model.heads={cfg.model.heads}: allowed is a divisor of model.width={cfg.model.width}"
         )
+    if _is(cfg.model, AvatarJLMConfig) and cfg.model.width % 4:
+        raise InputError(f"model.width={cfg.model.width}: allowed with AvatarJLM is a multiple of 4")
+    if _is(cfg.model, RPMConfig) and cfg.model.frames < (least := cfg.model.context + cfg.model.horizon):
+        raise InputError(
+            f"model.frames={cfg.model.frames}: allowed is at least model.context + model.horizon = {least}"
+        )
     steps = cfg.model.get("diffusion_steps", 1)
     if cfg.model.get("sampling_steps", 1) > steps:
         raise InputError(
@@ -176,15 +185,16 @@ def _check_baseline(cfg: DictConfig) -> None:
 
 
 def _check_foreign_loss(cfg: DictConfig, predictor: str) -> None:
-    """Refuse the loss of a baseline for Mem-MLP, with one exception.
+    """Refuse the loss of a baseline for Mem-MLP, with two exceptions.
 
-    AGRoL's loss scores rotations alone, so a Mem-MLP that predicts nothing else may be trained with it.
+    AGRoL's loss and the library's terms score rotations alone, so a Mem-MLP that predicts nothing else may be
+    trained with them.
     """
-    if not _is(cfg.loss, AGRoLLossConfig):
+    if not _is(cfg.loss, AGRoLLossConfig) and not _is(cfg.loss, TermsLossConfig):
         raise InputError("loss: that of a baseline; allowed is loss=uncertainty or loss=manual")
     if not predictor.startswith("RotationOnly") or not _is(cfg.hand, NoHandConfig):
         raise InputError(
-            "loss=agrol is of rotations alone: allowed is predictor=rotation_only with hand=off, "
+            f"loss={cfg.loss.name} is of rotations alone: allowed is predictor=rotation_only with hand=off, "
             "or loss=uncertainty or loss=manual"
         )
 

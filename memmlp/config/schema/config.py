@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,6 +11,7 @@ from typing import Any, Optional
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
+from memmlp.common.plugin import METRICS
 from memmlp.config.schema.data import (
     DataConfig,
     ListDataConfig,
@@ -20,10 +22,13 @@ from memmlp.config.schema.data import (
 from memmlp.config.schema.network import (
     AGRoLDiffusionConfig,
     AGRoLMLPConfig,
+    AvatarJLMConfig,
     AvatarPoserConfig,
     CodeMemoryConfig,
+    EgoPoserConfig,
     FrameConfig,
     GRUMemoryConfig,
+    HMDPoserConfig,
     JointCodeMemoryConfig,
     LSTMMemoryConfig,
     MemoryConfig,
@@ -33,20 +38,25 @@ from memmlp.config.schema.network import (
     PredictorConfig,
     RotationOnlyConfig,
     RotationOnlyMemoryConfig,
+    RPMConfig,
     TwoBranchConfig,
     TwoBranchMemoryConfig,
+    VAEHMDConfig,
     VQVAEConfig,
 )
 from memmlp.config.schema.rules import (
     DEVICE,
     EachOf,
     OneOf,
+    Registered,
     Text,
     Within,
     at_least,
     called,
     key,
     one_of,
+    optional,
+    own,
     positive,
     target,
 )
@@ -64,6 +74,8 @@ from memmlp.config.schema.training import (
     RolloutConfig,
     StreamsConfig,
     TeacherForcingConfig,
+    TermConfig,
+    TermsLossConfig,
     UncertaintyConfig,
 )
 
@@ -115,6 +127,9 @@ class ProfileConfig:
     avatar_poser_frames: int = at_least(2)
     avatar_poser_width: int = at_least(1)
     avatar_poser_feedforward: int = at_least(1)
+    ego_poser_frames: Optional[int] = optional(Within(2))
+    rpm_frames: Optional[int] = optional(Within(2))
+    rpm_feedforward: Optional[int] = optional(Within(1))
 
 
 @dataclass
@@ -125,6 +140,7 @@ class EvaluationConfig:
     batch: int = at_least(1)
     ik: str = one_of("off", "lbfgs")
     ik_iterations: int = at_least(1)
+    metrics: list[str] = own(EachOf(Registered(METRICS), empty=True))
 
 
 @dataclass
@@ -172,6 +188,7 @@ class Config:
     device: str = key(DEVICE)
     threads: int = at_least(0)
     force: bool = key()
+    plugins: list[str] = own(EachOf(empty=True))
     save_predictions: Optional[str] = key()
     paths: PathsConfig = field(default_factory=PathsConfig)
     profile: ProfileConfig = field(default_factory=ProfileConfig)
@@ -184,6 +201,7 @@ class Config:
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     hand: Optional[HandConfig] = None
+    term: Optional[TermConfig] = None
     optim: OptimConfig = field(default_factory=OptimConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     export: ExportConfig = field(default_factory=ExportConfig)
@@ -202,6 +220,11 @@ SCHEMAS: dict[str, type] = {
     "model_agrol_mlp": AGRoLMLPConfig,
     "model_agrol_diffusion": AGRoLDiffusionConfig,
     "model_avatar_poser": AvatarPoserConfig,
+    "model_ego_poser": EgoPoserConfig,
+    "model_hmd_poser": HMDPoserConfig,
+    "model_rpm": RPMConfig,
+    "model_avatar_jlm": AvatarJLMConfig,
+    "model_vae_hmd": VAEHMDConfig,
     "predictor_two_branch": TwoBranchConfig,
     "predictor_two_branch_memory": TwoBranchMemoryConfig,
     "predictor_rotation_only": RotationOnlyConfig,
@@ -220,6 +243,7 @@ SCHEMAS: dict[str, type] = {
     "loss_manual": ManualConfig,
     "loss_agrol": AGRoLLossConfig,
     "loss_avatar_poser": AvatarPoserLossConfig,
+    "loss_terms": TermsLossConfig,
     "hand_position": HandPositionConfig,
     "hand_fk": HandFKConfig,
     "hand_off": NoHandConfig,
@@ -243,6 +267,7 @@ GROUPS = {
     "rollout": RolloutConfig,
     "loss": LossConfig,
     "hand": HandConfig,
+    "term": TermConfig,
     "optim": OptimConfig,
     "evaluation": EvaluationConfig,
     "export": ExportConfig,
@@ -274,12 +299,12 @@ def _restored(group: str, content: Mapping[str, Any]) -> Any:
     """
     if group == "tracking":
         return _trackers(content)
-    if group == "data":
+    option = SCHEMAS.get(f"{group}_{content.get('name')}")
+    ours = option is None or option.__module__.startswith("memmlp.")
+    if group == "data" and ours:
         schema = SynthDataConfig if content["synth"] else DATA[content["split"]["name"]]
         return OmegaConf.merge(OmegaConf.structured(schema), _bare(content))
-    option = SCHEMAS.get(f"{group}_{content.get('name')}")
-    own = _bare(content) if option else dict(content)
-    return OmegaConf.merge(OmegaConf.structured(option or GROUPS[group]), own)
+    return OmegaConf.merge(OmegaConf.structured(option or GROUPS[group]), _content(option, content))
 
 
 def _trackers(content: Mapping[str, Any]) -> Any:
@@ -290,8 +315,15 @@ def _trackers(content: Mapping[str, Any]) -> Any:
 
 def _restored_tracker(name: str, content: Mapping[str, Any]) -> Any:
     option = SCHEMAS.get(f"tracking_{name}")
-    own = _bare(content) if option else dict(content)
-    return OmegaConf.merge(OmegaConf.structured(option or TrackerConfig), own)
+    return OmegaConf.merge(OmegaConf.structured(option or TrackerConfig), _content(option, content))
+
+
+def _content(option: type | None, content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a typed config is filled with.
+
+    The classes of memmlp's options may lie elsewhere by now; others are checked to be those of the option.
+    """
+    return _bare(content) if option and option.__module__.startswith("memmlp.") else dict(content)
 
 
 def _bare(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -305,3 +337,19 @@ def register() -> None:
     """Make the schemas known to Hydra; later calls do nothing."""
     for name, node in SCHEMAS.items():
         ConfigStore.instance().store(group="schema", name=name, node=node, provider="memmlp")
+
+
+def add_schema(option: str, schema: type) -> None:
+    """Add the schema of an option of one's own, named GROUP_OPTION.
+
+    Raises:
+        ValueError: where there is one of that name, or it does not extend the schema of its slot.
+    """
+    slots = {**GROUPS, "tracking": TrackerConfig, "data": DataConfig}
+    slot = slots.get(option.partition("_")[0])
+    if slot is None or option in SCHEMAS:
+        raise ValueError(f"'{option}': allowed is GROUP_OPTION with a new option of {', '.join(slots)}")
+    if not (dataclasses.is_dataclass(schema) and issubclass(schema, slot)):
+        raise ValueError(f"allowed is a dataclass that extends {slot.__name__}")
+    SCHEMAS[option] = schema
+    ConfigStore.instance().store(group="schema", name=option, node=schema, provider="plugin")

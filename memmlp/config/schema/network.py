@@ -9,6 +9,7 @@ from omegaconf import MISSING
 
 from memmlp.config.schema.rules import (
     EachOf,
+    OneOfOrPath,
     Text,
     Within,
     at_least,
@@ -29,7 +30,7 @@ from memmlp.config.schema.rules import (
 class FrameConfig:
     """The space in which the network sees the motion (conf/frame)."""
 
-    coordinates: str = one_of("heading", "head_relative", "world")
+    coordinates: str = key(OneOfOrPath(("heading", "head_relative", "world")))
     normalize: bool = key()
 
 
@@ -75,6 +76,46 @@ class AvatarPoserConfig(BaselineConfig):
     heads: int = at_least(1)
     feedforward: int = at_least(1)
     dropout: float = fraction()
+
+
+@dataclass
+class EgoPoserConfig(AvatarPoserConfig):
+    name: str = called("ego_poser")
+    _target_: str = target("memmlp.networks.baselines.ego_poser.EgoPoser")
+
+
+@dataclass
+class HMDPoserConfig(AvatarPoserConfig):
+    name: str = called("hmd_poser")
+    _target_: str = target("memmlp.networks.baselines.hmd_poser.HMDPoser")
+    width: int = at_least(4)
+    layers: int = at_least(1)
+    shape: float = at_least(0)
+
+
+@dataclass
+class VAEHMDConfig(BaselineConfig):
+    name: str = called("vae_hmd")
+    _target_: str = target("memmlp.networks.baselines.vae_hmd.VAEHMD")
+    latent: int = at_least(1)
+    dropout: float = fraction()
+    divergence: float = at_least(0)
+
+
+@dataclass
+class RPMConfig(AvatarPoserConfig):
+    name: str = called("rpm")
+    _target_: str = target("memmlp.networks.baselines.rpm.RPM")
+    context: int = at_least(1)
+    horizon: int = at_least(1)
+
+
+@dataclass
+class AvatarJLMConfig(AvatarPoserConfig):
+    name: str = called("avatar_jlm")
+    _target_: str = target("memmlp.networks.baselines.avatar_jlm.AvatarJLM")
+    width: int = at_least(4)
+    coarse: float = at_least(0)
 
 
 @dataclass

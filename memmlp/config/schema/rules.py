@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,35 @@ class OneOf:
 
     def __str__(self) -> str:
         return " or ".join(self.words)
+
+
+@dataclass(frozen=True)
+class Registered:
+    """The rule that a value is the name of a component that a package of one's own has registered."""
+
+    names: Mapping[str, Any]
+
+    def allows(self, value: Any) -> bool:
+        """Return whether there is such a component."""
+        return value in self.names
+
+    def __str__(self) -> str:
+        known = ", ".join(self.names)
+        return f"one of {known}" if known else "that of a package of one's own, which plugins=[NAME] uses"
+
+
+@dataclass(frozen=True)
+class OneOfOrPath:
+    """The rule that a value is one of a few words, or the dotted path of a class of one's own."""
+
+    words: tuple[str, ...]
+
+    def allows(self, value: Any) -> bool:
+        """Return whether the value is one of the words or looks like a path."""
+        return value in self.words or bool(re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+", value))
+
+    def __str__(self) -> str:
+        return " or ".join([*self.words, "the path of a class of one's own"])
 
 
 @dataclass(frozen=True)
@@ -58,7 +87,7 @@ class EachOf:
     An empty list is allowed only with `empty`.
     """
 
-    rule: OneOf | Within | None = None
+    rule: OneOf | Registered | Within | None = None
     empty: bool = False
 
     def allows(self, value: Any) -> bool:
@@ -145,6 +174,11 @@ DEVICE = Matching(re.compile(r"auto|cpu|mps|cuda(:\d+)?"), "auto or cpu or cuda 
 def optional(rule: object = None) -> Any:
     """Declare a key that may be null, as it is in runs from before there was the key."""
     return field(default=None, metadata={"rule": rule})
+
+
+def own(rule: object) -> Any:
+    """Declare a list that is empty unless one asks for it, as it is in runs from before there was the key."""
+    return field(default_factory=list, metadata={"rule": rule})
 
 
 def target(path: str) -> Any:

@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Optional
 
 from omegaconf import MISSING
 
-from memmlp.config.schema.rules import Text, Within, at_least, called, key, one_of, positive, target
+from memmlp.config.schema.rules import (
+    Text,
+    Within,
+    at_least,
+    called,
+    key,
+    one_of,
+    optional,
+    positive,
+    target,
+)
 
 # OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
 # The fields' helpers make dataclass fields, not shared defaults.
+# ruff: noqa: UP045
 
 
 @dataclass
@@ -89,6 +101,32 @@ class AvatarPoserLossConfig(BaselineLossConfig):
 
 
 @dataclass
+class TermsLossConfig(BaselineLossConfig):
+    """A loss made of terms of the library; null leaves a term out, as do runs from before there was it."""
+
+    name: str = called("terms")
+    _target_: str = target("memmlp.training.losses.TermsLoss")
+    error: str = one_of("absolute", "square", "norm", "smooth")
+    orientation: Optional[float] = optional(Within(0))
+    rotation: Optional[float] = optional(Within(0))
+    global_rotation: Optional[float] = optional(Within(0))
+    angle: Optional[float] = optional(Within(0))
+    sixd_velocity: Optional[float] = optional(Within(0))
+    turn: Optional[float] = optional(Within(0))
+    position: Optional[float] = optional(Within(0))
+    world_position: Optional[float] = optional(Within(0))
+    hand: Optional[float] = optional(Within(0))
+    velocity: Optional[float] = optional(Within(0))
+    velocity_3: Optional[float] = optional(Within(0))
+    velocity_5: Optional[float] = optional(Within(0))
+    acceleration: Optional[float] = optional(Within(0))
+    jerk: Optional[float] = optional(Within(0))
+    contact: Optional[float] = optional(Within(0))
+    penetration: Optional[float] = optional(Within(0))
+    foot_height: Optional[float] = optional(Within(0))
+
+
+@dataclass
 class HandConfig:
     """The hand term of Mem-MLP's loss (conf/hand)."""
 
@@ -112,6 +150,18 @@ class HandFKConfig(HandConfig):
 class NoHandConfig(HandConfig):
     name: str = called("off")
     _target_: str = target("memmlp.training.losses.NoHand")
+
+
+@dataclass
+class TermConfig:
+    """One more term of Mem-MLP's loss, of one's own (conf/term); null for none.
+
+    `weight` acts with fixed weights alone (loss=manual).
+    """
+
+    name: str = key(Text())
+    _target_: str = MISSING
+    weight: float = at_least(0)
 
 
 @dataclass

@@ -22,8 +22,8 @@ from memmlp.networks.memory import State
 from memmlp.networks.window_model import WindowModel
 
 
-class AGRoL(WindowModel):
-    """The base of AGRoL's two networks, which map a whole window of inputs to its rotations (`rotations`)."""
+class WholeWindow(WindowModel):
+    """The base of networks that map a whole window of inputs to its rotations (`rotations`)."""
 
     def rotations(self, encoded: Tensor) -> Tensor:
         """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
@@ -41,7 +41,7 @@ class AGRoL(WindowModel):
         return self.normalizer.posed(rotation[:, -wanted:], window[:, -wanted:]), kept
 
 
-class AGRoLMLP(AGRoL):
+class AGRoLMLP(WholeWindow):
     """AGRoL's MLP: stem, MLP blocks, head.
 
     It has 3,735,668 parameters at the paper's sizes (3.74 M in Table 16).
@@ -108,7 +108,7 @@ class TimeEmbedding(nn.Module):
         return self.mlp(torch.cat([angles.cos(), angles.sin()], -1))
 
 
-class AGRoLDiffusion(AGRoL):
+class AGRoLDiffusion(WholeWindow):
     """A denoiser of rotations, conditioned on the window's inputs, that predicts the clean rotations.
 
     It has 7,480,436 parameters at the paper's sizes (7.48 M in Table 16): the MLP's blocks and head

@@ -5,75 +5,18 @@ Its final step, inverse kinematics of the arms, is not part of the network and i
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.layers import Dropout
+from memmlp.networks.baselines.encoder import EncoderLayer
 from memmlp.networks.memory import State
 from memmlp.networks.window_model import WindowModel
 
 ROOT = 6  # components of the root's orientation, the first of the rotations
-
-
-class Attention(nn.Module):
-    """Multi-head self-attention over the frames of a window (Vaswani et al. 2017, Sec. 3.2).
-
-    Args:
-        width: d, the width of the features.
-        heads: number of heads; it divides d.
-    """
-
-    def __init__(self, width: int, heads: int):
-        super().__init__()
-        self.heads = heads
-        self.query, self.key, self.value = (nn.Linear(width, width) for _ in range(3))
-        self.out = nn.Linear(width, width)
-
-    def forward(self, h: Tensor) -> Tensor:
-        """Map features (B, T, d) to (B, T, d)."""
-        return self.attend(self.query(h), self.key(h), self.value(h))
-
-    def attend(self, *parts: Tensor) -> Tensor:
-        """Attend with queries (B, n, d) to keys (B, T, d) and values (B, T, d), given in this order.
-
-        Returns:
-            (B, n, d).
-        """
-        query, key, value = (part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in parts)
-        scores = query @ key.transpose(-1, -2) * query.shape[-1] ** -0.5
-        return self.out((scores.softmax(-1) @ value).transpose(1, 2).flatten(-2))
-
-
-class EncoderLayer(nn.Module):
-    """Attention, then a feed-forward of two layers, each added to its input and normalised (post-norm).
-
-    Args:
-        width: d, the width of the features.
-        heads: number of attention heads.
-        feedforward: width of the feed-forward's hidden layer.
-        dropout: dropout rate of both parts' outputs and of the hidden layer.
-    """
-
-    def __init__(self, width: int, heads: int, feedforward: int, dropout: float):
-        super().__init__()
-        self.attention = Attention(width, heads)
-        self.attention_norm = nn.LayerNorm(width)
-        self.widen, self.narrow = nn.Linear(width, feedforward), nn.Linear(feedforward, width)
-        self.norm = nn.LayerNorm(width)
-        self.dropout = Dropout(dropout)
-
-    def forward(self, h: Tensor) -> Tensor:
-        """Map features (B, T, d) to (B, T, d)."""
-        return self.finish(h, self.attention(h))
-
-    def finish(self, h: Tensor, attended: Tensor) -> Tensor:
-        """Apply what follows the attention, frame by frame, to its inputs and outputs (..., d)."""
-        h = self.attention_norm(h + self.dropout(attended))
-        wide = self.dropout(F.relu(self.widen(h)))
-        return self.norm(h + self.dropout(self.narrow(wide)))
 
 
 def head(width: int, size: int) -> nn.Module:
@@ -99,7 +42,12 @@ class AvatarPoser(WindowModel):
         heads: number of attention heads; it divides d.
         feedforward: width of the feed-forward's hidden layers.
         dropout: dropout rate in the encoder, while training.
+
+    Attributes:
+        inputs: how many features of a frame are embedded.
     """
+
+    inputs: ClassVar[int] = SPARSE_DIM
 
     def __init__(
         self,
@@ -113,14 +61,17 @@ class AvatarPoser(WindowModel):
         dropout: float,
     ):
         super().__init__(normalizer, frames)
-        self.embedding = nn.Linear(SPARSE_DIM, width)
+        self.embedding = nn.Linear(self.inputs, width)
         self.layers = nn.ModuleList(EncoderLayer(width, heads, feedforward, dropout) for _ in range(depth))
         self.orientation = head(width, ROOT)
         self.rotation = head(width, ROTATION.stop - ROOT)
 
     def rotations(self, encoded: Tensor) -> Tensor:
         """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
-        h = self.embedding(encoded)
+        return self.encode(self.embedding(encoded))
+
+    def encode(self, h: Tensor) -> Tensor:
+        """Map the embeddings of windows (B, T, d) to their last frames' rotations (B, 132)."""
         for layer in self.layers:
             h = layer(h)
         return self.read(h[:, -1])

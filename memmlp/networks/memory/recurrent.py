@@ -108,6 +108,7 @@ class RecurrentMemory(FeatureMemory):
     """
 
     recurrence: ClassVar[type[Recurrence]]
+    settled = True
 
     def __init__(
         self,

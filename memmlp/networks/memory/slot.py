@@ -26,7 +26,8 @@ class Memory(nn.Module):
             without a past.
         length: how many past frames of inputs the buffer holds; the last one directly precedes the new ones.
         frames: T, the window's length.
-        settled: whether what is recalled of a frame never changes, so that a stream may compute it once.
+        settled: whether what is recalled of a frame never changes, so that a stream may compute it once. A
+            memory of one's own that does not say so is exported as it was trained.
     """
 
     uses_codes: ClassVar[bool] = False
@@ -34,7 +35,7 @@ class Memory(nn.Module):
     shift: int
     length: int
     frames: int
-    settled: bool = True
+    settled: bool = False
 
     def block(self, layer: int) -> nn.Module:
         """Make the backbone's block of a layer (1-based)."""
@@ -91,6 +92,8 @@ class NoMemory(Memory):
         depth: the backbone's L; not used here.
         codes: the frozen VQ-VAE; not used here.
     """
+
+    settled = True
 
     def __init__(self, *, hidden: int, frames: int, depth: int, codes: VQVAE | None = None):
         super().__init__()

@@ -8,18 +8,37 @@ from __future__ import annotations
 
 from memmlp.common.errors import InputError
 from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP
+from memmlp.networks.baselines.avatar_jlm import AvatarJLM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
+from memmlp.networks.baselines.ego_poser import EgoPoser
+from memmlp.networks.baselines.hmd_poser import HMDPoser
+from memmlp.networks.baselines.rpm import RPM
+from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
-from memmlp.networks.streaming.baselines import AGRoLDiffusionStream, AGRoLMLPStream, AvatarPoserStream
+from memmlp.networks.streaming.baselines import (
+    AGRoLDiffusionStream,
+    AGRoLMLPStream,
+    AvatarJLMStream,
+    AvatarPoserStream,
+    EgoPoserStream,
+    HMDPoserStream,
+    RPMStream,
+    VAEHMDStream,
+)
 from memmlp.networks.streaming.mem_mlp import MemMLPStream
 from memmlp.networks.streaming.ring import StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
-__all__ = ["StreamingGraph", "streaming"]
+__all__ = ["StreamingGraph", "has_stream", "streaming"]
 
 STREAMS: dict[type[WindowModel], type[StreamingGraph]] = {
     MemMLP: MemMLPStream,
     AvatarPoser: AvatarPoserStream,
+    EgoPoser: EgoPoserStream,
+    HMDPoser: HMDPoserStream,
+    AvatarJLM: AvatarJLMStream,
+    RPM: RPMStream,
+    VAEHMD: VAEHMDStream,
     AGRoLMLP: AGRoLMLPStream,
     AGRoLDiffusion: AGRoLDiffusionStream,
 }
@@ -30,11 +49,21 @@ def streaming(model: WindowModel) -> StreamingGraph:
 
     Raises:
         InputError: if the network has none: where estimates of past frames change at each step
-            (`memory.history=latest`), nothing can be carried.
+            (`memory.history=latest`), nothing can be carried, and a part of one's own may have no graph.
     """
-    if not model.settled:
+    if getattr(getattr(model, "memory", None), "history", None) == "latest":
         raise InputError(
             "memory.history=latest: its estimates change at each step, which no streaming graph can carry; "
             "allowed is export.graph=naive, or memory.history=first"
         )
+    if not has_stream(model):
+        raise InputError(
+            "export.graph=streaming: a part of one's own has none; allowed is export.graph=naive"
+        )
     return STREAMS[type(model)](model)
+
+
+def has_stream(model: WindowModel) -> bool:
+    """Return whether there is a streaming graph of a network; of parts of one's own there may be none."""
+    graph = STREAMS.get(type(model))
+    return graph is not None and model.settled and graph.fits(model)

@@ -12,11 +12,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from memmlp.motion.body import ROTATION
+from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP, TimedBlock
-from memmlp.networks.baselines.avatar_poser import AvatarPoser, EncoderLayer
+from memmlp.networks.baselines.avatar_jlm import TOKENS, AvatarJLM
+from memmlp.networks.baselines.avatar_poser import AvatarPoser
+from memmlp.networks.baselines.ego_poser import PLACES, EgoPoser, beside_head, places
+from memmlp.networks.baselines.encoder import EncoderLayer
+from memmlp.networks.baselines.hmd_poser import HMDPoser
+from memmlp.networks.baselines.rpm import RPM
+from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.layers import MLPBlock
 from memmlp.networks.memory import State
+from memmlp.networks.stream_model import StreamModel
 from memmlp.networks.streaming.ring import Ring, StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
@@ -54,6 +61,53 @@ class AvatarPoserStream(StreamingGraph):
         attended = last.attention.attend(ring.newest(query)[None], key[None], value[None])[0]
         newest = last.finish(ring.newest(h), attended)
         return self.normalizer.posed(self.model.read(newest), sparse), {"first": first}
+
+
+def newest_frame(layers: list[EncoderLayer], h: Tensor) -> Tensor:
+    """Apply encoder layers to (T, d), the last one for the newest frame (1, d) alone."""
+    *earlier, last = layers
+    for layer in earlier:
+        h = layer(h)
+    attention, newest = last.attention, h[-1:]
+    return last.finish(
+        newest, attention.attend(attention.query(newest), attention.key(h), attention.value(h))
+    )
+
+
+class EgoPoserStream(StreamingGraph):
+    """EgoPoser's streaming graph: what the embedding makes of each frame is carried, in order of time.
+
+    Which frames the slow view adds to which changes at every step, so nothing after that can be carried. The
+    movement since the window's first frame is linear, so the first frame's share of it is taken off the sum.
+    """
+
+    ends = ("model.embedding", "model.orientation", "model.rotation")
+    model: EgoPoser
+
+    def build(self, model: WindowModel) -> None:
+        """Make the graph's parts from a copy of the network."""
+        assert isinstance(model, EgoPoser)
+        self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))
+
+    def windows(self) -> State:
+        """Return zeros (T - 1, n): each earlier frame's embedding (n = d) and places on the floor (n = 6)."""
+        sizes = {"embedded": self.model.embedding.out_features, "places": PLACES}
+        return {name: torch.zeros(self.frames - 1, size) for name, size in sizes.items()}
+
+    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        local = beside_head(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
+        place = places(local)
+        entering = {"embedded": self.model.embedding(torch.cat([local, place], -1)), "places": place}
+        window = {
+            name: torch.cat([torch.where(state["count"] > 0, state[name], frame), frame])
+            for name, frame in entering.items()
+        }
+        slow, fast = self.model.views(window["embedded"])
+        first = F.linear(window["places"][:1], self.model.embedding.weight[:, SPARSE_DIM:])
+        newest = newest_frame(self.layers, slow + fast - 2 * first)
+        kept = {name: frames[1:] for name, frames in window.items()}
+        return self.normalizer.posed(self.model.read(newest), sparse), kept
 
 
 class AGRoLStream(StreamingGraph):
@@ -146,3 +200,99 @@ class AGRoLDiffusionStream(AGRoLStream):
             h = block.newest(h + shift, self.frames)
         block, shift = last
         return self.model.head(block.newest(h + shift, count))
+
+
+class FrameStream(StreamingGraph):
+    """The streaming graph of a network without a window: the network as it is, one frame a step."""
+
+    model: StreamModel
+
+    def build(self, model: WindowModel) -> None:
+        """Make the graph's parts from a copy of the network."""
+        assert isinstance(model, StreamModel)
+        self.model = model
+
+    def windows(self) -> State:
+        """Return the network's own state at a fresh start."""
+        return self.model.initial_state(1)
+
+    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        motion, kept = self.model.advance(sparse[None], state, 1)
+        return motion[0], kept
+
+
+class HMDPoserStream(FrameStream):
+    """HMD-Poser's streaming graph."""
+
+    ends = ("model.trackers", "model.hands", "model.others", "model.pose")
+    model: HMDPoser
+
+    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        features, kept = self.model.features(sparse[None], state)
+        return self.normalizer.posed(self.model.pose(features[0]), sparse), kept
+
+
+class VAEHMDStream(FrameStream):
+    """VAE-HMD's streaming graph."""
+
+    ends = ("model.encoder.stem", "model.decoder.head")
+    model: VAEHMD
+
+    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) to world motion (1, 198); nothing is carried on."""
+        mean = self.model.latent(sparse).chunk(2, -1)[0]
+        return self.normalizer.posed(self.model.decoder(mean), sparse), {}
+
+
+class RPMStream(FrameStream):
+    """RPM's streaming graph."""
+
+    ends = ("model.motion", "model.sparse", "model.head")
+    model: RPM
+
+
+class AvatarJLMStream(StreamingGraph):
+    """AvatarJLM's streaming graph: the tokens of each frame are carried, in order of time.
+
+    Their places change at every step and attention looks both ways, so the layers are computed anew; the last
+    one, over time, for the newest frame alone.
+    """
+
+    ends = ("model.embedding", "model.coarse", "model.regressor")
+    model: AvatarJLM
+    layers: list[EncoderLayer]
+
+    def build(self, model: WindowModel) -> None:
+        """Make the graph's parts from a copy of the network."""
+        assert isinstance(model, AvatarJLM)
+        self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))
+
+    def windows(self) -> State:
+        """Return zeros (T - 1, 45 d): each earlier frame's tokens, without places."""
+        return {"tokens": torch.zeros(self.frames - 1, self.model.joint_places.numel())}
+
+    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+        entering = self.model.tokens(encoded).flatten(1)
+        window = torch.cat([torch.where(state["count"] > 0, state["tokens"], entering), entering])
+        h = self.model.placed(window.unflatten(-1, (TOKENS, -1)))
+        first = h[:, -1:]
+        for index, layer in enumerate(self.layers[:-1]):
+            turned = h if index % 2 == 0 else h.transpose(0, 1)
+            made = attended(layer, turned, turned)
+            h = self.model.renewed(made if index % 2 == 0 else made.transpose(0, 1), first)
+        by_token = h.transpose(0, 1)
+        newest = attended(self.layers[-1], by_token[:, -1:], by_token).transpose(0, 1)
+        features = self.model.renewed(newest, first[-1:]).flatten(1)
+        return self.normalizer.posed(self.model.regressor(features), sparse), {"tokens": window[1:]}
+
+
+def attended(layer: EncoderLayer, h: Tensor, seen: Tensor) -> Tensor:
+    """Apply an encoder layer to (N, n, d), which sees (N, m, d), by products of plain matrices."""
+    attention, flat, all_seen = layer.attention, h.flatten(0, 1), seen.flatten(0, 1)
+    query = attention.query(flat).view(h.shape)
+    key, value = (part(all_seen).view(seen.shape) for part in (attention.key, attention.value))
+    return layer.finish(flat, attention.attend(query, key, value).flatten(0, 1)).view(h.shape)

@@ -102,6 +102,11 @@ class MemMLPStream(StreamingGraph):
 
     ends = ("coordinates", "stem", "predictor.rotation.linear", "predictor.position.linear")
 
+    @classmethod
+    def fits(cls, model: WindowModel) -> bool:
+        """Return whether the predictor is made of branches, which alone can be streamed."""
+        return isinstance(model, MemMLP) and all(isinstance(c, Branch) for c in model.predictor.children())
+
     def build(self, model: WindowModel) -> None:
         """Make the graph's parts from a copy of the network."""
         assert isinstance(model, MemMLP)

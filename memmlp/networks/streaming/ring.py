@@ -71,6 +71,11 @@ class StreamingGraph(nn.Module):
         self.build(model)
         self.requires_grad_(False)
 
+    @classmethod
+    def fits(cls, model: WindowModel) -> bool:
+        """Return whether a network of the graph's class has only parts that it knows."""
+        return True
+
     def build(self, model: WindowModel) -> None:
         """Make the graph's parts from a copy of the network."""
         raise NotImplementedError

@@ -11,11 +11,12 @@ from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM
 from memmlp.motion.coordinates import Heading
 
 NAMES = list(tiny.BASELINES)
+WINDOWED = [name for name in NAMES if name not in tiny.WINDOWLESS]
 CLIP = tiny.clip(40)
 SPARSE = CLIP[None, :, :SPARSE_DIM]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", WINDOWED)
 @torch.no_grad()
 def test_a_stream_is_the_last_frame_of_windows_with_full_history(name):
     model = tiny.baseline(name, Heading())
@@ -26,13 +27,26 @@ def test_a_stream_is_the_last_frame_of_windows_with_full_history(name):
         torch.testing.assert_close(window[0, -1], stream[end - 1], atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", WINDOWED)
 @torch.no_grad()
 def test_a_fresh_start_is_the_first_frame_for_a_window(name):
     model = tiny.baseline(name)
     first = model.advance(SPARSE[:, :1], model.initial_state(1), 1)[0]
     still = model.advance(SPARSE[:, :1].expand(-1, model.frames, -1), model.initial_state(1), 1)[0]
     torch.testing.assert_close(first, still)
+
+
+@pytest.mark.parametrize("name", tiny.WINDOWLESS)
+@torch.no_grad()
+def test_without_a_window_both_modes_are_the_stream_in_calls_of_any_size(name):
+    model = tiny.baseline(name, Heading())
+    stream = evaluation.stream(model, [CLIP])[0]
+    assert torch.equal(evaluation.window(model, [CLIP])[0], stream)
+    state, made = model.initial_state(1), []
+    for part in SPARSE.split([1, 9, 30], 1):
+        motion, state = model.advance(part, state)
+        made.append(motion[0])
+    torch.testing.assert_close(torch.cat(made), stream, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -71,6 +85,11 @@ KNOBS = [
     ("agrol_diffusion", {"noise_seed": 1}), ("agrol_diffusion", {"depth": 3}),
     ("avatar_poser", {"frames": 6}), ("avatar_poser", {"heads": 2}), ("avatar_poser", {"feedforward": 16}),
     ("avatar_poser", {"depth": 3}),
+    ("ego_poser", {"frames": 6}), ("ego_poser", {"heads": 2}), ("ego_poser", {"feedforward": 16}),
+    ("vae_hmd", {"depth": 1}), ("vae_hmd", {"latent": 5}), ("vae_hmd", {"width": 12}),
+    ("rpm", {"context": 2}), ("rpm", {"horizon": 3}), ("rpm", {"feedforward": 16}), ("rpm", {"heads": 2}),
+    ("avatar_jlm", {"frames": 6}), ("avatar_jlm", {"depth": 1}), ("avatar_jlm", {"feedforward": 16}),
+    ("hmd_poser", {"layers": 2}), ("hmd_poser", {"depth": 1}), ("hmd_poser", {"heads": 2}),
 ]  # fmt: skip
 
 

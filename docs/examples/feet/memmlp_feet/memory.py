@@ -1,0 +1,66 @@
+"""A memory that tells the backbone the mean of the inputs over the window."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor, nn
+
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.networks.memory import State
+from memmlp.networks.memory.slot import FeatureMemory
+from memmlp.networks.vqvae import VQVAE
+
+
+class MeanFeature(nn.Module):
+    """Projects the mean inputs.
+
+    Args:
+        width: k, the width of the feature.
+    """
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.projection = nn.Sequential(nn.Linear(SPARSE_DIM, width), nn.SiLU())
+
+    def forward(self, mean: Tensor) -> Tensor:
+        """Map the mean inputs of each frame's past (B, T, 54) to features (B, T, k)."""
+        return self.projection(mean)
+
+
+class MeanMemory(FeatureMemory):
+    """A memory without a state: what a frame recalls is the mean of the inputs up to it.
+
+    Args:
+        layers: the backbone's layers (1-based) that get the feature.
+        width: k, the width of the feature.
+        fusion: "residual" or "plain".
+        hidden: the backbone's d.
+        frames: the backbone's T.
+        depth: the backbone's L.
+        codes: the frozen VQ-VAE; not used here.
+    """
+
+    def __init__(
+        self,
+        layers: Sequence[int],
+        width: int,
+        fusion: str,
+        *,
+        hidden: int,
+        frames: int,
+        depth: int,
+        codes: VQVAE | None = None,
+    ):
+        super().__init__(layers, width, fusion, hidden=hidden, frames=frames, depth=depth)
+        self.shift, self.length = 0, frames - 1
+
+    def feature(self) -> nn.Module:
+        """Make the module that computes a block's memory feature."""
+        return MeanFeature(self.width)
+
+    def recall(self, sparse: Tensor, state: State, new: int) -> Tensor:
+        """Return the mean of the window's inputs up to each frame (B, T, 54)."""
+        window = sparse[:, -self.frames :]
+        counts = window.new_ones(self.frames).cumsum(0)[:, None]
+        return window.cumsum(1) / counts

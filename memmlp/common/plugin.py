@@ -1,0 +1,75 @@
+"""What a package of one's own tells of its components: options of slots, metrics, recipe numbers."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+BETTER = ("lower", "higher")
+MEASURED = ("positions", "rotations")
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A metric of one's own, measured on test clips where `evaluation.metrics` names it.
+
+    Attributes:
+        function: the dotted path of a function of the prediction and the truth of one clip, which returns one
+            number; nothing is imported before it is needed.
+        unit: the unit; empty for a number without one.
+        smallest: the smallest difference that matters, in the unit: what two methods may differ by and still
+            be called as good as each other.
+        better: "lower" or "higher", what is better.
+        of: what the function is given: "positions" (N, 22, 3), metres in the world at 60 Hz, in both
+            branches, or "rotations" (N, 22, 3, 3), local with the root's global, in the rotation branch.
+        recipe: raised when what the function computes changes.
+    """
+
+    function: str
+    unit: str
+    smallest: float
+    better: str = "lower"
+    of: str = "positions"
+    recipe: int = 1
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """What a package has, in an attribute `plugin` of its module; a package without one just may be imported.
+
+    Attributes:
+        conf: the folder of configs inside the package, whose options are beside memmlp's; it need not exist.
+        schemas: the dotted path of the dataclass with an option's keys, by the option's name with its group:
+            "memory_mean". An option without one has the keys of its slot.
+        recipes: numbers of components, such as {"memory.mean": 2}: raised when what one computes changes, so
+            that its runs are made again.
+        metrics: metrics of one's own by name, a word.
+    """
+
+    conf: str = "conf"
+    schemas: Mapping[str, str] = field(default_factory=dict)
+    recipes: Mapping[str, int] = field(default_factory=dict)
+    metrics: Mapping[str, Metric] = field(default_factory=dict)
+
+
+METRICS: dict[str, Metric] = {}
+"""The metrics of all packages in use, by name (memmlp.config.plugins fills it)."""
+
+
+def faults(plugin: Plugin) -> Iterator[str]:
+    """Yield what is wrong with what a package tells, a line each."""
+    for name, metric in plugin.metrics.items():
+        if not re.fullmatch(r"[A-Za-z]\w*", name):
+            yield f"metric '{name}': allowed is a word of letters, digits and _"
+        if metric.better not in BETTER:
+            yield f"metric {name}: better={metric.better}; allowed is {' or '.join(BETTER)}"
+        if metric.of not in MEASURED:
+            yield f"metric {name}: of={metric.of}; allowed is {' or '.join(MEASURED)}"
+        if not 0 < metric.smallest < math.inf:
+            yield f"metric {name}: smallest={metric.smallest}; allowed is a number above 0"
+    numbers = {**plugin.recipes, **{f"metric.{name}": one.recipe for name, one in plugin.metrics.items()}}
+    for name, number in numbers.items():
+        if not isinstance(number, int) or isinstance(number, bool) or number < 1:
+            yield f"recipe of {name}: {number}; allowed is a whole number of at least 1"

@@ -1,0 +1,251 @@
+"""Packages with components of one's own: which are in use, and whose code a run may so name.
+
+A package is used where the user's command (`plugins=[NAME]`, `--plugins NAME`), a sweep's base, the
+environment (MEMMLP_PLUGINS) or an installed entry point of the group `memmlp.plugins` names it. Reading a run
+imports no package by itself: a run's folder may come from anybody.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.util
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from importlib import metadata
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import yaml
+
+from memmlp.common import plugin as known
+from memmlp.common.errors import InputError
+from memmlp.common.plugin import Plugin
+from memmlp.config.packaged import packaged
+from memmlp.evaluation.units import HIGHER, SMALLEST, UNITS
+from memmlp.runs.environment import package_sources
+from memmlp.runs.identity import flatten
+from memmlp.runs.recipes import RECIPES
+
+GROUP = "memmlp.plugins"
+VARIABLE = "MEMMLP_PLUGINS"
+KEY = "plugins"
+NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
+
+_active: dict[str, Plugin] = {}
+_folders: dict[str, Path] = {}
+_own: ContextVar[Path | None] = ContextVar("config_dir", default=None)
+
+
+def activate(names: Iterable[str] = ()) -> None:
+    """Use packages: those named, those of the environment, and installed ones with an entry point.
+
+    Raises:
+        InputError: naming the package, where it can't be imported or something that it tells is wrong.
+    """
+    for name in (*installed(), *in_environment(), *names):
+        if name not in _active:
+            _use(name)
+
+
+@functools.cache
+def installed() -> tuple[str, ...]:
+    """Return the packages that installed distributions name as entry points of the group."""
+    return tuple(dict.fromkeys(entry.module for entry in metadata.entry_points(group=GROUP)))
+
+
+def in_environment() -> list[str]:
+    """Return the packages that the environment names."""
+    return listed(os.environ.get(VARIABLE, ""))
+
+
+def listed(words: str) -> list[str]:
+    """Return the names between commas."""
+    return [name.strip() for name in words.split(",") if name.strip()]
+
+
+def named(words: Iterable[str]) -> list[str]:
+    """Return the packages that overrides such as `plugins=[mine]` name."""
+    values = [value for key, _, value in (word.partition("=") for word in words) if key.lstrip("+") == KEY]
+    found: list[str] = []
+    for value in values:
+        try:
+            content = yaml.safe_load(value)
+        except yaml.YAMLError:  # composing says what is wrong
+            continue
+        found += [str(name) for name in content] if isinstance(content, list) else []
+    return found
+
+
+def active() -> Mapping[str, Plugin]:
+    """Return the packages in use, by name."""
+    return _active
+
+
+def folders() -> list[tuple[str, Path]]:
+    """Return the folders of configs that are searched beside memmlp's: by name of the package, and own."""
+    own = _own.get()
+    return [*_folders.items(), *([("command-line", own)] if own else [])]
+
+
+@contextmanager
+def searching(folder: Path | None) -> Iterator[None]:
+    """Search a folder of the user's own configs, the one of `--config-dir`, for a while."""
+    token = _own.set(folder.absolute() if folder else None)
+    try:
+        yield
+    finally:
+        _own.reset(token)
+
+
+def words() -> list[str]:
+    """Return the words of a command line that search the same folder."""
+    own = _own.get()
+    return ["--config-dir", str(own)] if own else []
+
+
+def texts() -> list[tuple[str, str]]:
+    """Return what is one's own that a plan follows from: code and configs, a name and a text each."""
+    found = [(f"{name}:{file}", text) for name in _active for file, text in package_sources(name).items()]
+    paths = [path for _, folder in folders() for path in sorted(folder.rglob("*.yaml"))]
+    return [*found, *((str(path), path.read_text(encoding="utf-8")) for path in paths)]
+
+
+def _use(name: str) -> None:
+    """Import a package, and let everything know what it tells."""
+    module = _imported(name)
+    plugin = getattr(module, "plugin", None)
+    plugin = plugin if isinstance(plugin, Plugin) else Plugin()
+    for fault in (*known.faults(plugin), *_taken(plugin), *_hidden(module, plugin)):
+        raise InputError(f"plugin {name}: {fault}")
+    if (folder := _folder(module, plugin)).is_dir():
+        _folders[name] = folder
+    _add_schemas(name, plugin)
+    RECIPES.update(plugin.recipes)
+    known.METRICS.update(plugin.metrics)
+    for own, metric in plugin.metrics.items():
+        RECIPES[f"metric.{own}"], UNITS[own], SMALLEST[own] = metric.recipe, metric.unit, metric.smallest
+    HIGHER.update(own for own, metric in plugin.metrics.items() if metric.better == "higher")
+    _active[name] = plugin
+
+
+def _add_schemas(name: str, plugin: Plugin) -> None:
+    """Make the schemas of a package's options known. Raises InputError for one that is none of its slot."""
+    if not plugin.schemas:
+        return
+    from memmlp.config.schema import add_schema
+
+    for option, path in plugin.schemas.items():
+        module, _, attribute = path.rpartition(".")
+        try:
+            add_schema(option, getattr(importlib.import_module(module), attribute))
+        except (ImportError, AttributeError, ValueError) as error:
+            raise InputError(f"plugin {name}: schema of {option}: {path}: {error}") from error
+
+
+def _imported(name: str) -> ModuleType:
+    """Import the package. Raises InputError where there is none, or it raises something itself."""
+    if not NAME.fullmatch(name) or name.split(".")[0] == "memmlp":
+        raise InputError(f"plugins: '{name}'; allowed is the name of a package of your own")
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name and (name == error.name or name.startswith(f"{error.name}.")):
+            raise InputError(
+                f"plugin {name}: there is no such package here; install it, or put its folder on PYTHONPATH"
+            ) from None
+        raise InputError(f"plugin {name}: cannot be imported: {error}") from error
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise InputError(f"plugin {name}: cannot be imported: {reason}") from error
+
+
+def _folder(module: ModuleType, plugin: Plugin) -> Path:
+    """Return the folder of the package's configs; a module that is one file has none."""
+    return Path(next(iter(getattr(module, "__path__", ())), os.devnull)) / plugin.conf
+
+
+def _taken(plugin: Plugin) -> Iterator[str]:
+    """Yield the names that something else has already."""
+    from memmlp.sweep.spec import COSTS
+
+    for name in plugin.metrics:
+        if name in UNITS or name in COSTS:
+            yield f"metric {name}: there is one of that name; allowed is a name of its own"
+    for name in plugin.recipes:
+        if name in RECIPES:
+            yield f"recipe of {name}: there is a component of that name; allowed is a name of its own"
+
+
+def _hidden(module: ModuleType, plugin: Plugin) -> Iterator[str]:
+    """Yield the package's options that one of memmlp or of another package would hide."""
+    folder = _folder(module, plugin)
+    for path in sorted(folder.rglob("*.yaml")):
+        option = path.relative_to(folder)
+        if any((other / option).exists() for other in (packaged("conf"), *_folders.values())):
+            yield f"{path}: there is an option of that name; allowed is a name of its own"
+
+
+def foreign(config: Mapping[str, Any]) -> list[str]:
+    """Return the paths of the classes and functions outside of memmlp that a config names."""
+    flat = flatten(config)
+    paths = [str(value) for key, value in flat.items() if key.rsplit(".", 1)[-1] == "_target_"]
+    coordinates = str(flat.get("frame.coordinates", ""))
+    paths += [coordinates] if "." in coordinates else []
+    return [path for path in dict.fromkeys(paths) if not path.startswith("memmlp.")]
+
+
+def owner(path: str) -> str:
+    """Return the package in use that a path lies in; where there is none, the first name of the path."""
+    fits = [name for name in _active if path.startswith(f"{name}.")]
+    return max(fits, key=len, default=path.split(".")[0])
+
+
+def used(config: Mapping[str, Any]) -> list[str]:
+    """Return the packages that a config's classes and metrics come from, and see that they are in use."""
+    measured = (config.get("evaluation") or {}).get("metrics") or ()
+    paths = [known.METRICS[name].function for name in measured if name in known.METRICS]
+    found = sorted({owner(path) for path in [*foreign(config), *paths]})
+    activate(found)
+    return found
+
+
+def check_allowed(config: Mapping[str, Any], recorded: Mapping[str, Any], where: str) -> None:
+    """Check that the code which a recorded config names may be imported.
+
+    Args:
+        config: the config.
+        recorded: what was recorded of the packages that made the run, by name.
+        where: what the config is of, for the error.
+
+    Raises:
+        InputError: one line that names the package, and what to do.
+    """
+    named_here = [*(config.get(KEY) or ()), *map(owner, foreign(config))]
+    for name in dict.fromkeys(named_here):
+        if name not in _active:
+            raise InputError(f"{where}: {_refusal(str(name), recorded)}")
+    for path in foreign(config):
+        if not _defined(path, owner(path)):
+            raise InputError(f"{where}: {path}: allowed is what {owner(path)} defines itself")
+
+
+def _defined(path: str, name: str) -> bool:
+    """Return whether a package defines what lies at a path, and does not only import it: mine.os.system."""
+    from memmlp.config.instantiate import located
+
+    module = getattr(located(path, name), "__module__", "") or ""
+    return module.split(".")[0] == name.split(".")[0]
+
+
+def _refusal(name: str, recorded: Mapping[str, Any]) -> str:
+    """Say why a package's code is not imported, and what to do."""
+    version = (recorded.get(name) or {}).get("version")
+    said = f"{name} {version}" if version else name
+    if not NAME.fullmatch(name) or importlib.util.find_spec(name.split(".")[0]) is None:
+        return f"made with the package {said}, which is not here; install it, or put its folder on PYTHONPATH"
+    return f"names code of the package {said}; to trust it, say --plugins {name} or {VARIABLE}={name}"

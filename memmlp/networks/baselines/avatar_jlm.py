@@ -1,0 +1,153 @@
+"""AvatarJLM (Zheng et al., ICCV 2023): joint-level tokens, attended over joints and over time."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from memmlp.motion.body import (
+    HEAD,
+    N_JOINTS,
+    POSITION,
+    ROTATION,
+    SPARSE_ANGULAR_VELOCITY,
+    SPARSE_DIM,
+    SPARSE_POSITION,
+    SPARSE_ROTATION,
+    SPARSE_VELOCITY,
+    TRACKED,
+)
+from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.baselines.agrol import WholeWindow
+from memmlp.networks.baselines.encoder import EncoderLayer
+
+JOINT_DIM = 18  # features of a joint: rotation, angular velocity, position, velocity
+UNSEEN = 0.01  # stands in all features of joints without a tracker
+TOKENS = 2 * N_JOINTS + 1  # positions, rotations, and the inputs as a whole
+LONGEST = 200  # frames that have a place of their own, as published
+GROUPS = 8  # of the regressor's normalisation
+PARTS = (SPARSE_ROTATION, SPARSE_ANGULAR_VELOCITY, SPARSE_POSITION, SPARSE_VELOCITY)
+
+
+def joint_features(encoded: Tensor) -> Tensor:
+    """Spread inputs (..., 54) over the joints (..., 22 x 18); joints without a tracker hold a constant."""
+    trackers = torch.cat([encoded[..., part].unflatten(-1, (len(TRACKED), -1)) for part in PARTS], -1)
+    unseen = torch.full_like(trackers[..., :1, :], UNSEEN)
+    rows = [trackers[..., [TRACKED.index(j)], :] if j in TRACKED else unseen for j in range(N_JOINTS)]
+    return torch.cat(rows, -2).flatten(-2)
+
+
+def with_tracked(joints: Tensor, tracked: Tensor) -> Tensor:
+    """Return features of all joints (..., 22, n) with those of the trackers (..., 3, n) in their places."""
+    rows = list(joints.unbind(-2))
+    for joint, row in zip(TRACKED, tracked.unbind(-2), strict=True):
+        rows[joint] = row
+    return torch.stack(rows, -2)
+
+
+class AvatarJLM(WholeWindow):
+    """A coarse pose of each frame, tokens of its joints, encoder layers, and a head on all tokens of a frame.
+
+    It has 63,807,240 parameters at the paper's sizes (T = 41, d = 512, 6 blocks). It predicts all frames of a
+    window; a live stream keeps the last one.
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the window's length.
+        width: d, the width of a token; the layers of the coarse pose have 2 d.
+        depth: number of blocks: an encoder layer over a frame's tokens, and one over each token's frames.
+        heads: number of attention heads; it divides d.
+        feedforward: width of the encoders' hidden layers.
+        dropout: dropout rate of the encoders, while training.
+        coarse: weight of the loss of the coarse pose's joints.
+    """
+
+    def __init__(
+        self,
+        normalizer: Normalizer,
+        *,
+        frames: int,
+        width: int,
+        depth: int,
+        heads: int,
+        feedforward: int,
+        dropout: float,
+        coarse: float,
+    ):
+        super().__init__(normalizer, frames)
+        self.coarse_weight, hidden = coarse, 2 * width
+        self.embedding = nn.Linear(N_JOINTS * JOINT_DIM, hidden)
+        self.coarse = nn.Sequential(
+            nn.Linear(hidden, hidden), nn.LeakyReLU(0.1), nn.Linear(hidden, ROTATION.stop)
+        )
+        self.position_token, self.rotation_token = nn.Linear(3, width), nn.Linear(6, width)
+        self.input_token = nn.Linear(hidden, width)
+        self.joint_places = nn.Parameter(torch.empty(TOKENS, width))
+        self.time_places = nn.Parameter(torch.empty(max(LONGEST, frames), 1, width))
+        for places in (self.joint_places, self.time_places):
+            nn.init.trunc_normal_(places, std=0.02)
+        self.layers = nn.ModuleList(
+            EncoderLayer(width, heads, feedforward, dropout) for _ in range(2 * depth)
+        )
+        self.regressor = nn.Sequential(
+            nn.Linear(TOKENS * width, hidden),
+            nn.GroupNorm(GROUPS, hidden),
+            nn.LeakyReLU(0.1),
+            nn.Linear(hidden, ROTATION.stop),
+        )
+
+    def coarse_joints(self, embedded: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the coarse pose of embeddings (..., 2 d), in the network's coordinates without z-scores.
+
+        Returns:
+            Joints (..., 22, 3), metres, relative to the head, and their global 6D rotations (..., 22, 6).
+        """
+        mean, std = (part[SPARSE_DIM:][ROTATION] for part in (self.normalizer.mean, self.normalizer.std))
+        local = sixd_to_matrix((self.coarse(embedded) * std + mean).unflatten(-1, (N_JOINTS, 6)))
+        pelvis = torch.zeros_like(local[..., 0, :, 0])
+        rotations, positions = forward_kinematics(local, pelvis, self.normalizer.rest)
+        return positions - positions[..., HEAD : HEAD + 1, :], matrix_to_sixd(rotations)
+
+    def tokens(self, encoded: Tensor) -> Tensor:
+        """Map inputs (..., 54) in network space to their frames' tokens (..., 45, d), without places."""
+        embedded = self.embedding(joint_features(encoded))
+        positions, rotations = self.coarse_joints(embedded)
+        seen = encoded * self.normalizer.std[:SPARSE_DIM] + self.normalizer.mean[:SPARSE_DIM]
+        tracked = [seen[..., part].unflatten(-1, (len(TRACKED), -1)) for part in PARTS]
+        positions = with_tracked(positions, tracked[2] - tracked[2][..., :1, :])
+        rotations = with_tracked(rotations, tracked[0])
+        whole = self.input_token(embedded.detach())[..., None, :]
+        return torch.cat([self.position_token(positions), self.rotation_token(rotations), whole], -2)
+
+    def placed(self, tokens: Tensor) -> Tensor:
+        """Add the places of joints and frames to the tokens (..., T, 45, d) of a window."""
+        return tokens + self.joint_places + self.time_places[: tokens.shape[-3]]
+
+    @staticmethod
+    def renewed(h: Tensor, first: Tensor) -> Tensor:
+        """Return tokens (..., 45, d) with the inputs' token as it was at first (..., 1, d), detached."""
+        return torch.cat([h[..., :-1, :], first.detach()], -2)
+
+    def rotations(self, encoded: Tensor) -> Tensor:
+        """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
+        h = self.placed(self.tokens(encoded))
+        first = h[..., -1:, :]
+        for index, layer in enumerate(self.layers):
+            if index % 2 == 0:
+                h = layer(h.flatten(0, 1)).unflatten(0, encoded.shape[:2])
+            else:
+                h = layer(h.transpose(1, 2).flatten(0, 1)).unflatten(0, (-1, TOKENS)).transpose(1, 2)
+            h = self.renewed(h, first)
+        return self.regressor(h.flatten(-2).flatten(0, 1)).unflatten(0, encoded.shape[:2])
+
+    def auxiliary_losses(self, truth: Tensor) -> dict[str, Tensor]:
+        """Return the mean absolute error of the coarse pose's joints relative to the head, weighted."""
+        sparse, motion = truth[..., :SPARSE_DIM], truth[..., SPARSE_DIM:]
+        origin = self.normalizer.origin(sparse)
+        encoded = self.normalizer.encode_sparse(sparse, origin)
+        made, _ = self.coarse_joints(self.embedding(joint_features(encoded)))
+        true = self.normalizer.coordinates.motion_in(motion, origin)[..., POSITION]
+        joints = true.unflatten(-1, (N_JOINTS, 3))
+        error = made - (joints - joints[..., HEAD : HEAD + 1, :])
+        return {"coarse": self.coarse_weight * error.abs().mean()}

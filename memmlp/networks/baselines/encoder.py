@@ -1,0 +1,78 @@
+"""The transformer encoder that several baselines are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from memmlp.networks.layers import Dropout
+
+
+class Attention(nn.Module):
+    """Multi-head self-attention over the frames of a window (Vaswani et al. 2017, Sec. 3.2).
+
+    Windows may have no batch axis.
+
+    Args:
+        width: d, the width of the features.
+        heads: number of heads; it divides d.
+    """
+
+    def __init__(self, width: int, heads: int):
+        super().__init__()
+        self.heads = heads
+        self.query, self.key, self.value = (nn.Linear(width, width) for _ in range(3))
+        self.out = nn.Linear(width, width)
+
+    def forward(self, h: Tensor) -> Tensor:
+        """Map features (B, T, d) to (B, T, d)."""
+        return self.attend(self.query(h), self.key(h), self.value(h))
+
+    def attend(self, *parts: Tensor) -> Tensor:
+        """Attend with queries (B, n, d) to keys (B, T, d) and values (B, T, d), given in this order.
+
+        Returns:
+            (B, n, d).
+        """
+        query, key, value = (part.unflatten(-1, (self.heads, -1)).transpose(-3, -2) for part in parts)
+        scores = query @ key.transpose(-1, -2) * query.shape[-1] ** -0.5
+        return self.out((scores.softmax(-1) @ value).transpose(-3, -2).flatten(-2))
+
+
+class EncoderLayer(nn.Module):
+    """Attention, then a feed-forward of two layers, each added to its input and normalised (post-norm).
+
+    Args:
+        width: d, the width of the features.
+        heads: number of attention heads.
+        feedforward: width of the feed-forward's hidden layer.
+        dropout: dropout rate of both parts' outputs and of the hidden layer.
+        activation: what follows the hidden layer.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        heads: int,
+        feedforward: int,
+        dropout: float,
+        activation: Callable[[Tensor], Tensor] = F.relu,
+    ):
+        super().__init__()
+        self.attention = Attention(width, heads)
+        self.attention_norm = nn.LayerNorm(width)
+        self.widen, self.narrow = nn.Linear(width, feedforward), nn.Linear(feedforward, width)
+        self.norm = nn.LayerNorm(width)
+        self.dropout, self.activation = Dropout(dropout), activation
+
+    def forward(self, h: Tensor) -> Tensor:
+        """Map features (B, T, d) or (T, d) to the same shape."""
+        return self.finish(h, self.attention(h))
+
+    def finish(self, h: Tensor, attended: Tensor) -> Tensor:
+        """Apply what follows the attention, frame by frame, to its inputs and outputs (..., d)."""
+        h = self.attention_norm(h + self.dropout(attended))
+        wide = self.dropout(self.activation(self.widen(h)))
+        return self.norm(h + self.dropout(self.narrow(wide)))

@@ -1,0 +1,159 @@
+"""VAE-HMD (Dittadi et al., ICCV 2021): a variational autoencoder of poses, and an encoder from the trackers.
+
+There is no code of its authors; sizes are those of the one re-implementation that is public. Its two stages,
+the autoencoder and then the encoder from the trackers over its frozen decoder, are trained side by side here:
+of each batch half the windows go through the one and half through the other, whose gradients stop at the
+decoder.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from memmlp.common import parallel
+from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM, SPARSE_POSITION, SPARSE_ROTATION
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.layers import Dropout
+from memmlp.networks.memory import State
+from memmlp.networks.stream_model import StreamModel
+
+POSES = (SPARSE_ROTATION, SPARSE_POSITION)
+TRACKERS = sum(part.stop - part.start for part in POSES)  # no velocities
+
+
+class Residual(nn.Module):
+    """Two linear layers, each after a LeakyReLU, added to their input by a learned share that begins at 0.
+
+    Args:
+        width: d, the width of inputs and outputs.
+        dropout: dropout rate between the layers, while training.
+    """
+
+    def __init__(self, width: int, dropout: float):
+        super().__init__()
+        self.share = nn.Parameter(torch.zeros(()))
+        self.path = nn.Sequential(
+            nn.LeakyReLU(),
+            nn.Linear(width, width),
+            Dropout(dropout),
+            nn.LeakyReLU(),
+            nn.Linear(width, width),
+        )
+
+    def forward(self, h: Tensor) -> Tensor:
+        """Map (..., d) to (..., d)."""
+        return h + self.share * self.path(h)
+
+
+class Perceptron(nn.Module):
+    """A linear layer to a width, residual blocks, and a linear layer to the outputs.
+
+    Args:
+        inputs: number of inputs.
+        outputs: number of outputs.
+        width: d, the width of the blocks.
+        depth: number of blocks.
+        dropout: dropout rate of the blocks, while training.
+    """
+
+    def __init__(self, inputs: int, outputs: int, width: int, depth: int, dropout: float):
+        super().__init__()
+        self.stem = nn.Linear(inputs, width)
+        self.blocks = nn.Sequential(*(Residual(width, dropout) for _ in range(depth)))
+        self.head = nn.Linear(width, outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (..., inputs) to (..., outputs)."""
+        return self.head(self.blocks(self.stem(x)))
+
+
+def divergence(latent: Tensor) -> Tensor:
+    """Return the KL divergence of latents (..., 2 z), means and log variances, from the standard normal.
+
+    It is summed over the z components and the mean over the rest.
+    """
+    mean, log_variance = latent.chunk(2, -1)
+    return 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean()
+
+
+def drawn(latent: Tensor) -> Tensor:
+    """Draw (..., z) from latents (..., 2 z), means and log variances."""
+    mean, log_variance = latent.chunk(2, -1)
+    return mean + (0.5 * log_variance).exp() * parallel.drawn(torch.randn_like, mean)
+
+
+class VAEHMD(StreamModel):
+    """An encoder of a frame's trackers to a latent, whose mean is decoded to the rotations of that frame.
+
+    It has 853,958 parameters at the sizes of its re-implementation. The encoder of whole poses, which
+    training alone uses, is not counted.
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the frames of a training window; each is a pose of its own.
+        width: d, the width of the hidden layers.
+        depth: number of residual blocks of each part.
+        latent: z, the number of the latent's components.
+        dropout: dropout rate of the blocks, while training.
+        divergence: weight of the KL divergence.
+    """
+
+    def __init__(
+        self,
+        normalizer: Normalizer,
+        *,
+        frames: int,
+        width: int,
+        depth: int,
+        latent: int,
+        dropout: float,
+        divergence: float,
+    ):
+        super().__init__(normalizer, frames)
+        self.divergence = divergence
+        self.encoder = Perceptron(TRACKERS, 2 * latent, width, depth, dropout)
+        self.decoder = Perceptron(latent, ROTATION.stop, width, depth, dropout)
+        self.pose_encoder = Perceptron(MOTION_DIM, 2 * latent, width, depth, dropout)
+        self._latent: Tensor | None = None
+
+    def count_parameters(self) -> int:
+        """Count the trainable parameters of the network in use, without the encoder of whole poses."""
+        return super().count_parameters() - sum(p.numel() for p in self.pose_encoder.parameters())
+
+    def latent(self, sparse: Tensor) -> Tensor:
+        """Map world inputs (..., 54) to their latents (..., 2 z)."""
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+        return self.encoder(torch.cat([encoded[..., part] for part in POSES], -1))
+
+    def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
+        """Take in the newest frames, each on its own; see WindowModel.
+
+        By default the n new frames are returned, which are the most that it can make.
+        """
+        seen = sparse if newest is None else sparse[:, -newest:]
+        return self.normalizer.posed(self.decoder(self.latent(seen).chunk(2, -1)[0]), seen), state
+
+    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
+        """Make a training call: each window is decoded either from its true poses or from its trackers.
+
+        Args:
+            sparse: world inputs (B, T, 54).
+            state: see `advance`.
+            truth: world frames [X | Theta] (B, T, 252).
+        """
+        posed = (parallel.drawn(torch.rand_like, sparse[:, :1, :1]) < 0.5).to(sparse.dtype)
+        of_pose = self.pose_encoder(self.normalizer.encode(truth)[..., SPARSE_DIM:])
+        self._latent = posed * of_pose + (1 - posed) * self.latent(sparse)
+        sample = drawn(self._latent)
+        frozen = {name: weight.detach() for name, weight in self.decoder.named_parameters()}
+        live, still = self.decoder(sample), functional_call(self.decoder, frozen, (sample,))
+        return self.normalizer.posed(posed * live + (1 - posed) * still, sparse), state
+
+    def auxiliary_losses(self, truth: Tensor) -> dict[str, Tensor]:
+        """Return the KL divergence of the last training call's latents, weighted."""
+        if self._latent is None:
+            return {}
+        latent, self._latent = self._latent, None
+        return {"divergence": self.divergence * divergence(latent)}

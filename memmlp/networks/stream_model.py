@@ -1,0 +1,39 @@
+"""The interface of networks without a window, which take in frames one after the other, each once."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from memmlp.networks.memory import State
+from memmlp.networks.window_model import WindowModel
+
+
+class StreamModel(WindowModel):
+    """A network that carries all it knows of the past in its state; a live step takes the same work for ever.
+
+    `frames` is how many frames a training call takes in, from a fresh start. In both evaluation modes the
+    network is a stream over the whole clip.
+    """
+
+    @property
+    def windowless(self) -> bool:
+        """Whether the network has no window: this one has none."""
+        return True
+
+    @property
+    def length(self) -> int:
+        """How many past frames of inputs are kept in a buffer: none."""
+        return 0
+
+    @property
+    def stride(self) -> int:
+        """By how many frames a training step moves: by all that it takes in."""
+        return self.frames
+
+    def initial_state(self, batch: int = 1) -> State:
+        """Return the state of a fresh start, all zeros; here nothing is carried."""
+        return {}
+
+    def running_state(self, sparse: Tensor) -> State:
+        """Return the state of a fresh start, since no earlier frames (B, 0, 54) are kept."""
+        return self.initial_state(len(sparse))

@@ -1,0 +1,89 @@
+"""The losses of AGRoL and AvatarPoser, which their authors train them with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from torch import Tensor
+
+from memmlp.motion.body import N_JOINTS, ROOT, ROTATION
+from memmlp.motion.normalizer import Normalizer
+from memmlp.training.losses.loss import Fixed, Loss, Terms, joints
+
+
+def joint_norms(error: Tensor) -> Tensor:
+    """Return the L2 norm of each joint's 6D error, mean over frames and joints, for errors (..., 132)."""
+    return error.unflatten(-1, (N_JOINTS, 6)).norm(dim=-1).mean()
+
+
+def mean_square(error: Tensor) -> Tensor:
+    """Return the mean of the squared components of errors (..., 132)."""
+    return error.square().mean()
+
+
+ERRORS: dict[str, Callable[[Tensor], Tensor]] = {"norm": joint_norms, "square": mean_square}
+
+
+class AGRoLLoss(Loss):
+    """AGRoL's error of the 6D rotations, in network space, where the diffusion model's noise lies too.
+
+    Args:
+        error: "norm" as its released code trains both networks (`joint_norms`), or "square" for the mean
+            squared error that its paper can be read as (Du et al. 2023, L2).
+    """
+
+    def __init__(self, error: str = "norm"):
+        super().__init__()
+        self.error = ERRORS[error]
+        self.weighting = Fixed({"rotation": 1.0})
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
+        """Return the one term, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
+        origin = normalizer.origin(sparse)
+        error = normalizer.encode_motion(motion, origin) - normalizer.encode_motion(truth, origin)
+        return {"rotation": self.error(error[..., ROTATION])}
+
+
+def from_pelvis(positions: Tensor) -> Tensor:
+    """Return joint positions (..., 22, 3) relative to the pelvis."""
+    return positions - positions[..., ROOT : ROOT + 1, :]
+
+
+def from_origin(positions: Tensor) -> Tensor:
+    """Return joint positions (..., 22, 3) as they are, in the world."""
+    return positions
+
+
+ANCHORS: dict[str, Callable[[Tensor], Tensor]] = {"pelvis": from_pelvis, "head": from_origin}
+
+
+class AvatarPoserLoss(Loss):
+    """Mean absolute errors of root orientation, local rotations and joint positions (Jiang et al. 2022).
+
+    The positions follow by forward kinematics. The mean is over the 22 joints; its authors' is over the
+    fingers too, which move with the wrists.
+
+    Args:
+        orientation: weight of the root orientation's error; 0.02 in the released code, 0.05 in the paper.
+        rotation: weight of the local rotations' error.
+        position: weight of the positions' error.
+        anchor: the point at which predicted and true body are brought together: "pelvis" as in the released
+            code, which knows no translation, or "head", where the predicted head is put on its tracker.
+    """
+
+    def __init__(
+        self, orientation: float = 0.02, rotation: float = 1.0, position: float = 1.0, anchor: str = "pelvis"
+    ):
+        super().__init__()
+        weights = {"orientation": orientation, "rotation": rotation, "position": position}
+        self.weighting, self.anchored = Fixed(weights), ANCHORS[anchor]
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
+        """Return each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world."""
+        error = (motion - truth)[..., ROTATION].abs()
+        position = self.anchored(normalizer.pose(motion, sparse)) - self.anchored(joints(truth))
+        return {
+            "orientation": error[..., :6].mean(),
+            "rotation": error[..., 6:].mean(),
+            "position": position.abs().mean(),
+        }

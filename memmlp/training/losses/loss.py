@@ -1,0 +1,129 @@
+"""The interface of losses: terms by name, and how they are weighted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from memmlp.common.errors import InputError
+from memmlp.motion.body import N_JOINTS, POSITION
+from memmlp.motion.normalizer import Normalizer
+
+Terms = dict[str, Tensor]
+
+
+def joints(motion: Tensor) -> Tensor:
+    """Return the joint positions (B, T, 22, 3) of motion (B, T, 198)."""
+    return motion[..., POSITION].unflatten(-1, (N_JOINTS, 3))
+
+
+class Fixed(nn.Module):
+    """Fixed weights of the loss terms, by name."""
+
+    def __init__(self, values: Mapping[str, float]):
+        super().__init__()
+        self.values = values
+
+    def build(self, names: list[str], own: Mapping[str, float] | None = None) -> None:
+        """Take the weights of terms of one's own, by name; there is nothing to learn.
+
+        Raises:
+            InputError: for a term that has no weight.
+        """
+        self.values = {**(own or {}), **self.values}
+        if lacking := [name for name in names if name not in self.values]:
+            raise InputError(f"loss: term '{lacking[0]}' has no weight; allowed are {', '.join(self.values)}")
+
+    def parameter_groups(self) -> list[dict]:
+        """Return no parameters, since there is nothing to learn."""
+        return []
+
+    def forward(self, terms: Terms) -> Tensor:
+        """Return the weighted sum of the terms."""
+        return torch.stack([self.values[name] * term for name, term in terms.items()]).sum()
+
+    def weights(self) -> Mapping[str, float]:
+        """Return the weight of each term."""
+        return self.values
+
+
+class Manual(Fixed):
+    """Fixed weights of the paper's terms (reading 8); the defaults are from its grid search (Sec. 4.4)."""
+
+    def __init__(
+        self,
+        rotation: float = 1.0,
+        rotation_velocity: float = 30.0,
+        position: float = 0.5,
+        velocity: float = 0.1,
+        hand: float = 0.1,
+    ):
+        super().__init__(
+            {
+                "rotation": rotation,
+                "rotation_velocity": rotation_velocity,
+                "position": position,
+                "velocity": velocity,
+                "hand": hand,
+            }
+        )
+
+
+class Uncertainty(nn.Module):
+    """Weights by homoscedastic uncertainty (Kendall et al. 2018, reading 8): e^-s L + s with one s a term.
+
+    Args:
+        lr: learning rate of the s; with the model's own they would be too slow to settle.
+    """
+
+    def __init__(self, lr: float = 1e-2):
+        super().__init__()
+        self.lr = lr
+        self.s = nn.ParameterDict()
+
+    def build(self, names: list[str], own: Mapping[str, float] | None = None) -> None:
+        """Make a parameter s, starting at 0, for each term; `own` is of fixed weights, and not used."""
+        self.s = nn.ParameterDict({name: nn.Parameter(torch.zeros(())) for name in names})
+
+    def parameter_groups(self) -> list[dict]:
+        """Return the parameters s, with their own learning rate and without weight decay."""
+        return [{"params": list(self.s.values()), "lr": self.lr, "weight_decay": 0.0}]
+
+    def forward(self, terms: Terms) -> Tensor:
+        """Return the weighted sum of the terms."""
+        return torch.stack(
+            [(-self.s[name]).exp() * term + self.s[name] for name, term in terms.items()]
+        ).sum()
+
+    def weights(self) -> Mapping[str, float]:
+        """Return the present weight e^-s of each term."""
+        return {name: float((-s.detach()).exp()) for name, s in self.s.items()}
+
+
+Weighting = Fixed | Uncertainty
+
+
+class Loss(nn.Module):
+    """The interface of losses: terms by name, and their weighted sum."""
+
+    weighting: Weighting
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
+        """Return each term by name.
+
+        Args:
+            motion: predicted motion (B, T, 198), world.
+            truth: true motion (B, T, 198), world.
+            sparse: inputs (B, T, 54), world.
+            normalizer: converts between the world and network space.
+        """
+        raise NotImplementedError
+
+    def forward(
+        self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer
+    ) -> tuple[Tensor, Terms]:
+        """Return the loss and its unweighted terms; the arguments are those of `terms`."""
+        terms = self.terms(motion, truth, sparse, normalizer)
+        return self.weighting(terms), terms

@@ -1,0 +1,336 @@
+"""Packages of one's own: which are used, what they add, and that nothing is imported that nobody named."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+import yaml
+from own_package import EXAMPLE, PACKAGE, registers_kept
+
+from memmlp.cli.workers import split_executor
+from memmlp.common.errors import InputError
+from memmlp.config import plugins
+from memmlp.config.build import build_experiment, config_of
+from memmlp.config.build_motion import build_motion
+from memmlp.config.compose import composed
+from memmlp.config.plan_sweep import find_sweep
+from memmlp.config.schema import restored
+from memmlp.runs.environment import code_digest
+from memmlp.runs.identity import evaluation_id, evaluation_settings
+from memmlp.runs.run import Run
+from memmlp.search.spec import parse_search
+from memmlp.tables.table_text import heading
+
+OWN = [f"plugins=[{PACKAGE}]", "experiment=feet", "profile=tiny"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder on the path for modules of one's own."""
+    monkeypatch.syspath_prepend(tmp_path)
+    with registers_kept():
+        yield tmp_path
+
+
+def write(folder: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+
+
+@pytest.mark.parametrize("how", ["overrides", "environment", "entry point"])
+def test_a_package_is_used_where_somebody_names_it(on_path: Path, how: str, monkeypatch: pytest.MonkeyPatch):
+    if how == "environment":
+        monkeypatch.setenv("MEMMLP_PLUGINS", f" {PACKAGE},")
+    if how == "entry point":
+        entries = (EntryPoint("feet", PACKAGE, plugins.GROUP),)
+        monkeypatch.setattr(plugins.metadata, "entry_points", lambda group: entries if group else ())
+        plugins.installed.cache_clear()
+    try:
+        cfg = composed([*OWN[how != "overrides" :]])
+    finally:
+        plugins.installed.cache_clear()
+    assert (cfg.memory.name, cfg.term.name, list(cfg.evaluation.metrics)) == ("mean", "skate", ["FootSkate"])
+
+
+def test_nothing_is_there_of_a_package_that_nobody_names(on_path: Path):
+    with pytest.raises(InputError, match=r"memory=mean: no such option"):
+        composed(["memory=mean"])
+    assert PACKAGE not in sys.modules
+    with pytest.raises(InputError, match=r"evaluation.metrics=.*allowed is .*package of one's own"):
+        composed(["evaluation.metrics=[FootSkate]"])
+
+
+def test_keys_of_a_schema_of_ones_own_are_checked(on_path: Path):
+    with pytest.raises(InputError, match=r"memory.width=0: allowed is at least 1"):
+        composed([*OWN, "memory.width=0"])
+    with pytest.raises(InputError, match=r"memory.depth: no such key"):
+        composed([*OWN, "memory.depth=2"])
+    with pytest.raises(InputError, match=r"term.weight=-1.0: allowed is at least 0"):
+        composed([*OWN, "term.weight=-1"])
+
+
+def test_an_experiment_knows_packages_and_recipes(on_path: Path):
+    experiment = build_experiment(composed(OWN))
+    assert experiment.config["plugins"] == [PACKAGE]
+    recipes = experiment.identity("d").recipes
+    assert (recipes["memory.mean"], recipes["term.skate"]) == (1, 1)
+    before = experiment.identity("d").id
+    plugins.RECIPES["memory.mean"] = 2
+    assert experiment.identity("d").id != before
+    assert build_experiment(composed([])).config["plugins"] == []
+
+
+def test_naming_a_package_changes_no_run(on_path: Path):
+    plain = build_experiment(composed([])).identity("d").id
+    assert build_experiment(composed([f"plugins=[{PACKAGE}]"])).identity("d").id == plain
+
+
+def test_metrics_of_ones_own_make_another_evaluation(on_path: Path):
+    config = build_experiment(composed(OWN)).config
+    without = {**config, "evaluation": {**config["evaluation"], "metrics": []}}
+    assert evaluation_settings(config, "stream")["metrics"] == {"FootSkate": f"{PACKAGE}.metrics.foot_skate"}
+    assert "metrics" not in evaluation_settings(without, "stream")
+    before = evaluation_id(config, "stream")
+    assert before != evaluation_id(without, "stream")
+    plugins.RECIPES["metric.FootSkate"] = 2
+    assert evaluation_id(config, "stream") != before
+
+
+def test_the_weight_of_a_term_counts_where_it_is_not_learned(on_path: Path):
+    def ids(*words: str) -> set[str]:
+        weights = ("term.weight=0.1", "term.weight=0.2")
+        return {build_experiment(composed([*OWN, *words, word])).identity("d").id for word in weights}
+
+    assert len(ids("loss=manual")) == 2
+    assert len(ids("loss=uncertainty")) == 1
+
+
+def test_a_loss_has_the_term_with_its_weight(on_path: Path):
+    branches = frozenset({"rotation", "position"})
+    manual = build_experiment(composed([*OWN, "loss=manual", "term.weight=0.7"])).training.loss(branches)
+    learned = build_experiment(composed([*OWN, "loss=uncertainty"])).training.loss(branches)
+    assert manual.weighting.weights()["skate"] == 0.7
+    assert learned.weighting.weights()["skate"] == 1.0
+    assert len(learned.weighting.parameter_groups()[0]["params"]) == 6
+    whole = composed([*OWN, "predictor=rotation_only", "hand=off", "loss=agrol", "evaluation.ik=off"])
+    with pytest.raises(InputError, match=r"term=skate: loss=agrol is"):
+        build_experiment(whole)
+    with pytest.raises(InputError, match=r"term: AGRoLMLP has none"):
+        composed([f"plugins=[{PACKAGE}]", "model=agrol_mlp", "term=skate"])
+
+
+def test_a_memory_that_cannot_be_streamed_is_exported_as_it_was_trained(on_path: Path):
+    from memmlp.deploy.deployment import GRAPHS
+    from memmlp.motion.normalizer import Normalizer
+
+    architecture = build_experiment(composed(OWN)).architecture
+    model = architecture.build(Normalizer.raw(architecture.coordinates, torch.zeros(22, 3)), None).eval()
+    assert GRAPHS["auto"](model) is model
+    with pytest.raises(InputError, match=r"export.graph=streaming: parts of one's own have none|own"):
+        GRAPHS["streaming"](model)
+
+
+def test_metrics_of_ones_own_are_those_of_sweeps_and_searches(on_path: Path):
+    sweep = find_sweep(str(EXAMPLE / "feet.yaml"), ["profile=tiny"])
+    assert (sweep.metrics, sweep.smallest["FootSkate"]) == (("MPJPE", "FootSkate"), 0.5)
+    assert heading("FootSkate") == "FootSkate [cm/s] ↓"
+    plugins.HIGHER.add("FootSkate")
+    assert heading("FootSkate") == "FootSkate [cm/s] ↑"
+    content = yaml.safe_load((Path(__file__).parents[2] / "conf/search/loss_weights.yaml").read_text())
+    with pytest.raises(InputError, match=r"of FootSkate more is better"):
+        parse_search({"storage": None, **content, "objectives": ["FootSkate"]})
+    plugins.HIGHER.clear()
+    assert parse_search({"storage": None, **content, "objectives": ["FootSkate"]}).objectives
+
+
+def test_a_metric_is_measured_in_both_branches(on_path: Path):
+    from tiny import frames, model
+
+    from memmlp.evaluation.metrics import OwnMetric
+    from memmlp.evaluation.modes import evaluate, quick_stream
+
+    def mean(predicted: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+        return predicted.mean()
+
+    own = {"Mean": OwnMetric(mean, "positions"), "Turn": OwnMetric(mean, "rotations")}
+    report = evaluate(model(), frames(), ["stream"], 4, own=own)["mean"]["stream"]
+    assert {"Mean", "Turn"} <= report["rotation"].keys()
+    assert "Mean" in report["position"]
+    assert "Turn" not in report["position"]
+    assert {"rotation Mean", "position Mean"} <= quick_stream(model(), frames().clips(), own).keys()
+    with pytest.raises(InputError, match=r"metric Mean: returned no number"):
+        evaluate(model(), frames(), ["stream"], 4, own={"Mean": OwnMetric(lambda p, t: p, "positions")})
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("raise RuntimeError('no')", "plugin mine: cannot be imported: RuntimeError: no"),
+        ("import nothing_here", "plugin mine: cannot be imported: No module named 'nothing_here'"),
+        (
+            "P(metrics={'MPJPE': M('mine.f', 'cm', 1)})",
+            "plugin mine: metric MPJPE: there is one of that name",
+        ),
+        ("P(metrics={'a b': M('mine.f', 'cm', 1)})", "plugin mine: metric 'a b': allowed is a word"),
+        ("P(metrics={'A': M('mine.f', 'cm', 0)})", "plugin mine: metric A: smallest=0; allowed"),
+        ("P(metrics={'A': M('mine.f', '', 1, 'more')})", "metric A: better=more; allowed is lower or higher"),
+        ("P(recipes={'memory.gru': 2})", "plugin mine: recipe of memory.gru: there is a component"),
+        ("P(recipes={'memory.a': 0})", "plugin mine: recipe of memory.a: 0; allowed"),
+        ("P(schemas={'memory_gru': 'mine.X'})", "plugin mine: schema of memory_gru: mine.X"),
+        ("P(schemas={'memory_a': 'mine.M'})", "allowed is a dataclass that extends MemoryConfig"),
+    ],
+)
+def test_what_a_package_tells_is_checked(folder: Path, text: str, line: str):
+    head = "from memmlp.common.plugin import Metric as M, Plugin as P\n"
+    write(folder, {"mine.py": f"{head}{'plugin = ' if text.startswith('P') else ''}{text}\n"})
+    with pytest.raises(InputError) as error:
+        composed(["plugins=[mine]"])
+    assert line in str(error.value)
+    assert "mine" not in plugins.active()
+
+
+def test_names_that_are_no_packages(folder: Path):
+    for name, line in (("nowhere_at_all", "there is no such package here"), ("memmlp.cli", "allowed is")):
+        with pytest.raises(InputError, match=line):
+            composed([f"plugins=[{name}]"])
+
+
+def test_an_option_hides_no_other(folder: Path):
+    write(folder, {"mine/__init__.py": "", "mine/conf/memory/gru.yaml": "name: gru"})
+    with pytest.raises(InputError, match=r"gru.yaml: there is an option of that name"):
+        composed(["plugins=[mine]"])
+
+
+def test_a_config_file_names_a_package_too_late(folder: Path):
+    write(folder, {"mine.py": "", "conf/experiment/own.yaml": "# @package _global_\nplugins: [mine]"})
+    with pytest.raises(InputError, match=r"plugins=\[mine\]: a config file tells it too late"):
+        composed(["--config-dir", str(folder / "conf"), "experiment=own"])
+
+
+def test_a_folder_of_configs_is_searched_while_a_command_runs(folder: Path):
+    write(folder, {"conf/experiment/own.yaml": "# @package _global_\nseed: 7"})
+    with plugins.searching(folder / "conf"):
+        assert composed(["experiment=own"]).seed == 7
+        assert plugins.words() == ["--config-dir", str(folder / "conf")]
+        assert any("own.yaml" in name for name, _ in plugins.texts())
+    with pytest.raises(InputError, match=r"experiment=own: no such option"):
+        composed(["experiment=own"])
+
+
+def test_coordinates_of_ones_own(folder: Path):
+    write(folder, {"mine.py": "from memmlp.motion.coordinates import World\nclass Floor(World): pass\n"})
+    experiment = build_experiment(composed(["frame.coordinates=mine.Floor"]))
+    assert type(experiment.architecture.coordinates).__name__ == "Floor"
+    assert experiment.config["plugins"] == ["mine"]
+    assert experiment.identity("d").id != build_experiment(composed([])).identity("d").id
+    for word, line in (("mine.Gone", "mine.Gone"), ("pathlib.Path", "extends"), ("sideways", "allowed is")):
+        with pytest.raises(InputError, match=line):
+            build_experiment(composed([f"frame.coordinates={word}"]))
+
+
+WALKS = """
+from dataclasses import dataclass, field
+from memmlp.common.plugin import Plugin
+from memmlp.config.schema.data import SynthConfig, SynthDataConfig
+from memmlp.config.schema.rules import target
+
+def walks(folder, minutes, seed):
+    (folder / f"{minutes} {seed}").touch()
+
+@dataclass
+class Walks(SynthConfig):
+    _target_: str = target("mine.walks")
+
+@dataclass
+class WalksConfig(SynthDataConfig):
+    synth: Walks = field(default_factory=Walks)
+
+plugin = Plugin(schemas={"data_walks": "mine.WalksConfig"})
+"""
+WALKS_YAML = """
+defaults: [synth, /schema/data_walks@_here_, _self_]
+name: walks
+root: made
+synth: {_target_: mine.walks, minutes: 1, seed: 0}
+"""
+
+
+def test_a_data_source_of_ones_own(folder: Path):
+    write(folder, {"mine/__init__.py": WALKS, "mine/conf/data/walks.yaml": WALKS_YAML})
+    cfg = composed(["plugins=[mine]", "data=walks", "data.synth.minutes=2", "data.synth.seed=3"])
+    source = build_motion(cfg)
+    assert source.source.root == Path("made/minutes2.0-seed3")
+    source.generate(folder)
+    assert (folder / "2.0 3").exists()
+    config = build_experiment(cfg).config
+    assert config["plugins"] == ["mine"]
+    assert restored(config).data == cfg.data
+
+
+def test_an_executor_of_ones_own(folder: Path):
+    from memmlp.cli.workers import Workers, executor
+
+    write(folder, {"mine.py": "class Mine:\n    def __init__(self, *given):\n        self.given = given\n"})
+    engine, words, rest = split_executor(["executor=mine.Mine", "executor.queue=long", "seed=1"])
+    assert (engine, words, rest) == ("mine.Mine", {"queue": "long"}, ("seed=1",))
+    made = executor(Workers(engine, words), folder, [], gpus=False)
+    assert made.given == (folder / "workers/%j", {"queue": "long"})  # type: ignore[attr-defined]
+    with pytest.raises(InputError, match=r"executor.queue: goes with a class of your own"):
+        split_executor(["executor.queue=long"])
+
+
+def recorded(config: dict, version: str | None = None) -> Run:
+    """What a finished run tells, as far as `config_of` asks."""
+    manifest = {"kind": "memmlp", "plugins": {PACKAGE: {"version": version, "digest": "d"}}}
+    return SimpleNamespace(id="abc", done=True, manifest=manifest, config=config, config_path="c")  # type: ignore[return-value]
+
+
+def test_reading_a_run_imports_nothing_by_itself(on_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with registers_kept():
+        config = build_experiment(composed(OWN)).config
+    assert PACKAGE not in sys.modules
+    with pytest.raises(InputError) as error:
+        config_of(recorded(config, "0.1.0"))
+    assert str(error.value) == (
+        f"run abc: names code of the package {PACKAGE} 0.1.0; to trust it, say --plugins {PACKAGE} or "
+        f"MEMMLP_PLUGINS={PACKAGE}"
+    )
+    assert PACKAGE not in sys.modules
+    monkeypatch.setattr(sys, "path", [one for one in sys.path if one != str(on_path)])
+    with pytest.raises(InputError, match=rf"made with the package {PACKAGE} 0.1.0, which is not here"):
+        config_of(recorded(config, "0.1.0"))
+
+
+def test_a_run_is_read_again_once_its_package_is_named(on_path: Path):
+    with registers_kept():
+        config = build_experiment(composed(OWN)).config
+    read = config_of(recorded(config), [f"plugins=[{PACKAGE}]"])
+    assert build_experiment(read).identity("d").id == build_experiment(composed(OWN)).identity("d").id
+
+
+@pytest.mark.parametrize(
+    "path", ["os.system", "memmlp_feet.memory.nn.Linear", "memmlp_feet.losses.Gone", "other.Mean"]
+)
+def test_a_record_cannot_reach_beyond_the_package(on_path: Path, path: str):
+    config = build_experiment(composed(OWN)).config
+    forged = {**config, "memory": {**config["memory"], "_target_": path}}
+    with pytest.raises(InputError, match=rf"run abc: .*{path.split('.')[0]}|{path}"):
+        config_of(recorded(forged))
+
+
+def test_code_that_changed_since_is_told(folder: Path):
+    write(folder, {"mine.py": "A = 1\n"})
+    plugins.activate(["mine"])
+    run = Run(folder / "run")
+    run.begin("memmlp", {}, data="d", upstream=None, plugins={"mine": {"version": None, "digest": "d"}})
+    assert run.manifest["sources"]["mine:mine.py"] == code_digest("A = 1")
+    assert run.changed_sources == []
+    write(folder, {"mine.py": "A = 2\n"})
+    assert run.changed_sources == ["mine:mine.py"]

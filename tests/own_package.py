@@ -1,0 +1,45 @@
+"""The example package of docs/examples, in use for a test, and everything as it was before afterwards."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from memmlp.common.plugin import METRICS
+from memmlp.config import plugins
+from memmlp.config.schema import SCHEMAS
+from memmlp.evaluation.units import HIGHER, SMALLEST, UNITS
+from memmlp.runs.recipes import RECIPES
+
+EXAMPLE = Path(__file__).parent.parent / "docs/examples/feet"
+PACKAGE = "memmlp_feet"
+REGISTERS = (METRICS, SCHEMAS, SMALLEST, UNITS, RECIPES, HIGHER, plugins._active, plugins._folders)
+
+
+@contextmanager
+def registers_kept() -> Iterator[None]:
+    """What packages of one's own add is taken away again, and their modules are forgotten."""
+    before = [one.copy() for one in REGISTERS]
+    modules = set(sys.modules)
+    try:
+        yield
+    finally:
+        for one, content in zip(REGISTERS, before, strict=True):
+            one.clear()
+            one.update(content)  # type: ignore[arg-type]
+        for name in set(sys.modules) - modules:
+            if name.split(".")[0] in (PACKAGE, "mine", "other"):
+                del sys.modules[name]
+
+
+@pytest.fixture
+def on_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The example package on the path of this process and of those that it starts; not in use yet."""
+    monkeypatch.syspath_prepend(EXAMPLE)
+    monkeypatch.setenv("PYTHONPATH", str(EXAMPLE), prepend=":")
+    with registers_kept():
+        yield EXAMPLE

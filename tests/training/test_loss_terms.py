@@ -1,0 +1,147 @@
+"""The library of loss terms, computed independently, in NumPy and joint by joint."""
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from plain_body import posed
+
+from memmlp.common.errors import InputError
+from memmlp.motion.body import ROTATION, SPARSE_DIM, SPARSE_POSITION
+from memmlp.motion.coordinates import World
+from memmlp.motion.geometry import axis_angle_to_matrix, matrix_to_sixd
+from memmlp.training.losses import TermsLoss
+from memmlp.training.losses.terms import ERRORS, TERMS
+
+TRUE = torch.stack([tiny.clip(9, 3), tiny.clip(9, 4)])
+MADE = torch.stack([tiny.clip(9, 1), tiny.clip(9, 2)])[..., SPARSE_DIM:]
+NORMALIZER = tiny.normalizer(World())
+
+
+def terms(motion=MADE, truth=TRUE, error="absolute", **weights) -> dict[str, float]:
+    loss = TermsLoss(error, **(weights or dict.fromkeys(TERMS, 1.0)))
+    found = loss.terms(motion, truth[..., SPARSE_DIM:], truth[..., :SPARSE_DIM], NORMALIZER)
+    return {name: float(term) for name, term in found.items()}
+
+
+@pytest.fixture(scope="module")
+def bodies() -> tuple[np.ndarray, np.ndarray]:
+    """Predicted joints (2, 9, 22, 3) with the head on its tracker, and true ones."""
+    made = np.zeros((2, 9, 22, 3))
+    for b, t in np.ndindex(2, 9):
+        rooted = posed(MADE[b, t, ROTATION].numpy())
+        made[b, t] = rooted + TRUE[b, t, SPARSE_POSITION][:3].numpy() - rooted[15]
+    return made, TRUE[..., SPARSE_DIM:][..., ROTATION.stop :].unflatten(-1, (22, 3)).double().numpy()
+
+
+def test_terms_of_positions(bodies):
+    made, true = bodies
+    found, error = terms(), made - true
+    rooted = (made - made[..., :1, :]) - (true - true[..., :1, :])
+    expected = {
+        "position": np.abs(rooted).mean(),
+        "world_position": np.abs(error).mean(),
+        "hand": np.abs(error[..., [20, 21], :]).mean(),
+        "velocity": np.abs(error[:, 1:] - error[:, :-1]).mean(),
+        "velocity_3": np.abs(error[:, [3, 6]] - error[:, [0, 3]]).mean(),
+        "velocity_5": np.abs(error[:, 5] - error[:, 0]).mean(),
+        "acceleration": np.abs(error[:, 2:] - 2 * error[:, 1:-1] + error[:, :-2]).mean(),
+        "jerk": np.linalg.norm(np.diff(made, 3, axis=1), axis=-1).mean(),
+    }
+    assert {name: found[name] for name in expected} == pytest.approx(expected, rel=1e-3)
+
+
+def test_terms_of_feet(bodies):
+    """Foot by foot and frame by frame; the true feet stand in some frames and not in others."""
+    made, true = bodies
+    truth = TRUE.clone()
+    feet = truth[..., SPARSE_DIM + ROTATION.stop :].unflatten(-1, (22, 3))
+    feet[0, 3:6, [7, 10]] = feet[0, 3:4, [7, 10]]
+    truth = torch.cat([truth[..., : SPARSE_DIM + ROTATION.stop], feet.flatten(-2)], -1)
+    true = feet.double().numpy()
+    slides, heights, depths, standing = [], [], [], 0
+    for b in range(2):
+        floor = true[b, ..., 2].min()
+        depths += [max(floor - made[b, t, :, 2].min(), 0) for t in range(9)]
+        for t in range(1, 9):
+            for joint in (7, 8, 10, 11):
+                stands = np.linalg.norm(true[b, t, joint] - true[b, t - 1, joint]) <= 0.01
+                standing += stands
+                slides.append(np.abs(made[b, t, joint] - made[b, t - 1, joint]) * stands)
+                if joint > 9:
+                    heights.append(abs(made[b, t, joint, 2] - floor) * stands)
+    assert 0 < standing < 64
+    expected = {"contact": np.mean(slides), "foot_height": np.mean(heights), "penetration": np.mean(depths)}
+    found = terms(truth=truth)
+    assert {name: found[name] for name in expected} == pytest.approx(expected, rel=1e-3)
+    assert expected["penetration"] > 0
+
+
+def test_terms_of_rotations():
+    """A body whose every joint is turned by the same small angle about its own axis, frame by frame more."""
+    turn = axis_angle_to_matrix(
+        torch.tensor([0.0, 0.0, 0.1]).expand(1, 4, 22, 3) * torch.arange(4)[:, None, None]
+    )
+    still = torch.eye(3).expand(1, 4, 22, 3, 3)
+    rest = torch.zeros(1, 4, 66)
+    made, true = (torch.cat([matrix_to_sixd(r).flatten(-2), rest], -1) for r in (turn, still))
+    truth = torch.cat([torch.zeros(1, 4, SPARSE_DIM), true], -1)
+    chosen = ("orientation", "rotation", "sixd_velocity", "turn", "angle", "global_rotation")
+    found = terms(made, truth, **dict.fromkeys(chosen, 1.0))
+    angles = 0.1 * np.arange(4)
+    sixd = (2 * np.abs(np.cos(angles) - 1) + 2 * np.abs(np.sin(angles))) / 6
+    step = (2 * (1 - np.cos(0.1)) + 2 * np.sin(0.1)) / 6
+    depth = np.array([1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5, 5, 5, 5, 5, 6, 6, 6, 7, 7, 8, 8])
+    assert found["orientation"] == pytest.approx(sixd.mean(), rel=1e-4)
+    assert found["rotation"] == pytest.approx(sixd.mean(), rel=1e-4)
+    assert found["turn"] == pytest.approx(step, rel=1e-4)
+    assert found["angle"] == pytest.approx(np.mean(angles[:, None] * depth), rel=1e-4)
+    parts = np.stack([np.cos(angles), np.sin(angles)])
+    assert found["sixd_velocity"] == pytest.approx(2 * np.abs(np.diff(parts)).sum(0).mean() / 6, rel=1e-4)
+    whole = angles[:, None] * depth
+    both = (2 * np.abs(np.cos(whole) - 1) + 2 * np.abs(np.sin(whole))) / 6
+    assert found["global_rotation"] == pytest.approx(both.mean(), rel=1e-4)
+
+
+def test_errors_are_of_components_or_of_joints(bodies):
+    made, true = bodies
+    error = made - true
+    expected = {
+        "absolute": np.abs(error).mean(),
+        "square": (error**2).mean(),
+        "norm": np.linalg.norm(error, axis=-1).mean(),
+        "smooth": np.where(np.abs(error) < 1, error**2 / 2, np.abs(error) - 0.5).mean(),
+    }
+    found = {name: terms(error=name, world_position=1.0)["world_position"] for name in ERRORS}
+    assert found == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_weight_of_none_leaves_a_term_out_and_the_others_are_summed():
+    loss = TermsLoss(rotation=2.0, jerk=None, hand=0.5)
+    total, parts = loss(MADE, TRUE[..., SPARSE_DIM:], TRUE[..., :SPARSE_DIM], NORMALIZER)
+    assert list(parts) == ["rotation", "hand"]
+    assert float(total) == pytest.approx(2 * float(parts["rotation"]) + 0.5 * float(parts["hand"]))
+    with pytest.raises(InputError, match="no term has a weight"):
+        TermsLoss(rotation=None)
+
+
+@pytest.mark.parametrize("name", TERMS)
+def test_a_term_of_too_few_frames_is_refused_and_no_number_that_is_none(name):
+    """Of one frame alone the mean of velocities would be NaN; with as many frames as told it is a number."""
+    needed = TERMS[name][1]
+    assert np.isfinite(terms(MADE[:, :needed], TRUE[:, :needed], **{name: 1.0})[name])
+    if needed > 1:
+        with pytest.raises(InputError, match=rf"loss\.{name}: needs {needed} frames"):
+            terms(MADE[:, : needed - 1], TRUE[:, : needed - 1], **{name: 1.0})
+
+
+@pytest.mark.parametrize("name", TERMS)
+def test_every_term_reaches_the_rotations(name):
+    motion = MADE.clone().requires_grad_()
+    loss = TermsLoss(**{name: 1.0})
+    truth = TRUE.clone()
+    feet = SPARSE_DIM + ROTATION.stop
+    truth[:, :, feet:] = truth[:, :1, feet:]  # all feet stand
+    loss(motion, truth[..., SPARSE_DIM:], truth[..., :SPARSE_DIM], NORMALIZER)[0].backward()
+    assert torch.isfinite(motion.grad).all()
+    assert float(motion.grad[..., ROTATION].abs().sum()) > 0
