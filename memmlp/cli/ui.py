@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import outputs_option
+from memmlp.cli.options import outputs_option, plugins_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 )
 @click.option("--token", help="The token at another address.  [default: a new one, which is printed]")
 @click.option("--no-browser", is_flag=True, help="Print the page's address, and open no browser.")
+@plugins_option
 @outputs_option
 def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path) -> None:
     """Show runs, sweeps and searches on a page of this machine, which follows them while they go on.

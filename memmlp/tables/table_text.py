@@ -60,11 +60,10 @@ def grids(table: Table) -> list[Grid]:
 
 def heading(metric: str) -> str:
     """Return a metric's name with its unit and the direction that is better."""
-    words = (
-        metric,
-        f"[{unit(metric)}]" if unit(metric) else "",
-        "↑" if metric == "FPS" or metric in HIGHER else "↓",
-    )
+    # Of a metric of one's own whose package is not in use, nobody knows here what is better.
+    known = metric in UNITS or metric in COST_UNITS
+    better = "↑" if metric == "FPS" or metric in HIGHER else "↓"
+    words = (metric, f"[{unit(metric)}]" if unit(metric) else "", better if known else "")
     return " ".join(word for word in words if word)
 
 
