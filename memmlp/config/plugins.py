@@ -12,6 +12,7 @@ import importlib
 import importlib.util
 import os
 import re
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -149,7 +150,7 @@ def _add_schemas(name: str, plugin: Plugin) -> None:
 
 def _imported(name: str) -> ModuleType:
     """Import the package. Raises InputError where there is none, or it raises something itself."""
-    if not NAME.fullmatch(name) or name.split(".")[0] == "memmlp":
+    if not NAME.fullmatch(name) or _reserved(name):
         raise InputError(f"plugins: '{name}'; allowed is the name of a package of your own")
     try:
         return importlib.import_module(name)
@@ -162,6 +163,11 @@ def _imported(name: str) -> ModuleType:
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
         raise InputError(f"plugin {name}: cannot be imported: {reason}") from error
+
+
+def _reserved(name: str) -> bool:
+    """Return whether a name is memmlp's or the standard library's, such as os."""
+    return name.split(".")[0] in ("memmlp", *sys.stdlib_module_names)
 
 
 def _folder(module: ModuleType, plugin: Plugin) -> Path:
@@ -225,6 +231,9 @@ def check_allowed(config: Mapping[str, Any], recorded: Mapping[str, Any], where:
     Raises:
         InputError: one line that names the package, and what to do.
     """
+    for path in foreign(config):
+        if _reserved(path):
+            raise InputError(f"{where}: {path}: allowed is what memmlp or a package of your own defines")
     named_here = [*(config.get(KEY) or ()), *map(owner, foreign(config))]
     for name in dict.fromkeys(named_here):
         if name not in _active:

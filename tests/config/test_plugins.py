@@ -198,7 +198,11 @@ def test_what_a_package_tells_is_checked(folder: Path, text: str, line: str):
 
 
 def test_names_that_are_no_packages(folder: Path):
-    for name, line in (("nowhere_at_all", "there is no such package here"), ("memmlp.cli", "allowed is")):
+    for name, line in (
+        ("nowhere_at_all", "there is no such package here"),
+        ("memmlp.cli", "allowed is"),
+        ("os", "allowed is"),
+    ):
         with pytest.raises(InputError, match=line):
             composed([f"plugins=[{name}]"])
 
@@ -319,7 +323,7 @@ def test_a_run_is_read_again_once_its_package_is_named(on_path: Path):
 @pytest.mark.parametrize(
     ("path", "line"),
     [
-        ("os.system", "run abc: names code of the package os"),
+        ("os.system", "run abc: os.system: allowed is what memmlp or a package of your own defines"),
         ("other.Mean", "run abc: made with the package other, which is not here"),
         ("memmlp_feet.memory.nn.Linear", "nn.Linear: allowed is what memmlp_feet defines itself"),
         ("memmlp_feet.losses.Gone", "memmlp_feet.losses.Gone"),
