@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import command_line
+import exported
 import processes
 import pytest
 from filelock import FileLock
@@ -96,21 +97,42 @@ def _no_process_is_left() -> Iterator[None]:
     processes.end_all()
 
 
+def shared(factory: pytest.TempPathFactory, name: str) -> Path:
+    """Return a folder that all test processes share."""
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
 @pytest.fixture(scope="session")
 def tiny_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with one finished run, int8 included, and what it printed; made once for all processes.
 
     It is only read: what writes takes a copy (`home`).
     """
-    base = tmp_path_factory.getbasetemp()
-    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "tiny"
-    folder.mkdir(exist_ok=True)
+    folder = shared(tmp_path_factory, "tiny")
     said = folder / "out.txt"
     with FileLock(f"{folder}.lock"), pytest.MonkeyPatch.context() as monkeypatch:
         clean(monkeypatch)
         if not said.exists():
             said.write_text(command_line.run(folder, "train", *command_line.TINY, INT8))
     return folder
+
+
+@pytest.fixture(scope="session")
+def step_files(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The files of streaming steps by the name of the network (tests/exported.py), each exported once."""
+    folder = shared(tmp_path_factory, "steps")
+
+    def step_file(name: str) -> Path:
+        path = folder / f"{name}.onnx"
+        with FileLock(f"{path}.lock"):
+            if not path.exists():
+                exported.write(name, path)
+        return path
+
+    return step_file
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import json
 import math
 from pathlib import Path
 
+import exported
 import numpy as np
 import onnx
 import pytest
@@ -68,8 +69,9 @@ def weights(graph: onnx.ModelProto) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("network", ["mem_mlp", *tiny.BASELINES])
-def test_inner_layers_are_int8_and_the_ends_are_not(pair, tmp_path, network):
-    _, quantised = pair if network == "mem_mlp" else files(tmp_path, tiny.baseline(network))
+def test_inner_layers_are_int8_and_the_ends_are_not(step_files, tmp_path, network):
+    quantised, stream = tmp_path / "int8.onnx", streaming(exported.NETWORKS[network]())
+    quantise(step_files(network), quantised, stream.ends, CLIPS)
     kinds = weights(onnx.load(quantised))
     inner = [kind for name, kind in kinds.items() if ".blocks." in name or ".layers." in name]
     assert inner

@@ -65,7 +65,7 @@ def test_it_is_the_stream(name, network, folder: Path):
 
 @pytest.mark.parametrize("name", tiny.BASELINES)
 def test_baselines_have_it_too(name, tmp_path: Path):
-    network = tiny.baseline(name)
+    network = tiny.baseline(name, depth=1)
     export_full(network, tmp_path / "full.onnx", RUN, "unity")
     assert full_parity(network, tmp_path / "full.onnx", PERSON.frames, "unity") <= TOLERANCE
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 
+import exported
 import pytest
 import tiny
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from memmlp.common.errors import InputError
-from memmlp.deploy.export import export
 from memmlp.deploy.parity import parity
 from memmlp.deploy.session import OnnxStream
 from memmlp.motion.body import SPARSE_DIM
@@ -99,18 +99,9 @@ def test_what_has_no_stream_is_refused():
         streaming(tiny.model(CodeMemory, history="latest"))
 
 
-NETWORKS = {
-    "codes": partial(tiny.model, CodeMemory, coordinates=Heading()),
-    "lstm": partial(tiny.model, LSTMMemory, coordinates=Heading()),
-    **{name: partial(tiny.baseline, name) for name in tiny.BASELINES},
-}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("network", NETWORKS)
-def test_its_file_is_the_network_in_onnx_runtime(tmp_path: Path, network):
-    model = NETWORKS[network]()
-    path = tmp_path / "stream.onnx"
-    export(streaming(model), path, "0123456789abcdef")
-    assert parity(model, path, tiny.clip(40)) < 1e-4
+@pytest.mark.parametrize("network", exported.NETWORKS)
+def test_its_file_is_the_network_in_onnx_runtime(step_files: Callable[[str], Path], network: str):
+    path = step_files(network)
+    assert parity(exported.NETWORKS[network](), path, tiny.clip(40)) < 1e-4
     assert "state.count" in OnnxStream(path).state

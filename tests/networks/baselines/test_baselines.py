@@ -1,11 +1,9 @@
-"""What every baseline keeps to: streams, windows, joints, export."""
+"""What every baseline keeps to: streams, windows, joints."""
 
 import pytest
 import tiny
 import torch
 
-from memmlp.deploy.export import export
-from memmlp.deploy.parity import TOLERANCE, parity
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM
 from memmlp.motion.coordinates import Heading
@@ -68,15 +66,6 @@ def test_positions_are_forward_kinematics_of_the_rotations(name):
     motion = evaluation.stream(model, [CLIP])[0]
     expected = model.normalizer.pose(motion, CLIP[:, :SPARSE_DIM]).flatten(1)
     torch.testing.assert_close(motion[:, ROTATION.stop :], expected, atol=1e-5, rtol=0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
-def test_torch_and_onnx_agree_on_a_whole_clip(name, tmp_path):
-    """Relative to the heading, which makes the larger graph; in the world in the command below."""
-    model = tiny.baseline(name, Heading())
-    export(model, tmp_path / "step.onnx", "0" * 16)
-    assert parity(model, tmp_path / "step.onnx", CLIP) <= TOLERANCE
 
 
 KNOBS = [

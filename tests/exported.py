@@ -1,0 +1,29 @@
+"""The tiny networks whose streaming step several tests look at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import tiny
+
+from memmlp.motion.coordinates import Heading
+from memmlp.networks.memory import CodeMemory, LSTMMemory
+from memmlp.networks.window_model import WindowModel
+
+NETWORKS: dict[str, Callable[[], WindowModel]] = {
+    "mem_mlp": partial(tiny.model, CodeMemory, coordinates=Heading()),
+    "lstm": partial(tiny.model, LSTMMemory, coordinates=Heading()),
+    **{name: partial(tiny.baseline, name, Heading()) for name in tiny.BASELINES},
+}
+"""By name. Relative to the heading, which makes the larger graph."""
+
+
+def write(name: str, path: Path) -> None:
+    """Export a network's streaming step."""
+    # Imported here, since they take seconds to import and most test files need neither.
+    from memmlp.deploy.export import export
+    from memmlp.networks.streaming import streaming
+
+    export(streaming(NETWORKS[name]()), path, "0123456789abcdef")
