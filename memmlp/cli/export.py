@@ -72,6 +72,7 @@ def export(
 ) -> None:
     """Export a finished run (id, its beginning, or folder) as ONNX and check it on whole test clips."""
     from memmlp.common.errors import InputError
+    from memmlp.common.progress import tell
     from memmlp.config.open_run import open_run
     from memmlp.deploy.deployment import GRAPHS
     from memmlp.networks.streaming import StreamingGraph
@@ -89,6 +90,7 @@ def export(
     network = GRAPHS[graph](model)
     test = data.open("test").clips()
     if precision == "fp32":
+        tell(f"export: write {out}, and compare it with torch on {len(test[: clips or None])} test clips")
         write_exact(
             model,
             network,
@@ -98,6 +100,7 @@ def export(
             full=space or "amass" if scope == "full" else None,
         )
     elif scope == "network" and isinstance(network, StreamingGraph):
+        tell(f"export: write {out} in int8, and measure what that costs on {len(test)} test clips")
         write_int8(network, out, found.id, data.open("train").clips(), test, max_growth / 100)
     else:
         raise InputError("--precision int8: allowed with --scope network and a streaming graph")

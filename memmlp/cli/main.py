@@ -15,6 +15,7 @@ import click
 import memmlp
 from memmlp.common import parallel
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
+from memmlp.common.progress import telling
 
 
 class Command(NamedTuple):
@@ -124,7 +125,8 @@ def _run(arguments: list[str]) -> None:
     if arguments[:1] in (["-sc"], ["--shell-completion"]):
         _complete(arguments)
     else:
-        commands.main(arguments, prog_name="memmlp", standalone_mode=False)
+        with telling():
+            commands.main(arguments, prog_name="memmlp", standalone_mode=False)
 
 
 def _exit_code(error: Exception) -> int | None:
@@ -146,7 +148,8 @@ def _line(error: Exception) -> str:
         path = error.ctx.command_path if error.ctx else "memmlp"
         return f"{error.format_message()} (see {path} --help)"
     if isinstance(error, OSError):
-        return f"{error.filename or 'a file'}: {error.strerror}"
+        reason = "no such file or folder" if error.errno == errno.ENOENT else error.strerror
+        return f"{error.filename or 'a file'}: {reason}"
     return error.format_message() if isinstance(error, click.ClickException) else str(error)
 
 

@@ -1,36 +1,33 @@
-"""Progress bars that show the time left, silent where stderr is no terminal; lines that say what begins."""
+"""What is said of work that takes long: bars with the time left on a terminal, elsewhere lines for a log."""
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
 
 T = TypeVar("T")
 
-_SAY: ContextVar[Callable[[str], None] | None] = ContextVar("what is told of stages", default=None)
+EVERY = 30.0  # seconds between two lines about how far the same work is
+
+_SAY: ContextVar[Callable[[str], None] | None] = ContextVar("what is told of work", default=None)
 
 
-def stage_begins(line: str) -> None:
-    """Say in a line what begins now, where somebody listens (`telling_stages`)."""
-    if say := _SAY.get():
-        say(line)
+def to_log(line: str) -> None:
+    """Write a line to stderr, unless that is a terminal, which has the bars."""
+    if not sys.stderr.isatty():
+        print(line, file=sys.stderr, flush=True)
 
 
 @contextmanager
-def telling_stages(say: Callable[[str], None]) -> Iterator[None]:
-    """Hand the lines of stages that begin in this context to `say`."""
+def telling(say: Callable[[str], None] = to_log) -> Iterator[None]:
+    """Hand the lines about work in this context to `say`: what begins, and now and then how far it is."""
     token = _SAY.set(say)
     try:
         yield
@@ -38,23 +35,78 @@ def telling_stages(say: Callable[[str], None]) -> Iterator[None]:
         _SAY.reset(token)
 
 
-def progress(shown: bool = True) -> Progress:
-    """Make a progress display on stderr: description, bar, count, elapsed time, time left, and a note.
+def tell(line: str) -> None:
+    """Say a line about the work, such as what begins now, where somebody listens (`telling`)."""
+    if say := _SAY.get():
+        say(line)
 
-    It is hidden where stderr is no terminal, or it is not to be `shown`.
+
+class Count:
+    """How much of some work is done.
+
+    A terminal shows it as a bar; who listens (`telling`) gets a line of it every EVERY seconds.
+
+    Args:
+        display: what draws the bar.
+        row: the bar's row in it.
     """
+
+    def __init__(self, display: Progress, row: TaskID):
+        self.display, self.row = display, row
+        self.said = time.monotonic()
+
+    def advance(self) -> None:
+        """Count one more."""
+        self.display.advance(self.row)
+        if time.monotonic() - self.said >= EVERY:
+            self.said = time.monotonic()
+            tell(self.line)
+
+    def note(self, text: str) -> None:
+        """Replace the remark behind the numbers, such as the loss."""
+        self.display.update(self.row, note=text)
+
+    @property
+    def line(self) -> str:
+        """The work so far in a line, such as "Mem-MLP: 400 of 4000, loss 2.31, 6 min left"."""
+        task = self.display.tasks[0]
+        far = f"{task.completed:.0f}" + ("" if task.total is None else f" of {task.total:.0f}")
+        left = "" if task.time_remaining is None else f"{duration(task.time_remaining)} left"
+        return f"{task.description}: {', '.join(filter(None, (far, task.fields['note'], left)))}"
+
+
+def duration(seconds: float) -> str:
+    """Return a time as text, in minutes where it is long."""
+    return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"
+
+
+@contextmanager
+def counting(description: str, total: float | None, done: int = 0, shown: bool = True) -> Iterator[Count]:
+    """Show how far some work is: description, bar, count, elapsed time, time left, and a note, on stderr.
+
+    Args:
+        description: what is worked on.
+        total: how much there is to do; None if that is not known.
+        done: how much of it was done before.
+        shown: whether this process shows it.
+    """
+    from rich import progress  # here, since the help of all commands comes by without it
+    from rich.console import Console
+
     console = Console(stderr=True)
-    return Progress(
-        TextColumn("{task.description:<12}"),
-        BarColumn(bar_width=24),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+    display = progress.Progress(
+        progress.TextColumn("{task.description:<12}"),
+        progress.BarColumn(bar_width=24),
+        progress.MofNCompleteColumn(),
+        progress.TimeElapsedColumn(),
+        progress.TextColumn("left"),
+        progress.TimeRemainingColumn(),
+        progress.TextColumn("{task.fields[note]}"),
         console=console,
         disable=not (shown and console.is_terminal),
     )
+    with display:
+        yield Count(display, display.add_task(description, total=total, completed=done, note=""))
 
 
 def progress_bar(items: Iterable[T], description: str, total: int | None = None) -> Iterator[T]:
@@ -67,8 +119,7 @@ def progress_bar(items: Iterable[T], description: str, total: int | None = None)
     """
     if total is None and isinstance(items, Sized):
         total = len(items)
-    with progress() as bar:
-        task = bar.add_task(description, total=total, note="")
+    with counting(description, total) as count:
         for item in items:
             yield item
-            bar.advance(task)
+            count.advance()

@@ -19,6 +19,7 @@ from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantTy
 from torch import Tensor
 
 from memmlp.common.fences import publish, temporary
+from memmlp.common.progress import progress_bar
 from memmlp.deploy.parity import streamed
 from memmlp.deploy.session import OnnxStream
 from memmlp.evaluation.modes import rotations_report
@@ -109,7 +110,7 @@ def accuracy(path: Path, normalizer: Normalizer, clips: Sequence[Tensor]) -> dic
     """
     stream, share = OnnxStream(path), min(1.0, TEST_FRAMES / sum(map(len, clips)))
     rows = []
-    for clip in clips:
+    for clip in progress_bar(clips, "measuring"):
         truth = clip[: max(int(share * len(clip)), 2)]
         rows.append(rotations_report(normalizer, streamed(stream, truth), truth))
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}

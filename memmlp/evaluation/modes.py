@@ -136,7 +136,8 @@ def evaluate(
     for row, source in zip(rows, dataset.sources or (), strict=False):
         row["source"] = source
     for mode in modes:
-        for row, clip, motion in zip(rows, clips, predict(network, clips, mode, batch), strict=True):
+        motions = predict(network, clips, mode, batch)
+        for row, clip, motion in zip(progress_bar(rows, "measuring"), clips, motions, strict=True):
             row[mode] = clip_report(network.normalizer, motion, clip, ik, own)
     return {"mean": {mode: _mean([row[mode] for row in rows]) for mode in modes}, "clips": rows}
 

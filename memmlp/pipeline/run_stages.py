@@ -18,7 +18,7 @@ import torch
 from memmlp.common import parallel
 from memmlp.common.errors import LeaseLost, TrainingDiverged, of_the_disk
 from memmlp.common.files import write_json
-from memmlp.common.progress import stage_begins
+from memmlp.common.progress import tell
 from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
 from memmlp.motion.preparing.source import Prepared
@@ -54,7 +54,6 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
         experiment: what to run.
         watch: called after each validation with the step and its values; it may raise to stop the run.
     """
-    stage_begins(f"data: prepare the motion of {experiment.data.source.root}")
     data = experiment.data.prepare()
     codes = vqvae_run(experiment, data) if experiment.architecture.uses_codes else None
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
@@ -151,7 +150,7 @@ def train_vqvae(experiment: Experiment, run: Run, data: Prepared, identity: Iden
     """Train the VQ-VAE of a run, and mark the run as done."""
     begin(experiment, run, identity, experiment.vqvae.config)
     run.write_manifest({"partial": partial_words(experiment, data)})
-    stage_begins(f"VQ-VAE: train it, whose code-vectors the network's memory uses (run {run.id})")
+    tell(f"VQ-VAE: train it, whose code-vectors the network's memory uses (run {run.id})")
     parallel.of_first("vqvae")
     with timed(run, "train"):
         errors = experiment.vqvae.train(experiment.architecture, data, run, experiment.device)
@@ -186,7 +185,7 @@ def train_run(
     experiment: Experiment, run: Run, data: Prepared, codes: Run | None, watch: Watch = unwatched
 ) -> None:
     """Train the network of a run, and mark the run as done."""
-    stage_begins(f"network: train it for {experiment.training.optim.steps} steps (run {run.id})")
+    tell(f"network: train it for {experiment.training.optim.steps} steps (run {run.id})")
     begin(experiment, run, experiment.identity(data.digest), experiment.config)
     run.write_manifest({"body": data.manifest.body, "partial": partial_words(experiment, data)})
     run.clear_stages()
@@ -203,7 +202,7 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
     Each evaluation is a file that is there whole or not at all.
     """
     run.attempt("evaluation")
-    stage_begins(f"evaluation: measure the errors on the test clips, in {' and '.join(modes)} mode")
+    tell(f"evaluation: measure the errors on the test clips, in {' and '.join(modes)} mode")
     with timed(run, "evaluate"):
         model = experiment.architecture.load(run.weights()).to(experiment.device)
         test = data.open("test").to(experiment.device)
@@ -220,7 +219,7 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
 def deploy_run(experiment: Experiment, run: Run, data: Prepared, name: str) -> None:
     """Make the deployment of that identity: export a trained run, check file against network, and time it."""
     run.attempt("deployment")
-    stage_begins("deployment: export to ONNX, compare with torch, and time a frame")
+    tell("deployment: export to ONNX, compare with torch, and time a frame")
     with timed(run, "export"):
         model = experiment.architecture.load(run.weights())
         clips = [data.open(split).clips() for split in ("train", "test")]

@@ -14,12 +14,11 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from rich.progress import Progress, TaskID
 from torch import Tensor, nn
 
 from memmlp.common import parallel
 from memmlp.common.errors import InputError, TrainingDiverged
-from memmlp.common.progress import progress
+from memmlp.common.progress import Count, counting
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks import checkpoint, layers
 from memmlp.runs.run import Run
@@ -100,12 +99,11 @@ def train(
     optimiser = optim.build(task.parameter_groups())
     start = resume(task, optimiser, run)
     parallel.align(task.module)
-    with progress(shown=parallel.first()) as bar:
-        row = bar.add_task(description, total=optim.steps, completed=start, note="")
+    with counting(description, optim.steps, start, shown=parallel.first()) as count:
         for step in range(start, optim.steps):
             seed_step(seed, step)
             result = train_step(task, optim, optimiser, step)
-            validation = record(task, optim, run, step + 1, result, bar, row) if parallel.first() else {}
+            validation = record(task, optim, run, step + 1, result, count) if parallel.first() else {}
             if (step + 1) % optim.checkpoint_every == 0 or step + 1 == optim.steps:
                 save(task, optimiser, run, step + 1)
             if validation:
@@ -170,25 +168,24 @@ def check_finite(task: TrainingTask, result: StepResult, step: int) -> None:
 
 
 def record(
-    task: TrainingTask, optim: Optim, run: Run, step: int, result: StepResult, bar: Progress, row: TaskID
+    task: TrainingTask, optim: Optim, run: Run, step: int, result: StepResult, count: Count
 ) -> dict[str, float]:
     """Log and show a finished step, and validate if it is time.
 
     Args:
         step: how many steps are finished.
-        bar: the progress display.
-        row: the training's row in it.
+        count: shows how far the training is.
 
     Returns:
         The validation's values, empty where there was none.
     """
     last = step == optim.steps
-    bar.advance(row)
     if step % optim.log_every == 0 or last:
         loss = float(result.loss.detach())
         terms = {name: float(term.detach()) for name, term in result.terms.items()}
         run.log(step, {"loss": loss, **terms, **task.report()})
-        bar.update(row, note=f"loss {loss:.3g}")
+        count.note(f"loss {loss:.3g}")
+    count.advance()
     if step % optim.validate_every == 0 or last:
         task.module.eval()
         values = task.validate()

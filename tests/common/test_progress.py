@@ -1,0 +1,52 @@
+"""What is said of long work where no terminal shows bars."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from memmlp.common import progress
+from memmlp.common.progress import counting, progress_bar, tell, telling, to_log
+
+
+@pytest.mark.parametrize(("terminal", "said"), [(True, ""), (False, "data: once\n")])
+def test_a_terminal_has_its_progress_bars_alone(capsys, monkeypatch: pytest.MonkeyPatch, terminal, said):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: terminal, raising=False)
+    to_log("data: once")
+    assert capsys.readouterr().err == said
+
+
+def test_lines_are_told_to_who_listens_alone():
+    told: list[str] = []
+    tell("data: before")
+    with telling(told.append):
+        tell("data: within")
+    tell("data: after")
+    assert told == ["data: within"]
+
+
+def test_long_work_tells_how_far_it_is(monkeypatch: pytest.MonkeyPatch):
+    told: list[str] = []
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    with telling(told.append), counting("network", 4000, done=398) as count:
+        count.advance()
+        count.note("loss 2.31")
+        count.advance()
+    assert told[0].startswith("network: 399 of 4000")
+    assert re.fullmatch(r"network: 400 of 4000, loss 2\.31(, \d+ (s|min) left)?", told[1])
+
+
+def test_quick_work_tells_nothing_of_how_far_it_is():
+    told: list[str] = []
+    with telling(told.append):
+        assert list(progress_bar("abc", "reading")) == ["a", "b", "c"]
+    assert told == []
+
+
+def test_work_of_unknown_length_tells_what_is_done(monkeypatch: pytest.MonkeyPatch):
+    told: list[str] = []
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    with telling(told.append):
+        list(progress_bar(iter("ab"), "reading"))
+    assert told == ["reading: 1", "reading: 2"]
