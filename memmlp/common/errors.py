@@ -22,6 +22,15 @@ class InputError(ValueError):
         super().__init__(one_line(message))
 
 
+def why_unreadable(error: Exception) -> str:
+    """Return in words why a text or YAML file could not be read, without the file's name."""
+    if isinstance(error, OSError):
+        return "no such file" if error.errno == errno.ENOENT else error.strerror or str(error)
+    if (mark := getattr(error, "problem_mark", None)) is not None:
+        return f"line {mark.line + 1}, column {mark.column + 1}: {getattr(error, 'problem', 'no YAML')}"
+    return " ".join(str(error).replace('"<unicode string>"', "it").split())
+
+
 class TrainingDiverged(RuntimeError):
     """The loss became NaN or infinite.
 

@@ -29,7 +29,7 @@ from typing import Any
 
 import yaml
 
-from memmlp.common.errors import InputError
+from memmlp.common.errors import InputError, why_unreadable
 from memmlp.evaluation.units import SMALLEST, UNITS
 
 MODES = ("stream", "window")
@@ -218,9 +218,9 @@ def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: N
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), UniqueKeys)
     except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from None
+        raise InputError(f"{path}: {why_unreadable(error)}; allowed: a readable sweep file") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from None
+        raise InputError(f"{path}: not YAML: {why_unreadable(error)}") from None
     try:
         base = content.get("base") if isinstance(content, Mapping) else None
         prepare([word for word in base if isinstance(word, str)] if isinstance(base, list) else [])

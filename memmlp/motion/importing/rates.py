@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import yaml
 
-from memmlp.common.errors import InputError
+from memmlp.common.errors import InputError, why_unreadable
 from memmlp.motion.clip import FRAME_RATE_RANGE
 from memmlp.motion.importing.skeleton import is_number
 
@@ -73,7 +73,7 @@ def _sidecar(path: Path) -> float | None:
     try:
         content = yaml.safe_load(path.read_text("utf-8"))
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        raise InputError(f"{path}: {' '.join(str(error).split())[:120]}; allowed: readable YAML") from error
+        raise InputError(f"{path}: {why_unreadable(error)[:120]}; allowed: readable YAML") from error
     good = (
         isinstance(content, dict) and set(content) == {"fps"} and is_number(content["fps"], *FRAME_RATE_RANGE)
     )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import yaml
 
-from memmlp.common.errors import InputError
+from memmlp.common.errors import InputError, why_unreadable
 from memmlp.motion.body import JOINTS
 from memmlp.motion.importing.names import find_nodes
 
@@ -76,8 +76,7 @@ def load_skeleton(which: str) -> SkeletonMap:
     try:
         content = yaml.load(path.read_text("utf-8"), _StrictLoader)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        brief = " ".join(str(error).split())[:120]
-        raise InputError(f"{path}: {brief}; allowed: a readable YAML map") from error
+        raise InputError(f"{path}: {why_unreadable(error)[:120]}; allowed: a readable YAML map") from error
     return _parsed(path, content)
 
 

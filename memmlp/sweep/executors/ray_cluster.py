@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from memmlp.common.errors import InputError
+from memmlp.common.errors import InputError, why_unreadable
 from memmlp.sweep.executors.executor import Work
 from memmlp.sweep.executors.gpus import VISIBLE
 
@@ -74,7 +74,7 @@ def _runtime_env(path: Path) -> Mapping[str, Any]:
     try:
         found = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"ray.runtime_env={path}: {' '.join(str(error).split())}") from None
+        raise InputError(f"ray.runtime_env={path}: {why_unreadable(error)}") from None
     if not isinstance(found, dict):
         raise InputError(f"ray.runtime_env={path}: allowed is a YAML file of Ray's keys, such as env_vars")
     return found
