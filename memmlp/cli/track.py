@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -103,10 +104,6 @@ def mlflow(port: int, outputs: Path) -> None:
 
     store = MLflow(None, outputs).place
     program = shutil.which("mlflow")
-    try:
-        import mlflow.server  # noqa: F401  (mlflow-skinny has none)
-    except ImportError:
-        program = None
-    if program is None:
+    if program is None or find_spec("mlflow.server") is None:  # mlflow-skinny has no server
         raise InputError("mlflow: its page is not installed; pip install 'memmlp[mlflow]'")
     os.execv(program, [program, "ui", "--backend-store-uri", store, "--port", str(port)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import importlib
 import logging
 import os
 import re
@@ -295,8 +296,7 @@ def quiet(loggers: Sequence[str] = CHATTY) -> Iterator[None]:
     before: Mapping[str, int] = {name: logging.getLogger(name).level for name in loggers}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        import mlflow  # noqa: F401  (it sets its own levels when it is first imported)
-
+        importlib.import_module("mlflow")  # it sets its own levels when it is first imported
         for name in loggers:
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:

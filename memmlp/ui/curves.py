@@ -17,7 +17,11 @@ class Log:
     """A metrics log, of which only what is new is read again."""
 
     def __init__(self, path: Path):
-        self.path, self.read, self.first, self.bad = path, 0, b"", 0
+        self.path = path
+        self._forget()
+
+    def _forget(self) -> None:
+        self.read, self.first, self.bad = 0, b"", 0
         self.series: dict[str, dict[int, float]] = defaultdict(dict)
 
     def update(self) -> None:
@@ -27,7 +31,7 @@ class Log:
                 first = file.readline()
                 size = file.seek(0, 2)
                 if size < self.read or first[: len(self.first)] != self.first:
-                    self.__init__(self.path)  # type: ignore[misc]
+                    self._forget()
                 self.first = first if first.endswith(b"\n") else b""
                 file.seek(self.read)
                 new = file.read()

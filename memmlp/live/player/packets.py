@@ -17,6 +17,7 @@ import json
 import logging
 import math
 from collections.abc import Callable, Mapping
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -114,12 +115,8 @@ def packet(fields: Mapping[str, Any]) -> Packet:
 
 def needs_osc() -> None:
     """Raise InputError where python-osc is not installed."""
-    try:
-        import pythonosc  # noqa: F401
-    except ImportError:
-        raise InputError(
-            "--osc: needs python-osc, pip install 'memmlp[osc]'; allowed without: --udp"
-        ) from None
+    if find_spec("pythonosc") is None:
+        raise InputError("--osc: needs python-osc, pip install 'memmlp[osc]'; allowed without: --udp")
 
 
 def _tracker(name: str, values: Any) -> TrackerPose:
