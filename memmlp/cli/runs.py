@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 from rich import box
@@ -14,6 +15,7 @@ from rich.table import Table
 
 from memmlp.cli.options import PATH, Finite, outputs_option
 from memmlp.common.errors import InputError
+from memmlp.evaluation.units import UNITS
 
 if TYPE_CHECKING:
     from memmlp.runs.garbage import Garbage
@@ -23,12 +25,14 @@ if TYPE_CHECKING:
 NEWEST = 20
 SHOWN = {
     # the column's head -> the key of its number
-    "stream\ncm": "stream.rotation.MPJPE",
-    "window\ncm": "window.rotation.MPJPE",
-    "jitter": "stream.rotation.Jitter",
+    "MPJPE\nstream": "stream.rotation.MPJPE",
+    "MPJPE\nwindow": "window.rotation.MPJPE",
+    "Jitter": "stream.rotation.Jitter",
     "ms": "latency.median_ms",
 }
-ROOM, WIDTH = 66, 11  # characters of all other columns, and of one of what differs
+LEGEND = f"MPJPE [{UNITS['MPJPE']}], Jitter [{UNITS['Jitter']}]: rotation branch. ms: a frame on one core."
+SPARED = ("ms", "age", "kind", "Jitter", "MPJPE\nwindow")  # what a narrow screen has no room for, first
+FOLD = 12  # characters of a value in a line, where it can be broken
 
 
 @click.group("runs")
@@ -69,10 +73,9 @@ def list_command(
     if sort:
         listed = sorted_by(listed, records, sort)
     keys = wanted(columns, records, listed)
-    fit = len(keys) if columns else max((_console().width - ROOM) // WIDTH, 1)
-    show_runs(listed, records, keys[:fit], {} if columns else SHOWN)
-    if keys[fit:]:
-        click.echo(f"they differ in {', '.join(keys[fit:])}, too: --columns shows it")
+    hidden = show_runs([records[run.id] | {"age": _age(run)} for run in listed], keys, bool(columns))
+    if hidden:
+        click.echo(f"they differ in {', '.join(hidden)}, too: --columns shows it")
     if len(found) > limit:
         click.echo(f"{len(found) - limit} older ones: memmlp runs list --all")
     elif query:
@@ -115,35 +118,84 @@ def wanted(columns: str | None, records: Mapping[str, Record], listed: Sequence[
             check_key(key, records.values(), "--columns")
         return keys
     networks = [run for run in listed if records[run.id].get("kind") == "memmlp"]
-    return differing([run.config for run in networks]) if len(networks) > 1 else []
+    data = [str(records[run.id].get("data")) for run in networks]
+    return differing([run.config for run in networks], data) if len(networks) > 1 else []
 
 
-def show_runs(
-    listed: Sequence[Run],
-    records: Mapping[str, Record],
-    keys: Sequence[str],
-    numbers: Mapping[str, str],
-) -> None:
-    """Print the runs as a table: with the values of some keys, and with some numbers under heads of ours."""
+class Column(NamedTuple):
+    """A column of the list.
+
+    Attributes:
+        name: its head, or the key that it shows.
+        cells: its text for each run.
+        number: whether these are numbers.
+    """
+
+    name: str
+    cells: list[str]
+    number: bool = False
+
+
+def show_runs(records: Sequence[Record], keys: Sequence[str], asked: bool) -> list[str]:
+    """Print the runs as a table, and return the keys for which there was no room.
+
+    Args:
+        records: what may be asked of each run, and its `age`.
+        keys: the keys whose values are shown.
+        asked: whether these were asked for, so that they are shown whatever room there is, without results.
+    """
+    columns = list(_columns(records, keys, {} if asked else SHOWN))
+    spare = [name for name in SPARED if name not in keys] + ([] if asked else list(reversed(keys[1:])))
+    while spare and _width(columns) > _console().width:
+        columns = [column for column in columns if column.name != spare[0]]
+        del spare[0]
+    width = max(_console().width, _width(columns))
+    Console(highlight=False, markup=False, width=width).print(_lines(columns))
+    return [key for key in keys if key not in {column.name for column in columns}]
+
+
+def _columns(records: Sequence[Record], keys: Sequence[str], numbers: Mapping[str, str]) -> Iterator[Column]:
+    """Yield all columns, with the values of some keys, and with some numbers under heads of ours."""
     from memmlp.runs.query import shown
 
+    yield Column("run", [one["id"] for one in records])
+    for key in ("kind", "status", "age"):
+        if key not in keys:
+            yield Column(key, [str(one.get(key) or "-") for one in records])
+    for key in keys:
+        yield Column(key, [_folded(shown(one[key])) if key in one else "-" for one in records])
+    if any(one.get("tag") for one in records):
+        yield Column("tags", ["\n".join(one.get("tag", ())) for one in records])
+    for name, key in numbers.items():
+        yield Column(name, [_cell(one.get(key)) for one in records], number=True)
+
+
+def _lines(columns: Sequence[Column]) -> Table:
+    """Make the table of some columns, whose texts are folded already."""
     table = _table()
-    table.padding = (0, 0)
-    for column in ("run", "kind", "status", "age"):
-        table.add_column(column, no_wrap=True)
-    tags = any(records[run.id].get("tag") for run in listed)
-    for column in (*keys, *(["tags"] if tags else [])):
-        table.add_column(column, overflow="fold")
-    for column in numbers:
-        table.add_column(column, justify="right", no_wrap=True)
-    for run in listed:
-        one = records[run.id]
-        cells = [shown(one[key]) if key in one else "-" for key in keys]
-        labels = [" ".join(one.get("tag", ()))] if tags else []
-        kind = str(one.get("kind") or "-")
-        values = (_cell(one.get(key)) for key in numbers.values())
-        table.add_row(run.id, kind, str(one["status"]), _age(run), *cells, *labels, *values)
-    _console().print(table)
+    table.padding, table.caption_justify, table.caption_style = (0, 0), "left", ""
+    table.caption = LEGEND if any(column.number for column in columns) else None
+    for column in columns:
+        table.add_column(_folded(column.name), justify="right" if column.number else "left", no_wrap=True)
+    for cells in zip(*(column.cells for column in columns), strict=True):
+        table.add_row(*cells)
+    return table
+
+
+def _width(columns: Sequence[Column]) -> int:
+    """Return how wide the table of some columns is."""
+    console = Console(width=10_000)
+    return console.measure(_lines(columns)).maximum
+
+
+def _folded(text: str) -> str:
+    """Break a text into lines of FOLD characters, between the words of a key and the items of a list."""
+    lines = [""]
+    for part in re.findall(r"[^.,_/ ]*[.,_/ ]*", text):
+        if lines[-1] and len(lines[-1]) + len(part) > FOLD:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(lines)
 
 
 @runs.command("show")

@@ -53,6 +53,9 @@ INFERENCE = ("memory.blend", "memory.history", "model.sampling_steps")
 ID = re.compile(r"[0-9a-f]{16}")
 """What the id of a run looks like."""
 
+DATA_PATH = re.compile(r"data\.(root|body|split\.folder|sources\..+\.root)")
+"""The keys that say where data lies."""
+
 SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term")
 
 
@@ -218,6 +221,11 @@ def _training(kind: str, config: Mapping[str, Any], data: str, upstream: str | N
 def trained_with(key: str, config: Mapping[str, Any]) -> bool:
     """Return whether a dotted key can change the training of this config, or its data."""
     return key.startswith("data.") or any(_below(name, [key]) for name in trained_by(config))
+
+
+def is_data_path(key: str) -> bool:
+    """Return whether a dotted key says where data lies. One folder has many spellings, and one digest."""
+    return DATA_PATH.fullmatch(key) is not None
 
 
 def belongs(run_id: str | None, folder: Path) -> bool:

@@ -46,7 +46,9 @@ def find_run(outputs: Path | str, name: str) -> Run:
     if not matches and name and (Path(name) / "manifest.json").is_file():
         return Run(Path(name).resolve())
     if not matches:
-        raise InputError(f"run '{name}': no such folder, and no id in {where} ({len(known)}) begins so")
+        raise InputError(
+            f"run '{name}': no such folder, and the id of none of the {len(known)} runs in {where} begins so"
+        )
     ids = _enumerate(sorted(run.id for run in matches))
     raise InputError(f"run '{name}': {len(matches)} ids begin so: {ids}")
 

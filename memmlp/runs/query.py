@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
 from memmlp.runs.identity import SLOTS, flatten, trained_by
+from memmlp.runs.name import run_name
 from memmlp.runs.notes import read_notes
-from memmlp.runs.run import Run
+from memmlp.runs.run import STATUSES, Run
 
 Record = Mapping[str, Any]
 Condition = Callable[[Record], bool]
@@ -36,21 +37,28 @@ def record(run: Run) -> dict[str, Any]:
     the branch (`stream.MPJPE` for `stream.rotation.MPJPE`).
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
-    results = flatten(run.results)
+    results, flat = flatten(run.results), flatten(config)
     short = {key.replace(".rotation.", "."): value for key, value in results.items()}
     slots = {slot: (config.get(slot) or {}).get("name") for slot in SLOTS if slot in config}
-    facts = {name: manifest.get(name) for name in ("kind", "name", "started", "data", "upstream", "user")}
-    facts |= {"id": run.id, "status": run.status, "tag": notes.tags, "note": notes.note}
-    return {**flatten(config), **slots, **short, **results, **facts}
+    facts = {name: manifest.get(name) for name in ("kind", "started", "data", "upstream", "user")}
+    facts |= {"id": run.id, "name": run_name(manifest, flat), "status": run.status}
+    facts |= {"tag": notes.tags, "note": notes.note}
+    return {**flat, **slots, **short, **results, **facts}
 
 
-def differing(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+def differing(configs: Sequence[Mapping[str, Any]], data: Iterable[str] = ()) -> list[str]:
     """Return the config keys that change a result and differ among these configs.
 
     Where the option in a slot differs, its name stands for its keys that the others don't have.
+
+    Args:
+        configs: the configs.
+        data: the digests of their data; the keys of the data count only where these differ.
     """
     flats = [flatten(config) for config in configs]
     counting = {key for config in configs for key in (*trained_by(config), *_later(config))}
+    if len(set(data)) > 1:
+        counting |= {key for flat in flats for key in flat if key.startswith("data.")}
     names = [key for key in dict.fromkeys(key for flat in flats for key in flat) if key in counting]
     different = [key for key in names if len({repr(flat.get(key)) for flat in flats}) > 1]
     changed = {key.removesuffix(".name") for key in different if key.endswith(".name")}
@@ -172,6 +180,9 @@ class _Parser:
             raise self._refusal(f"after {key}{sign} comes '{value}'")
         if sign in ORDER and _number(value) is None and key != "started":
             raise self._refusal(f"{key}{sign}{value}: {sign} compares with a number")
+        if key == "status" and value not in (*STATUSES, "damaged"):
+            known = ", ".join([*STATUSES, "damaged"])
+            raise InputError(f"--where '{self.text}': status={value}; allowed are {known}")
         self.keys.append(key)
         return lambda one: _holds(one.get(key), sign, value)
 

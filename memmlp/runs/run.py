@@ -26,6 +26,12 @@ from memmlp.runs.identity import belongs, used_as_configured
 from memmlp.runs.metrics_log import Metrics, MetricsLog
 from memmlp.runs.resumed_origin import joined
 
+STAGE_WORDS = {"training": "training", "evaluation": "evaluating", "deployment": "exporting"}
+"""What a process is doing that works on a stage of a run."""
+
+STATUSES = (*STAGE_WORDS.values(), "done", "lost", "failed", "stopped", "new")
+"""What the status of a run may be: lost is one whose process died."""
+
 
 class Run:
     """A run: the folder outputs/runs/<id>/.
@@ -148,11 +154,23 @@ class Run:
 
     @property
     def status(self) -> str:
-        """One of: done, failed, running (a process is at it), lost (its process died), stopped, new."""
-        return self.state(self.done)
+        """One of STATUSES: what a process is doing with the run, or else how far it is."""
+        return self.stage or self.state(self.done)
+
+    @property
+    def stage(self) -> str | None:
+        """What a process is doing with the run, one of STAGE_WORDS; None if none is at it."""
+        if not self._lock.held:
+            return None
+        attempts = self.manifest.get("attempts") or [{}]
+        word = STAGE_WORDS.get(attempts[-1].get("stage"), "training")
+        return None if self.done and word == "training" else word
 
     def state(self, complete: bool) -> str:
-        """Return the status of work on the run, given whether that work is complete."""
+        """Return how far work on the run is, given whether that work is complete.
+
+        One of: done, running (a process is at it), lost (its process died), failed, stopped, new.
+        """
         if complete:
             return "done"
         if (held := self._lock.held) is not None:

@@ -72,11 +72,12 @@ def render(study: Study, outputs: Path) -> Group:
 def _going(trial: FrozenTrial, outputs: Path) -> Text:
     """Say how far a trial's runs are."""
     runs = [Run.of(outputs, run_id) for run_id in trial.user_attrs.get("runs", ())]
-    states = [run.status for run in runs]
-    done = f"{states.count('done')} seeds done, " if "done" in states else ""
-    if "running" not in states:
+    going = next((run for run in runs if run.stage), None)
+    count = sum(run.done for run in runs if run is not going)
+    done = f"{count} seeds done, " if count else ""
+    if going is None:
         return Text(f"{done}waiting")
-    return Text(done + progress_text(runs[states.index("running")], trial.user_attrs["steps"]), style="cyan")
+    return Text(done + progress_text(going, trial.user_attrs["steps"]), style="cyan")
 
 
 def trials_table(search: Search, title: str) -> Table:

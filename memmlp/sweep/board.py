@@ -137,7 +137,9 @@ def total_steps(task: RunTask) -> int:
 
 
 def progress_text(run: Run, total: int) -> str:
-    """Describe a run in training: its steps, the time left, and its loss."""
+    """Describe a run that somebody is at: of its training the steps, the time left and the loss."""
+    if (stage := run.stage) in ("evaluating", "exporting"):
+        return stage
     log = [entry for entry in run.metrics() if entry.phase == "train"]
     if not log:
         return "starting"

@@ -38,7 +38,10 @@ def states(plan: Plan) -> Say:
 
     def state(arm: Arm, seed: int) -> str | None:
         entry = entries.get((arm.label, seed))
-        word = plan.run_of(entry).state(plan.complete(entry)) if entry else "new"
+        if entry is None:
+            return None
+        run = plan.run_of(entry)
+        word = run.stage or run.state(plan.complete(entry))
         return word if word not in ("new", "done") else None
 
     return state

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 from memmlp.common.files import file_digest, plain, read_json
 from memmlp.runs.identity import flatten
 from memmlp.runs.metrics_log import Metrics, parsed
+from memmlp.runs.name import run_name
 from memmlp.runs.notes import read_notes
 from memmlp.runs.run import Run
 
@@ -95,7 +96,7 @@ def facts_of(run: Run, running: bool = False) -> Facts:
     )  # fmt: skip
     return Facts(
         id=run.id,
-        name=str(manifest.get("name") or run.id),
+        name=run_name(manifest, flatten(config)),
         folder=run.folder.absolute(),
         status=status,
         reason=run.failure if status == "failed" else None,

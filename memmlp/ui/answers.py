@@ -11,7 +11,7 @@ from memmlp.runs.identity import ID
 from memmlp.ui import runs
 from memmlp.ui.curves import Curves
 from memmlp.ui.index import Index
-from memmlp.ui.names import places
+from memmlp.ui.places import places
 from memmlp.ui.replay import Predict, Replays, body
 from memmlp.ui.runs import Rows
 from memmlp.ui.searches import Searches
@@ -79,6 +79,15 @@ class Answers:
         if room == "replay":
             return self._replay(rest, query)
         raise KeyError(name)
+
+    def missing(self, name: str) -> str:
+        """Say that there is nothing of that name, and where it would be."""
+        room, _, rest = name.partition("/")
+        folder = {"run": "runs", "replay": "runs", "sweeps": "sweeps", "searches": "tune"}.get(room)
+        if folder is None or not rest:
+            return f"{name}: there is no such page"
+        what = {"runs": "run", "sweeps": "sweep", "tune": "search"}[folder]
+        return f"{what} {rest}: it is not in {self.outputs / folder}; is it in another folder of outputs?"
 
     def _curves(self, query: Mapping[str, str]) -> dict[str, Any]:
         wanted = [one for one in re.findall(ID, query.get("runs", "")) if one in self.index.runs][

@@ -15,6 +15,7 @@ import yaml
 from memmlp.common.files import plain, read_json
 from memmlp.runs.evaluation_file import current
 from memmlp.runs.identity import INFERENCE, flatten, used_as_configured
+from memmlp.runs.name import run_name
 from memmlp.runs.run import Run
 
 HIDDEN = ("paths", "tracking", "tracker", "force", "hydra", "save_predictions")
@@ -40,6 +41,7 @@ def facts(folder: Path) -> dict[str, Any]:
     recent = last_entries(run.metrics_path)
     return {
         "id": run.id,
+        "name": run_name(manifest, shown),
         "kind": _word(manifest.get("kind")),
         "done": run.done,
         "started": _word(manifest.get("started")),

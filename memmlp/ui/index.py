@@ -81,7 +81,7 @@ class Index:
             if self.store:
                 self.store.put(run_id, signature, known)
             known["status"] = None
-        status = "done" if known["done"] else _status(folder)
+        status = "done" if known["done"] and not _claimed(folder) else _status(folder)
         if known.get("status") == status and run_id in self.runs and "generation" in known:
             return False
         self.removed.pop(run_id, None)
@@ -96,11 +96,18 @@ class Index:
 
 
 def _status(folder: Path) -> str:
-    """Return how far a run is that is not done."""
+    """Return how far a run is, or what somebody does with it."""
     try:
-        return Run(folder).state(False)
+        return Run(folder).status
     except (KeyError, ValueError, TypeError, AttributeError):  # somebody's damaged .holder
         return "stopped"
+
+
+def _claimed(folder: Path) -> bool:
+    """Return whether somebody may be at a run, as the last claim of its folder is not an empty one."""
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        return any(entry.name.startswith(".lease-") and entry.stat().st_size for entry in entries)
+    return False
 
 
 def _signature(folder: Path) -> str:

@@ -8,14 +8,13 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
-from memmlp.runs.identity import NEUTRAL, flatten
+from memmlp.runs.identity import NEUTRAL, flatten, is_data_path
 from memmlp.runs.lookup import is_trained
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan
 from memmlp.tables.measured_run import load
 from memmlp.ui.facts import read_config
 from memmlp.ui.index import Index
-from memmlp.ui.names import name
 
 SHOWN_FILES = (
     "config.yaml",
@@ -61,6 +60,7 @@ class Rows:
             "whole": whole,
             "keys": keys,
             "minor": minor(keys),
+            "paths": list(filter(is_data_path, keys)),
             "metrics": metrics,
             "rows": rows,
             "removed": gone,
@@ -73,6 +73,7 @@ def row(
     """Return a run's row in the table."""
     own = (
         "id",
+        "name",
         "kind",
         "status",
         "started",
@@ -90,7 +91,6 @@ def row(
     )
     return {
         **{key: facts[key] for key in own},
-        "name": name(facts, where),
         "places": list(where),
         "config": [facts["config"].get(key) for key in keys],
         "metrics": [_short(facts["metrics"].get(metric)) for metric in metrics],
@@ -98,7 +98,10 @@ def row(
 
 
 def differing(runs: Any) -> list[str]:
-    """Return the config keys in which runs differ, in the order of the configs."""
+    """Return the config keys in which runs differ, in the order of the configs.
+
+    The path of data differs where the data does, whichever way it is spelled.
+    """
     first: dict[str, Any] = {}
     counts: dict[str, int] = {}
     found: dict[str, None] = {}
@@ -107,9 +110,10 @@ def differing(runs: Any) -> list[str]:
         total += bool(run["config"])
         for key, value in run["config"].items():
             counts[key] = counts.get(key, 0) + 1
-            if first.setdefault(key, value) != value:
+            meant = run["data"] if is_data_path(key) else value
+            if first.setdefault(key, meant) != meant:
                 found[key] = None
-    return [key for key in first if key in found or counts[key] < total]
+    return [key for key in first if key in found or (counts[key] < total and not is_data_path(key))]
 
 
 def minor(keys: Sequence[str]) -> list[str]:
@@ -142,17 +146,18 @@ def page(
         facts = dict(index.runs[run_id])
         known = dict(index.runs)
     run = Run.of(index.outputs, run_id)
-    where = every.get(run_id, [])
+    where, config = every.get(run_id, []), whole_config(run)
     control = control_of(plans, run_id, known)
     return {
         **facts,
-        "name": name(facts, where),
         "places": where,
-        "config": whole_config(run),
+        "config": config,
+        "paths": list(filter(is_data_path, config)),
         "control": control
         and {
             "id": control,
-            "name": name(known[control], every.get(control, [])),
+            "name": known[control]["name"],
+            "data": known[control]["data"],
             "config": whole_config(Run.of(index.outputs, control)),
         },
         "manifest": flatten(run.manifest),

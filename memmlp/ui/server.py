@@ -133,7 +133,7 @@ class Handler(BaseHTTPRequestHandler):
         try:
             found = self.server.answers.of(name, query)
         except KeyError:
-            self._missing()
+            self._json(404, {"error": self.server.answers.missing(name)})
         except (InputError, ValueError, OverflowError) as error:
             self._json(400, {"error": str(error)})
         except Exception as error:  # one folder's damage must not look like the server's end

@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from memmlp.common.errors import InputError
+from memmlp.evaluation.units import UNITS
+from memmlp.runs.run import STAGE_WORDS
 from memmlp.sweep.board import name as task_name
 from memmlp.sweep.kept import kept
 from memmlp.sweep.plan import Entry, Plan, RunTask
@@ -82,9 +84,13 @@ class Sweeps:
         if plan is None:
             raise KeyError(name)
         states = self.states(plan)
-        cells = [self._cell(plan, entry, states) for entry in plan.entries]
+        sweep = self._kept(name) or of_plan(plan)
+        metric = next((metric for metric in sweep.metrics if metric in UNITS), "MPJPE")
+        shown = {arm.label: f"stream.{arm.branch}.{metric}" for arm in sweep.arms}
+        cells = [self._cell(plan, entry, states, shown.get(entry.label, "")) for entry in plan.entries]
         upstream = [self._upstream(plan, task, states) for task in plan.tasks if task.kind == "vqvae"]
-        return {**self.progress(plan), "cells": cells, "upstream": upstream, "table": self.table(plan)}
+        found = {"metric": metric, "cells": cells, "upstream": upstream, "table": self.table(plan)}
+        return self.progress(plan) | found
 
     def states(self, plan: Plan) -> dict[str, str]:
         """Return every task's state by its key, as `Plan.states` does, from what the index knows."""
@@ -101,15 +107,15 @@ class Sweeps:
         if facts["status"] != "done":
             return facts["status"]
         run = plan.run_of(task)
-        return "done" if all(map(run.has, task.stages)) else run.state(False)
+        return "done" if all(map(run.has, task.stages)) else run.stage or run.state(False)
 
-    def _cell(self, plan: Plan, entry: Entry, states: Mapping[str, str]) -> dict[str, Any]:
+    def _cell(self, plan: Plan, entry: Entry, states: Mapping[str, str], shown: str) -> dict[str, Any]:
         facts = self.index.runs.get(entry.id, {})
         recent = facts.get("recent") or [[0, 0, None]]
         return {
             "arm": entry.label, "seed": entry.seed, "id": entry.id, "state": states[entry.key],
             "step": recent[-1][0], "steps": facts.get("steps"), "failure": facts.get("failure", ""),
-            "value": facts.get("metrics", {}).get("stream.rotation.MPJPE"),
+            "value": facts.get("metrics", {}).get(shown),
         }  # fmt: skip
 
     def _upstream(self, plan: Plan, task: RunTask, states: Mapping[str, str]) -> dict[str, Any]:
@@ -124,19 +130,22 @@ class Sweeps:
         return max(total - int(facts["recent"][-1][0]), 0)
 
     def _share(self, plan: Plan, states: Mapping[str, str]) -> float:
-        """Return which part of all steps is done."""
+        """Return which part of all steps is done; a run that is not done has one left at least."""
         total = sum(
             self._left(task, "new")
             if task.id not in self.index.runs
             else int(self.index.runs[task.id]["steps"] or 0)
             for task in plan.tasks
         )
-        left = sum(self._left(task, states[task.key]) for task in plan.tasks)
+        each = [(task, states[task.key]) for task in plan.tasks]
+        left = sum(max(self._left(task, state), state != "done") for task, state in each)
         return 1 - left / total if total else 0.0
 
     def _time_left(self, plan: Plan, states: Mapping[str, str]) -> float | None:
-        """Return about how many seconds the workers that are at it still need; None if nobody is."""
-        running = [task for task in plan.tasks if states[task.key] == "running"]
+        """Return about how many seconds of training the workers that are at it still need; None if nobody is
+        at it, or all is trained.
+        """
+        running = [task for task in plan.tasks if states[task.key] in STAGE_WORDS.values()]
         paces = [pace for task in plan.tasks if (pace := _pace(self.index.runs.get(task.id))) is not None]
         if not running or not paces:
             return None
@@ -145,7 +154,7 @@ class Sweeps:
             for task in plan.tasks
             if states[task.key] not in ("failed", "blocked")
         )
-        return left * statistics.median(paces) / len(running)
+        return left * statistics.median(paces) / len(running) if left else None
 
     def table(self, plan: Plan) -> dict[str, Any]:
         """Return the table with effects and verdicts, made again when one of its runs changed."""

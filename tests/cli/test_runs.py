@@ -101,19 +101,45 @@ def test_an_unknown_run_is_one_line(memmlp: Memmlp, outputs: Path):
     assert one_line(memmlp("runs", "diff", "a", "zz"), "run 'zz'")
 
 
+def heads(said: str) -> set[str]:
+    """Return the words of the table's heads."""
+    return set(said.partition("─")[0].split())
+
+
 def test_list_shows_what_differs_as_far_as_there_is_room(
     memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch
 ):
     config = {"seed": 1, "memory": {"layers": [2]}}
-    Run.of(outputs, "d" * 16).begin("memmlp", config, data="d", upstream=None)
-    narrow = memmlp("runs", "list").out
-    assert "seed" in narrow.partition("─")[0]
-    assert "differ in memory.layers, too: --columns shows it" in narrow
-    monkeypatch.setenv("COLUMNS", "120")
-    wide = memmlp("runs", "list").out
-    assert "memory.layers" in wide.partition("─")[0]
-    assert "[2]" in wide
-    assert "too:" not in wide
+    Run.of(outputs, "d" * 16).begin("memmlp", config, data="d" * 64, upstream=None)
+    seen = {}
+    for width in ("40", "70", "120"):
+        monkeypatch.setenv("COLUMNS", width)
+        seen[width] = memmlp("runs", "list").out
+    assert heads(seen["40"]) == {"run", "status", "seed", "MPJPE", "stream"}
+    assert "differ in memory.layers, too: --columns shows it" in seen["40"]
+    assert heads(seen["70"]) == {
+        "run",
+        "status",
+        "seed",
+        "memory.",
+        "layers",
+        "MPJPE",
+        "stream",
+        "window",
+        "Jitter",
+    }
+    assert "too:" not in seen["70"]
+    assert heads(seen["120"]) == heads(seen["70"]) | {"kind", "age", "ms"}
+    assert "MPJPE [cm]" in seen["120"]
+
+
+def test_no_word_of_the_columns_that_were_asked_for_is_broken(memmlp: Memmlp, outputs: Path):
+    keys = "stream.MPJPE,window.rotation.MPJPE,latency.median_ms,memory.layers,kind,name"
+    said = memmlp("runs", "list", "--columns", keys).out
+    assert {"run", "status", "rotation.", "latency.", "median_ms", "layers", "kind"} < heads(said)
+    assert "age" not in heads(said)
+    for word in ("6.512", "[2,4,6,8,2,", "memmlp", "seed"):
+        assert word in said
 
 
 def test_where_sort_and_columns(memmlp: Memmlp, outputs: Path):

@@ -56,6 +56,7 @@ def test_what_a_run_does_not_have_is_neither_smaller_nor_larger():
     ("memory=", "it ends where a value after memory="), ("memory=gru and", "a key"),
     ("memory=gru or or seed=1", "'or' stands where a key"), ("(memory=gru", "a ) is missing"),
     ("memory=gru)", "')' is not expected"), ("memory gru", "after memory comes 'gru'"),
+    ("status=running", "allowed are training, evaluating"),
     ("seed<many", "compares with a number"), ("=gru", "'=' stands where a key"), ("seed=(", "comes '('"),
     ('note="open', "is not understood"), ("memory=gru seed=1", "'seed' is not expected"),
     ("(" * 60 + "a=1" + ")" * 60, "too deep"), ("not " * 60 + "a=1", "too deep"),
@@ -94,3 +95,9 @@ def test_the_keys_that_differ_without_neutral_ones():
     second = {"seed": 0, "paths": {"outputs": "b"}, "memory": {"name": "gru", "width": 6}}
     assert differing([first, second]) == ["memory", "memory.width"]
     assert differing([first, first]) == []
+
+
+def test_the_data_differs_where_its_digest_does():
+    first, second = ({"data": {"root": root, "weighting": "frames"}} for root in ("here", "/x/here"))
+    assert differing([first, second], ["d", "d"]) == []
+    assert differing([first, second], ["d", "e"]) == ["data.root"]

@@ -212,6 +212,19 @@ def test_a_retry_of_a_run_that_never_began_leaves_it_new(tmp_path: Path):
     assert run.status == "new"
 
 
+def test_the_status_names_the_stage_that_somebody_is_at(tmp_path: Path):
+    run = begun(tmp_path)
+    with run.lock():
+        assert run.status == "training"
+        write_json(run.results_path, {})
+        run.finish(["results.json"])
+        assert run.status == "done"  # somebody holds it who works on no later stage of it
+        for stage, word in (("evaluation", "evaluating"), ("deployment", "exporting")):
+            run.attempt(stage)
+            assert (run.stage, run.status, run.state(False)) == (word, word, "running")
+    assert (run.stage, run.status) == (None, "done")
+
+
 def test_runs_need_neither_torch_nor_hydra():
     code = "import sys, memmlp.runs.run; print([m for m in ('torch', 'hydra', 'mlflow') if m in sys.modules])"
     assert finished([sys.executable, "-c", code]).stdout == "[]\n"

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from memmlp.sweep.board import device_name, render
+from memmlp.sweep.board import device_name, progress_text, render
 from memmlp.sweep.plan import Entry, Plan, RunTask
 
 CARD = {"device": "cuda", "gpu": "A card", "gpu_index": "1"}
@@ -30,6 +30,14 @@ def test_running_runs_are_counted_by_device(plan: Plan, capsys: pytest.CaptureFi
     assert "running on GPU 1 (A card): 2, cpu: 1" in capsys.readouterr().out
     Console(width=200).print(render(plan, dict.fromkeys(states, "done")))
     assert "running on" not in capsys.readouterr().out
+
+
+def test_a_run_whose_training_is_over_shows_its_stage(plan: Plan):
+    run = plan.run_of(plan.tasks[0])
+    with run.lock():
+        assert progress_text(run, 9) == "starting"
+        run.attempt("deployment")
+        assert progress_text(run, 9) == "exporting"
 
 
 def test_names(plan: Plan):

@@ -77,6 +77,18 @@ def test_only_what_changed_is_parsed_again(outputs: Path, monkeypatch: pytest.Mo
     assert (parsed[6:], index.runs[run.id]["recent"][-1][0]) == ([run.id] * 2, 600)
 
 
+def test_a_run_is_not_done_while_it_is_evaluated(outputs: Path):
+    index = Index(outputs)
+    index.refresh()
+    run = run_of(outputs)
+    with run.lock():
+        run.attempt("evaluation")
+        index.refresh()
+        assert index.runs[run.id]["status"] == "evaluating"
+    index.refresh()
+    assert index.runs[run.id]["status"] == "done"
+
+
 def test_a_run_that_is_gone_is_told(outputs: Path):
     index = Index(outputs)
     index.refresh()

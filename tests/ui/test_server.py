@@ -53,7 +53,7 @@ def test_runs_and_only_what_changed_since(server: Server, outputs: Path):
     first = get(server, "/api/runs").json
     assert (len(first["rows"]), first["whole"]) == (6, True)
     row = next(row for row in first["rows"] if row["id"] == run_of(outputs, "gru", 2).id)
-    assert (row["name"], row["status"]) == ("gru · seed 2", "done")
+    assert (row["name"], row["status"]) == ("memory=gru · seed 2", "done")
     assert dict(zip(first["keys"], row["config"], strict=True))["memory.name"] == "gru"
     since = f"/api/runs?since={first['generation']}&heads={first['heads']}"
     assert get(server, since).json["rows"] == []
@@ -69,7 +69,8 @@ def test_runs_and_only_what_changed_since(server: Server, outputs: Path):
 def test_pages_of_a_run_a_sweep_and_curves(server: Server, outputs: Path):
     run, control = run_of(outputs, "gru", 1), run_of(outputs, "none", 1)
     page = get(server, f"/api/run/{run.id}").json
-    assert (page["name"], page["control"]["id"], len(page["clips"])) == ("gru · seed 1", control.id, 12)
+    assert page["name"] == "memory=gru · seed 1"
+    assert (page["control"]["id"], len(page["clips"])) == (control.id, 12)
     assert page["control"]["config"]["memory.name"] == "none"
     assert "config.yaml" in [file["name"] for file in page["files"]]
     assert get(server, "/api/sweeps").json["sweeps"][0]["title"] == "Mine"
@@ -93,7 +94,13 @@ def test_pages_of_a_run_a_sweep_and_curves(server: Server, outputs: Path):
 def test_nothing_else_is_sent(server: Server, outputs: Path, path: str):
     answer = get(server, path.replace("{id}", run_of(outputs).id))
     assert answer.code == 404
-    assert answer.json == {"error": "nothing is here"}
+    assert answer.json.keys() == {"error"}
+
+
+def test_what_is_missing_is_named(server: Server, outputs: Path):
+    assert get(server, "/api/run/nope").json["error"].startswith(f"run nope: it is not in {outputs / 'runs'};")
+    assert get(server, "/api/sweeps/none").json["error"].startswith("sweep none: it is not in ")
+    assert get(server, "/api/none").json["error"] == "none: there is no such page"
 
 
 @pytest.mark.parametrize(

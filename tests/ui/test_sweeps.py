@@ -49,14 +49,24 @@ def test_progress_and_time_left(outputs: Path, monkeypatch: pytest.MonkeyPatch):
         {"step": s, "phase": "train", "time": s / 100, "values": {"loss": 1}} for s in range(0, 1001, 100)
     ]
     run.metrics_path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    monkeypatch.setattr(Run, "state", lambda self, complete: "done" if complete else "running")
+    monkeypatch.setattr(Run, "stage", property(lambda self: None if self.done else "training"))
     sweeps = sweeps_of(outputs)
     found = sweeps.progress(sweeps.known()[0])
-    assert found["counts"] == {"done": 5, "running": 1}
+    assert found["counts"] == {"done": 5, "training": 1}
     assert found["share"] == pytest.approx(11 / 12)
     assert found["left"] is not None
-    (cell,) = [cell for cell in sweeps.page("mine")["cells"] if cell["state"] == "running"]
+    (cell,) = [cell for cell in sweeps.page("mine")["cells"] if cell["state"] == "training"]
     assert (cell["arm"], cell["seed"], cell["step"], cell["steps"]) == ("gru", 2, 1000, 2000)
+
+
+def test_no_time_is_left_where_only_the_evaluation_is(outputs: Path):
+    run = run_of(outputs, "gru", 2)
+    with run.lock():
+        run.attempt("evaluation")
+        sweeps = sweeps_of(outputs)
+        found = sweeps.progress(sweeps.known()[0])
+    assert (found["counts"], found["left"]) == ({"done": 5, "evaluating": 1}, None)
+    assert 0.999 < found["share"] < 1
 
 
 def test_a_failed_run_and_its_reason(outputs: Path):

@@ -1,0 +1,26 @@
+"""In which sweeps and searches a run stands."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from memmlp.sweep.plan import Plan
+
+
+def places(
+    plans: Iterable[Plan], trials: Iterable[tuple[str, int, str]] = ()
+) -> dict[str, list[dict[str, Any]]]:
+    """Return, by run id, the sweeps in which a run stands, each with arm and seed, and searches with trials.
+
+    `trials` are the name of a search, the number of a trial and the id of one of its runs.
+    """
+    found: dict[str, list[dict[str, Any]]] = {}
+    for plan in plans:
+        for entry in plan.entries:
+            found.setdefault(entry.id, []).append(
+                {"sweep": plan.name, "arm": entry.label, "seed": entry.seed}
+            )
+    for search, number, run_id in trials:
+        found.setdefault(run_id, []).append({"search": search, "trial": number})
+    return found
