@@ -22,7 +22,7 @@ MODULES = {
         "stage.js", "three/three.module.min.js", "three/three.core.min.js", "three/OrbitControls.js",
     )},
 }  # fmt: skip
-SCRIPTS = ("plot/d3.min.js", "plot/plot.umd.min.js")
+SCRIPTS = ("theme.js", "plot/d3.min.js", "plot/plot.umd.min.js")
 FILES = {"index.html": HERE, "style.css": HERE, **dict.fromkeys(SCRIPTS, HERE), **MODULES}
 """All files that there are, with the package that has them; nothing else is ever sent."""
 
@@ -65,7 +65,8 @@ def one_file(answers: Mapping[str, Any], extra: str = "") -> str:
     data = json.dumps(answers, separators=(",", ":")).replace("<", "\\u003c")
     parts = {
         r'<link rel="stylesheet" href="style.css">': style,
-        r'<script src="plot/d3.min.js"></script>': scripts,
+        r'<script src="theme.js"></script>': scripts,
+        r'<script src="plot/d3.min.js"></script>': "",
         r'<script src="plot/plot.umd.min.js"></script>': "",
         r'<script type="importmap">.*?</script>': f'<script type="importmap">{imports}</script>',
         r'<script type="module" src="main.js"></script>': (

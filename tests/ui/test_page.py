@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from chromium import Browser
-from ui.conftest import begun, made, run_of
+from ui.conftest import SEEDS, begun, made, run_of
 from ui.test_replay import motion
 
 from memmlp.runs.run import Run
@@ -77,11 +77,12 @@ def test_filter_sort_and_the_address(browser: Browser, server: Server):
         "const f = document.querySelector('#filter'); f.value = 'memory=gru stream.MPJPE<99'; "
         "f.dispatchEvent(new Event('input'))"
     )
-    assert sorted(browser.value(NAMES)) == ["gru · seed 0", "gru · seed 1", "gru · seed 2"]
+    names = [f"memory=gru · seed {seed}" for seed in SEEDS]
+    assert sorted(browser.value(NAMES)) == names
     browser.click(".runs thead th:nth-child(2) button")
-    assert browser.value(NAMES) == ["gru · seed 0", "gru · seed 1", "gru · seed 2"]
+    assert browser.value(NAMES) == names
     browser.click(".runs thead th:nth-child(2) button")
-    assert browser.value(NAMES) == ["gru · seed 2", "gru · seed 1", "gru · seed 0"]
+    assert browser.value(NAMES) == names[::-1]
     assert browser.value("document.querySelector('th[aria-sort]').ariaSort") == "descending"
     heads = browser.value(
         "[...document.querySelectorAll('.runs thead button')].map(b => b.firstChild.textContent)"
@@ -90,7 +91,7 @@ def test_filter_sort_and_the_address(browser: Browser, server: Server):
     assert "memory" not in heads  # all of these have the same
     route = browser.value("location.hash")
     go(browser, server.url, route.removeprefix("#/"), f"{NAMES}.length == 3")
-    assert browser.value(NAMES) == ["gru · seed 2", "gru · seed 1", "gru · seed 0"]
+    assert browser.value(NAMES) == names[::-1]
 
 
 def test_chosen_runs_are_compared(browser: Browser, server: Server, home: Path):
@@ -101,7 +102,7 @@ def test_chosen_runs_are_compared(browser: Browser, server: Server, home: Path):
     browser.wait("document.querySelectorAll('.plot svg path').length >= 3")
     assert browser.value("document.querySelector('h1').textContent") == "3 runs"
     label = browser.value("document.querySelector('.plot svg').ariaLabel")
-    assert label.startswith("training loss by step. gru · seed")
+    assert label.startswith("training loss by step. memory=gru · seed")
 
 
 def test_a_run_s_page_and_its_replay(browser: Browser, server: Server, home: Path):
@@ -114,8 +115,8 @@ def test_a_run_s_page_and_its_replay(browser: Browser, server: Server, home: Pat
     )
     assert browser.value("[...document.querySelectorAll('.view-name span')].map(s => s.textContent)") == [
         "Truth",
-        "gru · seed 0",
-        "none · seed 0",
+        "memory=gru · seed 0",
+        "memory=none · seed 0",
     ]
     pieces = browser.value("[...document.querySelectorAll('.pieces button')].map(b => b.textContent)")
     assert pieces[0] == "Worst second at 5.0 s: 20.0 cm"

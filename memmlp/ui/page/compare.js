@@ -93,7 +93,7 @@ const unique = (run, list) => (list.filter(other => other.name === run.name).len
 
 function differences(list, keys, names) {
   if (list.length < 2) return null;
-  const rows = about.keys.filter(key => new Set(list.map(run => JSON.stringify(run.config[key] ?? null))).size > 1);
+  const rows = about.keys.filter(key => new Set(list.map(run => run.cells[key])).size > 1);
   return section('Where they differ', rows.length ? matrix(rows.map(key => [key, ...list.map(run => word(run.config[key]))]), list, names) : h('p', { class: 'faint' }, 'Their configs are the same.'));
 }
 

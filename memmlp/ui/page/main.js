@@ -40,7 +40,10 @@ async function show() {
     replace(content, page.element);
     if (anew) { scrollTo(0, 0); content.querySelector('h1')?.setAttribute('tabindex', '-1'); say(page.title); }
   } catch (error) {
-    replace(content, empty('This page cannot be shown.', h('p', {}, error.message), h('p', {}, link('#/runs', 'All runs'))));
+    if (shown !== key) return;
+    document.title = 'Not shown · memmlp';
+    replace(content, empty('This page cannot be shown.', h('p', {}, error.message), h('p', {}, link(`#/${PARENT[room] ?? 'runs'}`, `All ${PARENT[room] ?? 'runs'}`))));
+    say(error.message);
     if (!error.missing) console.warn(error);
   }
 }

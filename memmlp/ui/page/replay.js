@@ -37,14 +37,17 @@ export class Replay {
       body ??= await ask('body');
       const mine = await this.piece(asked, run.id, clip, mode);
       if (asked !== this.asked) return;
-      this.begin(asked, run, mine, null, null, { clip, mode });
+      this.begin(asked, run, mine, other, null, { clip, mode });
       if (!other) return;
       const begin = mine.from / mine.fps;
       const theirs = await this.piece(asked, other.id, clip, mode, begin).catch(error => ({ state: 'failed', reason: error.message }));
       if (asked !== this.asked) return;
       const same = theirs.state !== 'failed' && theirs.frames === mine.frames && theirs.from === mine.from;
       if (same) this.begin(asked, run, mine, other, theirs, { clip, mode });
-      else this.remark(`${other.name}: ${theirs.reason ?? 'its clip is another motion'}`);
+      else {
+        this.begin(asked, run, mine, null, null, { clip, mode });
+        this.remark(`${other.name}: ${theirs.reason ?? 'its clip is another motion'}`);
+      }
     } catch (error) {
       if (asked === this.asked) replace(this.place, h('div', { class: 'empty' }, h('p', { class: 'lead' }, 'This clip cannot be replayed.'), h('p', {}, error.message)));
     }
@@ -106,6 +109,7 @@ export class Replay {
   layout() {
     const { mine, theirs } = this.data;
     const stages = [['Truth', null], [this.run.name, mine], ...(theirs ? [[this.other.name, theirs]] : [])];
+    const waiting = this.other && !theirs ? h('div', { class: 'view' }, h('div', { class: 'view-stage' }, h('p', { class: 'wait', role: 'status' }, 'computing …')), h('p', { class: 'view-name' }, h('span', {}, this.other.name))) : null;
     const panels = stages.map(([name, data]) => {
       const canvas = h('canvas', { 'aria-label': `${name} in 3D` });
       const error = h('b', { class: 'n' });
@@ -126,7 +130,7 @@ export class Replay {
     this.chart = chart;
     const ramp = h('div', { class: 'scale' }, h('span', {}, '0'), h('i', { style: `background:linear-gradient(to right, ${body.heat.join(', ')})` }), h('span', {}, `${this.top}+ cm`));
     const element = h('div', { class: 'replay', tabindex: 0, role: 'group', 'aria-label': 'Replay; space plays, arrows step a frame', onkeydown: event => this.key(event) },
-      h('div', { class: `views of${panels.length}` }, panels.map(panel => panel.element)), h('div', { class: 'transport' }, this.play, this.slider, this.clock, speeds), h('div', { class: 'pieces' }, this.pieces, ramp),
+      h('div', { class: `views of${waiting ? 3 : panels.length}` }, panels.map(panel => panel.element), waiting), h('div', { class: 'transport' }, this.play, this.slider, this.clock, speeds), h('div', { class: 'pieces' }, this.pieces, ramp),
       h('div', { class: 'keys' }, h('span', { class: 'key still' }, h('i', { style: 'background:var(--series0)' }), this.run.name), theirs ? h('span', { class: 'key still' }, h('i', { style: 'background:var(--series1)' }), this.other.name) : null), chart);
     replace(this.place, element);
     try {

@@ -38,7 +38,7 @@ export async function page(id) {
 
 function head(run) {
   return [
-    h('p', { class: 'trail' }, link('#/runs', 'Runs'), run.places.map(at => [' / ', at.sweep ? link(address('sweep', at.sweep), at.sweep) : link(address('search', at.search), at.search)])),
+    h('p', { class: 'trail' }, link('#/runs', 'Runs'), run.places.map(at => [' / ', at.sweep ? [link(address('sweep', at.sweep), at.sweep), ` · ${at.arm}, seed ${at.seed}`] : [link(address('search', at.search), at.search), ` · trial ${at.trial}`]])),
     h('div', { class: 'bar title' }, h('h1', {}, run.name), status(run), tags(run)),
     run.note ? h('p', { class: 'remark' }, run.note) : null,
   ];
@@ -136,7 +136,8 @@ function config(run) {
   const list = h('div');
   function draw() {
     const keys = [...new Set([...Object.keys(run.config), ...Object.keys(other ?? {})])].filter(key => !/\._(target|partial)_$/.test(key));
-    const differs = key => other && JSON.stringify(run.config[key] ?? null) !== JSON.stringify(other[key] ?? null);
+    const alike = run.control?.data === run.data ? run.paths : [];
+    const differs = key => other && !alike.includes(key) && JSON.stringify(run.config[key] ?? null) !== JSON.stringify(other[key] ?? null);
     const shown = keys.filter(key => (all || differs(key)) && `${key}=${run.config[key]}`.toLowerCase().includes(words.toLowerCase()));
     const rows = shown.map(key => h('tr', { class: differs(key) ? 'differs' : null }, h('th', { scope: 'row' }, key), h('td', {}, word(run.config[key])), other ? h('td', { class: 'faint' }, word(other[key])) : null));
     replace(list, shown.length ? h('div', { class: 'scroll short' }, h('table', { class: 'grid config' }, h('thead', {}, h('tr', {}, h('th', { scope: 'col' }, 'key'), h('th', { scope: 'col' }, 'this run'), other ? h('th', { scope: 'col' }, run.control.name) : null)), h('tbody', {}, rows)))

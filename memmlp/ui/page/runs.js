@@ -8,12 +8,17 @@ import { ago, date, duration, DASH, metricNumber, metricText, metricWords, numbe
 const STEP = 150; // rows that are drawn at once
 const AUTO = 6; // config columns that are shown unasked
 const METRICS = ['stream.rotation.MPJPE', 'stream.rotation.MPJRE', 'stream.rotation.MPJVE', 'stream.rotation.Jitter', 'latency.median_ms'];
+const NARROW = matchMedia('(max-width: 640px)'); // errors come first where little can be seen
 const KINDS = [['memmlp', 'Networks'], ['vqvae', 'VQ-VAEs'], ['', 'All']];
-const STATES = ['running', 'done', 'failed', 'lost', 'stopped', 'new'];
+export const AT_WORK = ['training', 'evaluating', 'exporting'];
+const STATES = [...AT_WORK, 'done', 'failed', 'lost', 'stopped', 'new'];
 export const STATE_WORDS = { lost: 'lost', new: 'waiting', blocked: 'blocked', stopped: 'stopped' };
 
+// How a status looks: whatever somebody does with a run looks alike.
+export const look = status => (AT_WORK.includes(status) ? 'running' : status);
+
 export function state(status, title) {
-  return h('span', { class: `state ${status}`, title }, STATE_WORDS[status] ?? status);
+  return h('span', { class: `state ${look(status)}`, title }, STATE_WORDS[status] ?? status);
 }
 
 // The keys in which these runs differ; of several that differ alike (memory and its sizes) the first.
@@ -83,7 +88,8 @@ export function page() {
     ui.auto = differing(ui.list, about.keys);
     const asked = set.cols === null ? null : set.cols.split('|').filter(Boolean);
     const some = METRICS.filter(name => ui.list.some(run => typeof run.metrics[name] === 'number'));
-    ui.columns = asked ?? [...ui.auto.slice(0, AUTO), ...(set.kind === 'vqvae' ? vqvae() : some)];
+    const groups = [ui.auto.slice(0, AUTO), set.kind === 'vqvae' ? vqvae() : some];
+    ui.columns = asked ?? (NARROW.matches ? groups.reverse() : groups).flat();
     ui.list = sorted(ui.list, set.sort);
     states(found, set.status);
     bests(ui.list);
@@ -226,12 +232,12 @@ export function tags(run) {
 export function status(run) {
   if (run.damage.length) return h('span', { class: 'state damaged', title: `cannot be read: ${run.damage.join(', ')}` }, 'damaged');
   const [last] = run.recent?.slice(-1) ?? [];
-  if (run.status !== 'running' || !last || !run.steps) return state(run.status, run.failure);
+  if (run.status !== 'training' || !last || !run.steps) return state(run.status, run.failure);
   const [first] = run.recent;
   const pace = run.recent.length > 1 && last[0] > first[0] ? (last[1] - first[1]) / (last[0] - first[0]) : null;
   const share = Math.min(last[0] / run.steps, 1);
-  const left = share >= 1 ? 'evaluating' : pace ? `${duration((run.steps - last[0]) * pace)} left` : '';
-  return h('span', { class: 'state running' }, h('progress', { value: share, max: 1, 'aria-label': `${Math.round(100 * share)} % trained` }), h('span', {}, `${Math.round(100 * share)} %`), h('small', {}, left));
+  const left = share < 1 && pace ? `${duration((run.steps - last[0]) * pace)} left` : '';
+  return h('span', { class: 'state running' }, h('progress', { value: share, max: 1, 'aria-label': `${Math.floor(100 * share)} % trained` }), h('span', {}, `${Math.floor(100 * share)} %`), h('small', {}, left));
 }
 
 function sorted(list, sort) {

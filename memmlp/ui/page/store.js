@@ -5,7 +5,7 @@ const answers = embedded ? JSON.parse(embedded.textContent) : null;
 export const alone = answers !== null; // the page is a file without a server
 
 export const runs = new Map();
-export const about = { keys: [], minor: [], metrics: [], outputs: '', generation: 0, heads: '' };
+export const about = { keys: [], minor: [], paths: [], metrics: [], outputs: '', generation: 0, heads: '' };
 const listeners = new Set();
 let state = alone ? 'file' : 'connecting';
 
@@ -52,7 +52,8 @@ function readable(row) {
     row.id, row.name, row.status, row.kind, row.device, row.note, row.failure, ...row.tags,
     ...row.places.flatMap(place => Object.values(place).map(String)), ...about.keys.map((key, i) => `${key}=${row.config[i]}`),
   ];
-  const cells = Object.fromEntries(about.keys.map((key, i) => [key, JSON.stringify(row.config[i] ?? null)]));
+  // What runs are compared by: of paths of data the data's digest, as one folder has many spellings.
+  const cells = Object.fromEntries(about.keys.map((key, i) => [key, about.paths.includes(key) ? row.data : JSON.stringify(row.config[i] ?? null)]));
   return { ...row, config, cells, metrics, text: words.join('\n').toLowerCase() };
 }
 

@@ -4,10 +4,10 @@ import { h, replace, link, section, empty, choice, select } from './dom.js';
 import { address, alone, ask, place, remember, runs } from './store.js';
 import { curvePanel } from './compare.js';
 import { forest } from './charts.js';
-import { state, STATE_WORDS } from './runs.js';
-import { DASH, duration, metricNumber, number, signed } from './format.js';
+import { AT_WORK, look, state, STATE_WORDS } from './runs.js';
+import { DASH, duration, metricNumber, metricText, number, signed } from './format.js';
 
-const ORDER = ['done', 'running', 'lost', 'stopped', 'new', 'failed', 'blocked'];
+const ORDER = ['done', ...AT_WORK, 'lost', 'stopped', 'new', 'failed', 'blocked'];
 
 export async function page() {
   const element = h('div', { class: 'page' });
@@ -24,10 +24,10 @@ export async function page() {
 }
 
 function progress(sweep) {
-  const parts = ORDER.filter(name => sweep.counts[name]).map(name => h('i', { class: name, style: `flex-grow:${sweep.counts[name]}` }));
+  const parts = ORDER.filter(name => sweep.counts[name]).map(name => h('i', { class: look(name), style: `flex-grow:${sweep.counts[name]}` }));
   const words = ORDER.filter(name => sweep.counts[name]).map(name => `${sweep.counts[name]} ${STATE_WORDS[name] ?? name}`).join(', ');
-  const left = sweep.left === null ? '' : ` · about ${duration(sweep.left)} left`;
-  return h('span', { class: 'sweep-progress' }, h('span', { class: 'segments', role: 'img', 'aria-label': words }, parts), h('span', { class: 'n' }, `${Math.round(100 * sweep.share)} %`), h('small', { class: 'faint' }, `${words}${left}`));
+  const left = sweep.left === null ? '' : ` · about ${duration(sweep.left)} of training left`;
+  return h('span', { class: 'sweep-progress' }, h('span', { class: 'segments', role: 'img', 'aria-label': words }, parts), h('span', { class: 'n' }, `${Math.floor(100 * sweep.share)} %`), h('small', { class: 'faint' }, `${words}${left}`));
 }
 
 export async function single(name) {
@@ -64,13 +64,13 @@ function board(sweep) {
   const at = (arm, seed) => sweep.cells.find(cell => cell.arm === arm && cell.seed === seed);
   const words = cell => {
     if (!cell) return h('td', { class: 'n faint' }, DASH);
-    const share = cell.state === 'running' && cell.steps ? Math.min(cell.step / cell.steps, 1) : null;
-    const text = cell.state === 'done' ? (typeof cell.value === 'number' ? h('b', {}, `${number(cell.value, 2)}`) : 'done') : share === null ? state(cell.state, cell.failure) : [h('progress', { value: share, max: 1, 'aria-label': 'trained' }), ` ${Math.round(100 * share)} %`];
-    return h('td', { class: `n cell ${cell.state}` }, runs.has(cell.id) ? link(address('run', cell.id), text) : text);
+    const share = cell.state === 'training' && cell.steps ? Math.min(cell.step / cell.steps, 1) : null;
+    const text = cell.state === 'done' ? (typeof cell.value === 'number' ? h('b', {}, metricNumber(sweep.metric, cell.value)) : 'done') : share === null ? state(cell.state, cell.failure) : [h('progress', { value: share, max: 1, 'aria-label': 'trained' }), ` ${Math.floor(100 * share)} %`];
+    return h('td', { class: `n cell ${look(cell.state)}` }, runs.has(cell.id) ? link(address('run', cell.id), text) : text);
   };
   const failed = sweep.cells.filter(cell => cell.failure).map(cell => h('p', { class: 'warning' }, h('b', {}, `${cell.arm}, seed ${cell.seed}: `), cell.failure));
   const above = sweep.upstream.map(task => h('li', {}, runs.has(task.id) ? link(address('run', task.id), task.name) : task.name, ' ', state(task.state)));
-  return section('Runs', h('p', { class: 'faint' }, 'MPJPE [cm], stream mode, rotation branch.'), h('div', { class: 'scroll short' }, h('table', { class: 'grid' },
+  return section('Runs', h('p', { class: 'faint' }, `${metricText(sweep.metric)}, stream mode.`), h('div', { class: 'scroll short' }, h('table', { class: 'grid' },
     h('thead', {}, h('tr', {}, h('th', { scope: 'col' }, 'arm'), seeds.map(seed => h('th', { scope: 'col', class: 'n' }, `seed ${seed}`)))),
     h('tbody', {}, arms.map(arm => h('tr', {}, h('th', { scope: 'row' }, arm), seeds.map(seed => words(at(arm, seed)))))))),
     above.length ? h('details', {}, h('summary', {}, `${above.length} VQ-VAEs`), h('ul', { class: 'remarks' }, above)) : null, failed);
@@ -91,7 +91,7 @@ function effects(table, draw) {
   });
   const choose = changes => { remember(changes); draw(); };
   return section('Effects', h('div', { class: 'tools' }, choice('Metric', tested.map(one => [one, one]), metric, value => choose({ metric: value })), table.modes.length > 1 ? choice('Mode', table.modes.map(one => [one, one]), mode, value => choose({ mode: value })) : null),
-    h('p', { class: 'faint' }, `Difference from ‘${table.control}’, or from the arm’s own control, with its 95 % interval over seeds and clips; filled where it is significant after Holm’s correction. `, h('span', { class: 'diamond' }, '◇'), ' the paper’s difference. Left is better. The band is the smallest effect of interest.'),
+    h('p', { class: 'faint' }, `Difference from ‘${table.control}’, or from the arm’s own control, with its 95 % interval over seeds and clips; filled where it is significant after Holm’s correction. `, rows.some(row => row.paper !== null) ? [h('span', { class: 'diamond' }, '◇'), ' the paper’s difference. '] : null, 'Left is better. The band is the smallest effect of interest.'),
     forest(rows, { label: table.headings[metric].replace(/ ↓| ↑/, ''), smallest: table.smallest[metric] }));
 }
 
