@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from memmlp.cli.options import Finite, outputs_option, plugins_option
+from memmlp.cli.options import Finite, outputs_option, page_options, plugins_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -48,14 +48,7 @@ PORT = click.IntRange(1, 65535)
     type=Finite(10, 1000),
     help="How many samples of a clip are played a second, Hz.",
 )
-@click.option(
-    "--port",
-    default=8765,
-    show_default=True,
-    type=click.IntRange(0, 65535),
-    help="Port of the page at 127.0.0.1; 0 takes a free one.",
-)
-@click.option("--no-browser", is_flag=True, help="Print the page's address, and open no browser.")
+@page_options(port=8765)
 @click.option(
     "--send", is_flag=True, help="Send the clip once, to the port of --udp or --osc, and show no page."
 )

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
 
+Command = Callable[..., Any]
 PATH = click.Path(path_type=Path)
 
 
@@ -52,6 +54,21 @@ outputs_option = click.option(
     show_default=True,
     help="Folder in which runs and caches of data are kept.",
 )
+
+
+def page_options(port: int) -> Callable[[Command], Command]:
+    """Give a command that serves a page the options --port, by default `port`, and --no-browser."""
+    options = (
+        click.option(
+            "--port",
+            default=port,
+            show_default=True,
+            type=click.IntRange(0, 65535),
+            help="Port of the page; 0 takes a free one.",
+        ),
+        click.option("--no-browser", is_flag=True, help="Print the page's address, and open no browser."),
+    )
+    return lambda command: options[0](options[1](command))
 
 
 def _use(ctx: click.Context, param: click.Parameter, value: str | None) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import outputs_option, plugins_option
+from memmlp.cli.options import outputs_option, page_options, plugins_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,13 +19,7 @@ if TYPE_CHECKING:
 
 
 @click.command("ui")
-@click.option(
-    "--port",
-    default=8787,
-    show_default=True,
-    type=click.IntRange(0, 65535),
-    help="Port of the page; 0 takes a free one.",
-)
+@page_options(port=8787)
 @click.option(
     "--host",
     default="127.0.0.1",
@@ -33,7 +27,6 @@ if TYPE_CHECKING:
     help="Address to serve at. At another one than this machine's own, every request needs the token.",
 )
 @click.option("--token", help="The token at another address.  [default: a new one, which is printed]")
-@click.option("--no-browser", is_flag=True, help="Print the page's address, and open no browser.")
 @plugins_option
 @outputs_option
 def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path) -> None:

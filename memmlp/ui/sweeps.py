@@ -89,7 +89,15 @@ class Sweeps:
         shown = {arm.label: f"stream.{arm.branch}.{metric}" for arm in sweep.arms}
         cells = [self._cell(plan, entry, states, shown.get(entry.label, "")) for entry in plan.entries]
         upstream = [self._upstream(plan, task, states) for task in plan.tasks if task.kind == "vqvae"]
-        found = {"metric": metric, "cells": cells, "upstream": upstream, "table": self.table(plan)}
+        branches = {arm.branch for arm in sweep.arms}
+        branch = branches.pop() if len(branches) == 1 else ""
+        found = {
+            "metric": metric,
+            "branch": branch,
+            "cells": cells,
+            "upstream": upstream,
+            "table": self.table(plan),
+        }
         return self.progress(plan) | found
 
     def states(self, plan: Plan) -> dict[str, str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Event
 
 import pytest
 from chromium import Browser
@@ -164,6 +165,37 @@ def test_a_phone_s_page_is_not_wider_than_the_phone(browser: Browser, server: Se
     for route in ("runs", "sweep/mine", "sweeps", "run/abcdef0123456789", "searches"):
         go(browser, server.url, route, "document.querySelector('h1')")
         assert browser.value("document.documentElement.scrollWidth") <= 390, route
+    go(browser, server.url, "runs", "document.querySelector('.runs thead th.n')")
+    assert browser.value("document.querySelector('.runs thead th.n').textContent") == "MPJPEstream, cm"
+    assert browser.value("document.querySelector('.runs thead th.n').getBoundingClientRect().right") <= 390
+
+
+def test_colours_are_a_choice_that_is_kept(browser: Browser, server: Server):
+    paper = "getComputedStyle(document.body).backgroundColor"
+    go(browser, server.url, "runs", "document.querySelector('h1')")
+    light = browser.value(paper)
+    for _ in range(2):  # from the system's to light, and to dark
+        browser.click("#theme")
+    dark = browser.value(paper)
+    assert dark != light
+    go(browser, server.url, "sweeps", "document.querySelector('h1')")
+    assert browser.value(paper) == dark
+
+
+def test_a_replay_says_that_the_other_run_s_is_being_computed(browser: Browser, home: Path):
+    seen = Event()
+
+    def slow(run: Run, clip: str, mode: str) -> dict:
+        if run.config["memory"]["name"] == "none":
+            seen.wait()
+        return predict(run, clip, mode)
+
+    with Server(Answers(home, slow, kept=False), 0, every=0.05) as server:
+        go(browser, server.url, f"run/{run_of(home, 'gru', 1).id}", "document.querySelector('.view .wait')")
+        assert browser.value("document.querySelector('.view .wait').textContent") == "computing …"
+        seen.set()
+        browser.wait("/ 3$/.test(document.documentElement.dataset.replayed)")
+        assert browser.value("document.querySelector('.view .wait')") is None
 
 
 def test_a_file_without_a_server(browser: Browser, home: Path, tmp_path: Path):

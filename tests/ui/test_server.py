@@ -97,8 +97,14 @@ def test_nothing_else_is_sent(server: Server, outputs: Path, path: str):
     assert answer.json.keys() == {"error"}
 
 
+def test_the_page_says_what_it_reads_before_it_has_read_it(server: Server):
+    assert b"Reading the run folders" in get(server, "/").body
+
+
 def test_what_is_missing_is_named(server: Server, outputs: Path):
-    assert get(server, "/api/run/nope").json["error"].startswith(f"run nope: it is not in {outputs / 'runs'};")
+    assert (
+        get(server, "/api/run/nope").json["error"].startswith(f"run nope: it is not in {outputs / 'runs'};")
+    )
     assert get(server, "/api/sweeps/none").json["error"].startswith("sweep none: it is not in ")
     assert get(server, "/api/none").json["error"] == "none: there is no such page"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -67,6 +68,17 @@ def test_no_time_is_left_where_only_the_evaluation_is(outputs: Path):
         found = sweeps.progress(sweeps.known()[0])
     assert (found["counts"], found["left"]) == ({"done": 5, "evaluating": 1}, None)
     assert 0.999 < found["share"] < 1
+
+
+def test_the_board_shows_the_sweep_s_first_metric_and_its_branch(outputs: Path):
+    folder, run = outputs / "sweeps" / "mine", run_of(outputs, "gru", 0)
+    sweep = kept(folder)
+    assert sweep is not None
+    keep(replace(sweep, metrics=("FLOPs", "MPJRE", "MPJPE")).with_branch("combined"), folder)
+    page = sweeps_of(outputs).page("mine")
+    assert (page["metric"], page["branch"]) == ("MPJRE", "combined")
+    (cell,) = [cell for cell in page["cells"] if cell["id"] == run.id]
+    assert cell["value"] == pytest.approx(run.results["stream"]["combined"]["MPJRE"])
 
 
 def test_a_failed_run_and_its_reason(outputs: Path):

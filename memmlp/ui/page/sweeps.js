@@ -70,7 +70,7 @@ function board(sweep) {
   };
   const failed = sweep.cells.filter(cell => cell.failure).map(cell => h('p', { class: 'warning' }, h('b', {}, `${cell.arm}, seed ${cell.seed}: `), cell.failure));
   const above = sweep.upstream.map(task => h('li', {}, runs.has(task.id) ? link(address('run', task.id), task.name) : task.name, ' ', state(task.state)));
-  return section('Runs', h('p', { class: 'faint' }, `${metricText(sweep.metric)}, stream mode.`), h('div', { class: 'scroll short' }, h('table', { class: 'grid' },
+  return section('Runs', h('p', { class: 'faint' }, `${metricText(sweep.metric)}, stream mode${sweep.branch ? `, ${sweep.branch} branch` : ''}.`), h('div', { class: 'scroll short' }, h('table', { class: 'grid' },
     h('thead', {}, h('tr', {}, h('th', { scope: 'col' }, 'arm'), seeds.map(seed => h('th', { scope: 'col', class: 'n' }, `seed ${seed}`)))),
     h('tbody', {}, arms.map(arm => h('tr', {}, h('th', { scope: 'row' }, arm), seeds.map(seed => words(at(arm, seed)))))))),
     above.length ? h('details', {}, h('summary', {}, `${above.length} VQ-VAEs`), h('ul', { class: 'remarks' }, above)) : null, failed);
