@@ -115,6 +115,11 @@ def test_exit_codes(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch, error: Base
     assert ran.out == ""
 
 
+def test_a_missing_file_is_told_in_our_words(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
+    failing(monkeypatch, FileNotFoundError(errno.ENOENT, "No such file or directory", "nope.npz"))
+    assert memmlp("train", "profile=tiny").err == "memmlp: nope.npz: no such file or folder\n"
+
+
 def test_a_bug_shows_where_it_is(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
     failing(monkeypatch, ZeroDivisionError("a bug"))
     with pytest.raises(ZeroDivisionError, match="a bug"):

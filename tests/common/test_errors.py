@@ -1,6 +1,11 @@
 """Messages of one line."""
 
-from memmlp.common.errors import InputError, one_line
+from pathlib import Path
+
+import pytest
+import yaml
+
+from memmlp.common.errors import InputError, one_line, why_unreadable
 
 
 def test_a_message_is_one_line_whatever_is_in_it():
@@ -9,3 +14,23 @@ def test_a_message_is_one_line_whatever_is_in_it():
 
 def test_words_stay_as_they_are():
     assert one_line("Läufer/走る\u3000\xa0.npz \\n") == "Läufer/走る\u3000\xa0.npz \\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a: [1\nb: 2", "line 2, column 2: expected"),
+        ("a: \x00", "special characters are not allowed in it, position 3"),
+    ],
+)
+def test_what_is_no_yaml_is_told_by_line_and_column(text: str, words: str):
+    with pytest.raises(yaml.YAMLError) as error:
+        yaml.safe_load(text)
+    assert words in why_unreadable(error.value)
+    assert "<unicode string>" not in why_unreadable(error.value)
+
+
+def test_a_missing_file_has_the_words_of_all_missing_files(tmp_path: Path):
+    with pytest.raises(OSError, match="No such file") as missing:
+        (tmp_path / "none").read_text()
+    assert why_unreadable(missing.value) == "no such file"

@@ -31,7 +31,9 @@ def test_the_newest_run_is_first(tmp_path: Path):
 @pytest.mark.parametrize("name", ["zz", "", "no/such"])
 def test_no_such_run_is_one_line(tmp_path: Path, name: str):
     begun(tmp_path)
-    with pytest.raises(InputError, match="no such folder"):
+    with pytest.raises(
+        InputError, match=r"no such folder, and the id of none of the \d+ runs in .*runs begins so"
+    ):
         find_run(tmp_path, name)
 
 
