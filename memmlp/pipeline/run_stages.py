@@ -55,6 +55,7 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
         watch: called after each validation with the step and its values; it may raise to stop the run.
     """
     data = experiment.data.prepare()
+    tell(f"data: {len(data.manifest.clips)} clips, prepared in {data.cache}")
     codes = vqvae_run(experiment, data) if experiment.architecture.uses_codes else None
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     with run.lock():

@@ -11,5 +11,5 @@ def test_each_stage_has_a_line_without_a_terminal(memmlp):
     ran = memmlp("demo", *TINY)
     assert ran.code == 0
     stages = [line.partition(":")[0] for line in ran.err.splitlines()]
-    assert stages == ["data", "data", "VQ-VAE", "network", "evaluation", "deployment"]
+    assert stages == ["data", "VQ-VAE", "network", "evaluation", "deployment"]
     assert "the demo took" in ran.out

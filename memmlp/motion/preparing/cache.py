@@ -23,7 +23,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.common.fences import check, publish, temporary
 from memmlp.common.lease import Lock
-from memmlp.common.progress import progress_bar, tell
+from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
 from memmlp.motion.clip import Clip, resample
 from memmlp.motion.formats.npz import read_clip
@@ -134,7 +134,6 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
 def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) -> None:
     """Write the arrays under temporary names, then rename them, then write the manifest."""
     check(out)
-    tell(f"data: write the frames of {len(manifest.clips)} clips to {out}")
     (out / MANIFEST).unlink(missing_ok=True)
     frames = {part: int(manifest.totals[part]["frames"]) for part in PARTS}
     _check_space(out, sum(frames.values()) * ITEM_BYTES)

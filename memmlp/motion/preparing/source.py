@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from memmlp.common.fences import publish, temporary
 from memmlp.common.lease import Lock
-from memmlp.common.progress import tell
 from memmlp.motion.preparing.cache import ClipFolder, finished, prepare
 from memmlp.motion.preparing.coverage import Coverage
 from memmlp.motion.preparing.find import Found, clip_name
@@ -111,7 +110,6 @@ def _make_once(root: Path, generate: Callable[[Path], object]) -> None:
     root.parent.mkdir(parents=True, exist_ok=True)
     with Lock(root.parent, root.name).hold():
         if not root.exists():  # no other process made it while this one waited
-            tell(f"data: make synthetic motion in {root}")
             unfinished = temporary(root)
             generate(unfinished)
             publish(unfinished, root)
