@@ -73,7 +73,7 @@ def list_command(
     if sort:
         listed = sorted_by(listed, records, sort)
     keys = wanted(columns, records, listed)
-    hidden = show_runs([records[run.id] | {"age": _age(run)} for run in listed], keys, bool(columns))
+    hidden = show_runs([{**records[run.id], "age": _age(run)} for run in listed], keys, bool(columns))
     if hidden:
         click.echo(f"they differ in {', '.join(hidden)}, too: --columns shows it")
     if len(found) > limit:

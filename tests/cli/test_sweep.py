@@ -207,7 +207,7 @@ def test_an_interrupted_sweep_ends_its_workers_and_goes_on_later(tmp_path: Path)
     [
         (["nosuch"], "sweep 'nosuch': no such sweep"),
         (["99"], "sweep '99': no such sweep"),
-        (["missing.yaml"], "missing.yaml: No such file"),
+        (["missing.yaml"], "missing.yaml: no such file; allowed"),
         (["trial.yaml", "memory=nosuch"], "memory=nosuch"),
         (["trial.yaml", "executor=cloud"], "executor=cloud: allowed is local, slurm or ray"),
         (["trial.yaml", "slurm.partition=x"], "slurm.partition: goes with executor=slurm"),
