@@ -30,6 +30,7 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.coordinates import Heading, HeadRelative, World
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.cells import CELLS
 from memmlp.networks.memory import (
     CodeMemory,
     GRUMemory,
@@ -234,9 +235,9 @@ def loss(make: Callable[[], Loss]) -> Numbers:
     return found | {"total": float(total.detach())} | summary("slope", motion.grad)
 
 
-def weighted(weighting: Callable[[], Manual | Uncertainty]) -> Numbers:
-    """A weighting of all of Mem-MLP's terms, after a step of what it learns."""
-    one = MotionLoss(weighting(), NoHand(), BOTH)
+def weighted(make: Callable[[], Loss]) -> Numbers:
+    """A loss, and its terms' weights after a step of what it learns."""
+    one = make()
     found = loss(lambda: one)
     for parameter in one.parameters():
         parameter.data -= 0.1 * torch.sign(parameter.grad)
@@ -311,6 +312,11 @@ CASES: dict[str, Callable[[], Numbers]] = {
         f"model.{name}": partial(lambda name: network(tiny.baseline(name)), name)
         for name in tiny.BASELINES
     },
+    "model.recurrent_poser": lambda: {
+        f"{cell} {name}": value
+        for cell in CELLS
+        for name, value in network(tiny.recurrent_poser(cell=cell)).items()
+    },
     **{
         f"memory.{name}": partial(lambda kind: network(tiny.model(kind)), kind)
         for name, kind in {
@@ -333,8 +339,8 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "rollout.teacher_forcing": partial(rollout, TeacherForcing),
     "rollout.own_predictions": partial(rollout, partial(OwnPredictions, 2)),
     "rollout.streams": partial(rollout, partial(PersistentStreams, 4)),
-    "loss.uncertainty": partial(weighted, partial(Uncertainty, 0.01)),
-    "loss.manual": partial(weighted, Manual),
+    "loss.uncertainty": partial(weighted, lambda: MotionLoss(Uncertainty(0.01), NoHand(), BOTH)),
+    "loss.manual": partial(weighted, lambda: MotionLoss(Manual(), NoHand(), BOTH)),
     "loss.agrol": lambda: {
         f"{error} {name}": value
         for error in ("norm", "square")
@@ -350,6 +356,9 @@ CASES: dict[str, Callable[[], Numbers]] = {
         for error in ERRORS
         for name, value in loss(partial(TermsLoss, error, **dict.fromkeys(TERMS, 0.5))).items()
     },
+    "weighting.learned": partial(
+        weighted, partial(TermsLoss, weighting="learned", rotation=2.0, velocity=30.0)
+    ),
     "hand.position": lambda: hand(HandPosition()),
     "hand.fk": lambda: hand(HandFK()),
     "hand.off": lambda: hand(NoHand()),

@@ -183,6 +183,8 @@ def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
         yield f"coordinates.{coordinates}"
     names = {slot: (config.get(slot) or {}).get("name") for slot in SLOTS}
     yield from (f"{slot}.{name}" for slot, name in names.items() if name)
+    if (config.get("loss") or {}).get("weighting") == "learned":
+        yield "weighting.learned"
     if schedule := config.get("optim", {}).get("schedule"):
         yield f"schedule.{schedule}"
     if kind == "vqvae" or names["memory"] == "vq_joint":
@@ -250,8 +252,11 @@ def _unused(config: Mapping[str, Any]) -> Iterable[str]:
         yield "optim.drop_at"
     if config.get("vqvae", {}).get("codebook", "ema") != "ema":
         yield "vqvae.decay"
-    if (config.get("loss") or {}).get("name") == "uncertainty":
+    loss = config.get("loss") or {}
+    if loss.get("name") == "uncertainty":
         yield "term.weight"  # it is learned
+    if loss.get("name") == "terms" and loss.get("weighting") != "learned":
+        yield from ("loss.weighting", "loss.lr")  # fixed weights are what runs before these keys have
 
 
 def _below(key: str, names: Iterable[str]) -> bool:
