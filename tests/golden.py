@@ -29,6 +29,7 @@ from memmlp.evaluation.ik import LBFGS
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.coordinates import Heading, HeadRelative, World
 from memmlp.motion.dataset import MotionDataset, WindowSampler
+from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.cells import CELLS
 from memmlp.networks.memory import (
@@ -162,6 +163,12 @@ def sampler() -> Numbers:
             for name, values in zip(("clip", "end"), draws.draw(step), strict=True):
                 found |= summary(f"{weighting} {name} {step}", values)
     return found
+
+
+def mirror() -> Numbers:
+    """Windows of mirrored clips."""
+    clips, ends = torch.tensor([3, 1, 5]), torch.tensor([20, 30, 44])
+    return summary("frames", MirroredDataset(frames()).segments(clips, ends, 9))
 
 
 def schedule(name: str) -> Numbers:
@@ -334,6 +341,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "vqvae": vqvae,
     **{f"codebook.{name}": partial(vqvae, name) for name in ("ema", "gradient")},
     "sampler": sampler,
+    "mirror": mirror,
     "training": training,
     **{f"schedule.{name}": partial(schedule, name) for name in ("step", "cosine", "milestones")},
     "rollout.teacher_forcing": partial(rollout, TeacherForcing),

@@ -179,6 +179,8 @@ def deployment_settings(config: Mapping[str, Any]) -> dict[str, Any]:
 def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
     """Yield the names of the components that a training's numbers come from."""
     yield from ("features", "sampler", "training")
+    if (config.get("data") or {}).get("mirror"):
+        yield "mirror"
     if coordinates := config.get("frame", {}).get("coordinates"):
         yield f"coordinates.{coordinates}"
     names = {slot: (config.get(slot) or {}).get("name") for slot in SLOTS}
@@ -210,7 +212,8 @@ def _draws(config: Mapping[str, Any]) -> dict[str, Any]:
     sources = (data.get("sources") or {}).items()
     weights = {name: _canonical(source.get("weight")) for name, source in sources}
     shares = {"data.sources": weights} if any(weights.values()) else {}
-    return {"data.weighting": data.get("weighting", "frames"), **shares}
+    mirror = {"data.mirror": True} if data.get("mirror") else {}
+    return {"data.weighting": data.get("weighting", "frames"), **shares, **mirror}
 
 
 def _training(kind: str, config: Mapping[str, Any], data: str, upstream: str | None) -> dict[str, Any]:

@@ -66,12 +66,19 @@ def test_side_by_side_is_one_by_one():
         torch.testing.assert_close(together, evaluation.stream(model, [clip])[0], atol=1e-5, rtol=0)
 
 
-def test_the_state_stays_exact_where_layers_are_rounded():
-    model = tiny.recurrent_poser(cell="lru")
+@pytest.mark.parametrize("cell", CELLS)
+@torch.no_grad()
+def test_cells_stay_exact_where_layers_are_rounded(cell):
+    model, calls = tiny.recurrent_poser(cell=cell), []
+    block = model.blocks["block2"]
+    block.cell.register_forward_hook(lambda of, given, made: calls.append((given, made)))
     with torch.autocast("cpu", torch.bfloat16):
-        motion, state = model.learn(SPARSE, model.initial_state(), CLIP[None])
-    assert {part.dtype for part in state.values()} == {torch.float32}
-    assert torch.isfinite(motion).all()
+        assert model.blocks["block1"].mlp(torch.zeros(1, 16)).dtype == torch.bfloat16
+        model.learn(SPARSE, model.initial_state(), CLIP[None])
+    given, made = calls[0]
+    for found, expected in zip(made, block.cell(*given), strict=True):
+        assert found.dtype == torch.float32
+        torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
 
 
 CHANGES = [
@@ -163,5 +170,6 @@ def test_each_cell_is_a_run_of_its_own():
 
     ids = [identity(f"model.cell={cell}") for cell in CELLS]
     ids += [identity("loss.weighting=fixed"), identity("loss.lr=0.1"), identity("rollout=streams")]
+    ids += [identity("data.mirror=true")]
     assert len(set(ids)) == len(ids)
     assert identity("loss.weighting=fixed", "loss.lr=0.1") == identity("loss.weighting=fixed")

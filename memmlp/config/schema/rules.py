@@ -176,7 +176,7 @@ def optional(rule: object = None) -> Any:
     return field(default=None, metadata={"rule": rule})
 
 
-def standing(value: object, rule: object) -> Any:
+def standing(value: object, rule: object = None) -> Any:
     """Declare a key with a default, which stands for it in runs from before there was the key."""
     return field(default=value, metadata={"rule": rule})
 
