@@ -29,7 +29,9 @@ from memmlp.evaluation.ik import LBFGS
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.coordinates import Heading, HeadRelative, World
 from memmlp.motion.dataset import MotionDataset, WindowSampler
+from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.cells import CELLS
 from memmlp.networks.memory import (
     CodeMemory,
     GRUMemory,
@@ -163,6 +165,12 @@ def sampler() -> Numbers:
     return found
 
 
+def mirror() -> Numbers:
+    """Windows of mirrored clips."""
+    clips, ends = torch.tensor([3, 1, 5]), torch.tensor([20, 30, 44])
+    return summary("frames", MirroredDataset(frames()).segments(clips, ends, 9))
+
+
 def schedule(name: str) -> Numbers:
     """Its course."""
     optim = Optim(steps=20, batch=1, lr=1e-2, final_lr=1e-4, schedule=name, drop_at=0.6)
@@ -234,9 +242,9 @@ def loss(make: Callable[[], Loss]) -> Numbers:
     return found | {"total": float(total.detach())} | summary("slope", motion.grad)
 
 
-def weighted(weighting: Callable[[], Manual | Uncertainty]) -> Numbers:
-    """A weighting of all of Mem-MLP's terms, after a step of what it learns."""
-    one = MotionLoss(weighting(), NoHand(), BOTH)
+def weighted(make: Callable[[], Loss]) -> Numbers:
+    """A loss, and its terms' weights after a step of what it learns."""
+    one = make()
     found = loss(lambda: one)
     for parameter in one.parameters():
         parameter.data -= 0.1 * torch.sign(parameter.grad)
@@ -311,6 +319,11 @@ CASES: dict[str, Callable[[], Numbers]] = {
         f"model.{name}": partial(lambda name: network(tiny.baseline(name)), name)
         for name in tiny.BASELINES
     },
+    "model.recurrent_poser": lambda: {
+        f"{cell} {name}": value
+        for cell in CELLS
+        for name, value in network(tiny.recurrent_poser(cell=cell)).items()
+    },
     **{
         f"memory.{name}": partial(lambda kind: network(tiny.model(kind)), kind)
         for name, kind in {
@@ -328,13 +341,14 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "vqvae": vqvae,
     **{f"codebook.{name}": partial(vqvae, name) for name in ("ema", "gradient")},
     "sampler": sampler,
+    "mirror": mirror,
     "training": training,
     **{f"schedule.{name}": partial(schedule, name) for name in ("step", "cosine", "milestones")},
     "rollout.teacher_forcing": partial(rollout, TeacherForcing),
     "rollout.own_predictions": partial(rollout, partial(OwnPredictions, 2)),
     "rollout.streams": partial(rollout, partial(PersistentStreams, 4)),
-    "loss.uncertainty": partial(weighted, partial(Uncertainty, 0.01)),
-    "loss.manual": partial(weighted, Manual),
+    "loss.uncertainty": partial(weighted, lambda: MotionLoss(Uncertainty(0.01), NoHand(), BOTH)),
+    "loss.manual": partial(weighted, lambda: MotionLoss(Manual(), NoHand(), BOTH)),
     "loss.agrol": lambda: {
         f"{error} {name}": value
         for error in ("norm", "square")
@@ -350,6 +364,9 @@ CASES: dict[str, Callable[[], Numbers]] = {
         for error in ERRORS
         for name, value in loss(partial(TermsLoss, error, **dict.fromkeys(TERMS, 0.5))).items()
     },
+    "weighting.learned": partial(
+        weighted, partial(TermsLoss, weighting="learned", rotation=2.0, velocity=30.0)
+    ),
     "hand.position": lambda: hand(HandPosition()),
     "hand.fk": lambda: hand(HandFK()),
     "hand.off": lambda: hand(NoHand()),

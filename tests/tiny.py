@@ -24,6 +24,7 @@ from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import CodeMemory, JointCodeMemory, Memory, NoMemory, RecurrentMemory
 from memmlp.networks.predictor import Predictor, TwoBranch
+from memmlp.networks.recurrent_poser import RecurrentPoser
 from memmlp.networks.vqvae import VQVAE
 from memmlp.networks.window_model import WindowModel
 from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, TermsLoss
@@ -136,3 +137,10 @@ def baseline(name: str, coordinates: World | None = None, seed: int = 0, **chang
     """Make a tiny baseline with random weights, in evaluation mode."""
     torch.manual_seed(seed)
     return BASELINES[name](normalizer(coordinates), **changes).eval()
+
+
+def recurrent_poser(coordinates: World | None = None, seed: int = 0, **changes) -> RecurrentPoser:
+    """Make a tiny RecurrentPoser with random weights, in evaluation mode."""
+    torch.manual_seed(seed)
+    settings = {"frames": 7, "width": 16, "depth": 2, "cell": "gru", "expansion": 2}
+    return RecurrentPoser(normalizer(coordinates), **settings | changes).eval()

@@ -11,7 +11,7 @@ from memmlp.networks import checkpoint
 from memmlp.networks.memory import JointCodeMemory
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.run import Run
-from memmlp.training.losses import HandPosition, MotionLoss, Uncertainty
+from memmlp.training.losses import HandPosition, MotionLoss, TermsLoss, Uncertainty
 from memmlp.training.network import MotionTask
 from memmlp.training.optim import Optim
 from memmlp.training.rollout import OwnPredictions, PersistentStreams, TeacherForcing
@@ -38,6 +38,13 @@ def baseline_task(name: str, optim: Optim = OPTIM, seed: int = 0) -> MotionTask:
     return MotionTask(model, loss, TeacherForcing(), tiny.frames(), optim, seed, validate=lambda model: {})
 
 
+def recurrent_task(rollout: str = "forced", optim: Optim = OPTIM, seed: int = 0) -> MotionTask:
+    model, made = tiny.recurrent_poser(seed=seed), ROLLOUTS[rollout]()
+    made.begin(model)
+    loss = TermsLoss(weighting="learned", rotation=1.0, world_position=2.0, velocity=20.0)
+    return MotionTask(model, loss, made, tiny.frames(), optim, seed, validate=lambda model: {})
+
+
 def vqvae_task(optim: Optim = OPTIM) -> VQVAETask:
     torch.manual_seed(0)
     model = VQVAE(codes=8, width=12, encoder_depth=1)
@@ -51,6 +58,7 @@ def weights(run: Run) -> dict[str, torch.Tensor]:
 TASKS = {
     **{name: partial(motion_task, name) for name in ROLLOUTS},
     **{name: partial(baseline_task, name) for name in tiny.BASELINES},
+    **{f"recurrent {name}": partial(recurrent_task, name) for name in ("forced", "streams")},
     "vqvae": vqvae_task,
     "joint": partial(motion_task, kind=JointCodeMemory),
 }

@@ -87,6 +87,7 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
             weighting=cfg.data.weighting,
             shares=shares(cfg.data),
             metrics=metrics,
+            mirror=cfg.data.mirror,
         ),
         evaluation=Evaluation(
             modes=list(cfg.evaluation.modes),

@@ -126,7 +126,7 @@ class MemMLPArchitecture(Architecture):
 
 @dataclass(frozen=True)
 class BaselineArchitecture(Architecture):
-    """How a baseline, which has neither memory nor predictor slot, is built.
+    """How a network with neither memory nor predictor slot is built, as all baselines are.
 
     Attributes:
         network: makes the network from its normalizer; all other arguments are bound already.

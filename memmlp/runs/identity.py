@@ -182,10 +182,14 @@ def deployment_settings(config: Mapping[str, Any]) -> dict[str, Any]:
 def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
     """Yield the names of the components that a training's numbers come from."""
     yield from ("features", "sampler", "training")
+    if (config.get("data") or {}).get("mirror"):
+        yield "mirror"
     if coordinates := config.get("frame", {}).get("coordinates"):
         yield f"coordinates.{coordinates}"
     names = {slot: (config.get(slot) or {}).get("name") for slot in SLOTS}
     yield from (f"{slot}.{name}" for slot, name in names.items() if name)
+    if (config.get("loss") or {}).get("weighting") == "learned":
+        yield "weighting.learned"
     if schedule := config.get("optim", {}).get("schedule"):
         yield f"schedule.{schedule}"
     if kind == "vqvae" or names["memory"] == "vq_joint":
@@ -211,7 +215,8 @@ def _draws(config: Mapping[str, Any]) -> dict[str, Any]:
     sources = (data.get("sources") or {}).items()
     weights = {name: _canonical(source.get("weight")) for name, source in sources}
     shares = {"data.sources": weights} if any(weights.values()) else {}
-    return {"data.weighting": data.get("weighting", "frames"), **shares}
+    mirror = {"data.mirror": True} if data.get("mirror") else {}
+    return {"data.weighting": data.get("weighting", "frames"), **shares, **mirror}
 
 
 def _training(kind: str, config: Mapping[str, Any], data: str, upstream: str | None) -> dict[str, Any]:
@@ -258,8 +263,11 @@ def _unused(config: Mapping[str, Any]) -> Iterable[str]:
         yield "optim.drop_at"
     if config.get("vqvae", {}).get("codebook", "ema") != "ema":
         yield "vqvae.decay"
-    if (config.get("loss") or {}).get("name") == "uncertainty":
+    loss = config.get("loss") or {}
+    if loss.get("name") == "uncertainty":
         yield "term.weight"  # it is learned
+    if loss.get("name") == "terms" and loss.get("weighting") != "learned":
+        yield from ("loss.weighting", "loss.lr")  # fixed weights are what runs before these keys have
 
 
 def _below(key: str, names: Iterable[str]) -> bool:

@@ -27,6 +27,7 @@ RECIPES: dict[str, int] = {
     "model.vae_hmd": 1,
     "model.rpm": 1,
     "model.avatar_jlm": 1,
+    "model.recurrent_poser": 1,
     "memory.vq": 1,
     "memory.vq_joint": 1,
     "memory.no_codes": 1,
@@ -42,6 +43,7 @@ RECIPES: dict[str, int] = {
     "codebook.gradient": 1,
     # how they are trained (memmlp.training)
     "sampler": 1,
+    "mirror": 1,
     "training": 1,
     "schedule.step": 1,
     "schedule.cosine": 1,
@@ -54,6 +56,7 @@ RECIPES: dict[str, int] = {
     "loss.agrol": 1,
     "loss.avatar_poser": 1,
     "loss.terms": 1,
+    "weighting.learned": 1,
     "hand.position": 1,
     "hand.fk": 1,
     "hand.off": 1,

@@ -14,6 +14,7 @@ from memmlp.evaluation import modes
 from memmlp.evaluation.metrics import OwnMetrics
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset, WindowSampler
+from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.preparing.source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architecture import Architecture
@@ -39,6 +40,7 @@ class NetworkTraining:
         weighting: how training windows are drawn, "frames" or "clips" (see WindowSampler).
         shares: how often a window is of each source (see WindowSampler).
         metrics: metrics of one's own, measured at validations.
+        mirror: whether half of the training windows are mirrored (see MirroredDataset).
     """
 
     seed: int
@@ -48,6 +50,7 @@ class NetworkTraining:
     weighting: str
     shares: Mapping[str, float] | None = None
     metrics: OwnMetrics = field(default_factory=dict)
+    mirror: bool = False
 
     def train(
         self,
@@ -81,7 +84,7 @@ class NetworkTraining:
             model,
             self.loss(model.branches).to(device),
             self.rollout.to(device),
-            dataset,
+            MirroredDataset(dataset) if self.mirror else dataset,
             self.optim,
             self.seed,
             validate=lambda network: modes.quick_stream(network, pieces, self.metrics),

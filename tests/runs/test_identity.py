@@ -107,3 +107,16 @@ def test_equal_numbers_and_orders_are_one_identity():
 
 def test_flatten_keeps_lists_and_empty_mappings():
     assert flatten({"a": {"b": 1, "c": {}}, "d": [1]}) == {"a.b": 1, "a.c": {}, "d": [1]}
+
+
+def test_keys_that_older_runs_lack_count_only_where_they_change_something():
+    """Fixed weights and windows without a mirror are what runs have from before there were such keys."""
+    terms = {**CONFIG, "loss": {"name": "terms", "rotation": 1.0}, "data": {"weighting": "frames"}}
+
+    def of(**changes: dict) -> str:
+        config = {**terms, **{group: {**terms[group], **keys} for group, keys in changes.items()}}
+        return Identity("memmlp", config, "d").what  # recipe numbers, which move as well, do not count
+
+    assert of(loss={"weighting": "fixed", "lr": 0.01}, data={"mirror": False}) == of()
+    learned = of(loss={"weighting": "learned", "lr": 0.01})
+    assert len({of(), learned, of(loss={"weighting": "learned", "lr": 0.1}), of(data={"mirror": True})}) == 4

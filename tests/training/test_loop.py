@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import tiny
 import torch
-from tiny_tasks import OPTIM, ROLLOUTS, TASKS, motion_task, vqvae_task, weights
+from tiny_tasks import OPTIM, ROLLOUTS, TASKS, motion_task, recurrent_task, vqvae_task, weights
 
 from memmlp.common.errors import InputError, TrainingDiverged
 from memmlp.config.build import build_experiment
@@ -42,7 +42,9 @@ class Kill(Exception):
     """Raised where a process is killed."""
 
 
-@pytest.mark.parametrize("make", [*ROLLOUTS, *tiny.BASELINES, "vqvae"])
+@pytest.mark.parametrize(
+    "make", [*ROLLOUTS, *tiny.BASELINES, "recurrent forced", "recurrent streams", "vqvae"]
+)
 def test_a_resumed_run_is_the_same_run(make, tmp_path):
     """It is stopped at step 7 of 12, two steps after the last checkpoint, and resumed with new objects."""
 
@@ -91,7 +93,9 @@ def test_another_seed_is_another_run(tmp_path):
     assert not torch.equal(a["module.model.stem.weight"], b["module.model.stem.weight"])
 
 
-@pytest.mark.parametrize("make", [vqvae_task, motion_task, *(TASKS[name] for name in tiny.BASELINES)])
+@pytest.mark.parametrize(
+    "make", [vqvae_task, motion_task, recurrent_task, *(TASKS[name] for name in tiny.BASELINES)]
+)
 def test_it_learns_and_logs(make, tmp_path):
     optim = replace(OPTIM, steps=60, lr=5e-3, final_lr=1e-3, batch=16, validate_every=30)
     run = Run(tmp_path)

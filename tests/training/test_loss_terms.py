@@ -145,3 +145,31 @@ def test_every_term_reaches_the_rotations(name):
     loss(motion, truth[..., SPARSE_DIM:], truth[..., :SPARSE_DIM], NORMALIZER)[0].backward()
     assert torch.isfinite(motion.grad).all()
     assert float(motion.grad[..., ROTATION].abs().sum()) > 0
+
+
+def test_learned_weights_begin_as_given_and_find_the_reciprocals_of_their_terms():
+    """At the minimum of e^-s L + s, e^-s is 1 / L, whatever the weight that it begins at."""
+    loss = TermsLoss(weighting="learned", lr=0.05, rotation=3.0, world_position=50.0)
+    assert loss.weighting.weights() == pytest.approx({"rotation": 3.0, "world_position": 50.0})
+    given = MADE, TRUE[..., SPARSE_DIM:], TRUE[..., :SPARSE_DIM], NORMALIZER
+    total, parts = loss(*given)
+    weights = {"rotation": 3.0, "world_position": 50.0}
+    expected = sum(
+        weights[name] * float(term.detach()) - np.log(weights[name]) for name, term in parts.items()
+    )
+    assert float(total.detach()) == pytest.approx(expected, rel=1e-5)
+    (group,) = loss.weighting.parameter_groups()
+    assert (group["lr"], group["weight_decay"], len(group["params"])) == (0.05, 0.0, 2)
+    optimiser = torch.optim.Adam([group])
+    for _ in range(400):
+        optimiser.zero_grad()
+        loss(*given)[0].backward()
+        optimiser.step()
+    found = {name: weight * float(parts[name]) for name, weight in loss.weighting.weights().items()}
+    assert found == pytest.approx({"rotation": 1.0, "world_position": 1.0}, rel=0.02)
+
+
+def test_a_learned_weight_is_never_zero():
+    with pytest.raises(InputError, match=r"loss\.rotation=0: allowed"):
+        TermsLoss(weighting="learned", rotation=0.0)
+    assert TermsLoss(rotation=0.0).weighting.weights() == {"rotation": 0.0}

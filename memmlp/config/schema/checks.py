@@ -13,11 +13,12 @@ from omegaconf.errors import OmegaConfBaseException
 
 from memmlp.common.errors import InputError
 from memmlp.config.schema.config import SCHEMAS, Config
-from memmlp.config.schema.network import AvatarJLMConfig, BaselineConfig, RPMConfig
+from memmlp.config.schema.network import AvatarJLMConfig, BaselineConfig, RecurrentPoserConfig, RPMConfig
 from memmlp.config.schema.training import (
     AGRoLLossConfig,
     BaselineLossConfig,
     NoHandConfig,
+    StreamsConfig,
     TeacherForcingConfig,
     TermsLossConfig,
 )
@@ -115,6 +116,10 @@ def _check_combinations(cfg: DictConfig) -> None:
         _check_baseline(cfg)
     else:
         _check_slots(cfg)
+    if "streams" in cfg.rollout and cfg.rollout.streams < cfg.optim.batch:
+        raise InputError(
+            f"rollout.streams={cfg.rollout.streams}: allowed is at least optim.batch={cfg.optim.batch}"
+        )
     if (cfg.vqvae.epochs is None) == (cfg.vqvae.steps is None):
         given = f"vqvae.epochs={cfg.vqvae.epochs}, vqvae.steps={cfg.vqvae.steps}"
         raise InputError(f"{given}: allowed is one of them, and null for the other")
@@ -160,7 +165,8 @@ def _check_baseline(cfg: DictConfig) -> None:
             raise InputError(f"{group}: {name} has none; allowed is a command line without {group}=...")
     if not _is(cfg.loss, BaselineLossConfig):
         raise InputError(f"loss: weights of Mem-MLP's terms, which {name} has not; allowed is its own loss")
-    if not _is(cfg.rollout, TeacherForcingConfig):
+    carries = _is(cfg.model, RecurrentPoserConfig) and _is(cfg.rollout, StreamsConfig)
+    if not (_is(cfg.rollout, TeacherForcingConfig) or carries):
         raise InputError(f"rollout: {name} has no history of its own; allowed is rollout=teacher_forcing")
     if cfg.evaluation.ik != "off":
         raise InputError(
@@ -220,8 +226,4 @@ def _check_slots(cfg: DictConfig) -> None:
         raise InputError(
             f"evaluation.ik={cfg.evaluation.ik} needs the positions of predictor=two_branch: "
             "allowed is evaluation.ik=off"
-        )
-    if "streams" in cfg.rollout and cfg.rollout.streams < cfg.optim.batch:
-        raise InputError(
-            f"rollout.streams={cfg.rollout.streams}: allowed is at least optim.batch={cfg.optim.batch}"
         )

@@ -36,6 +36,7 @@ from memmlp.config.schema.network import (
     NoCodesMemoryConfig,
     NoMemoryConfig,
     PredictorConfig,
+    RecurrentPoserConfig,
     RotationOnlyConfig,
     RotationOnlyMemoryConfig,
     RPMConfig,
@@ -130,6 +131,9 @@ class ProfileConfig:
     ego_poser_frames: Optional[int] = optional(Within(2))
     rpm_frames: Optional[int] = optional(Within(2))
     rpm_feedforward: Optional[int] = optional(Within(1))
+    recurrent_poser_frames: Optional[int] = optional(Within(2))
+    recurrent_poser_width: Optional[int] = optional(Within(1))
+    recurrent_poser_depth: Optional[int] = optional(Within(1))
 
 
 @dataclass
@@ -225,6 +229,7 @@ SCHEMAS: dict[str, type] = {
     "model_rpm": RPMConfig,
     "model_avatar_jlm": AvatarJLMConfig,
     "model_vae_hmd": VAEHMDConfig,
+    "model_recurrent_poser": RecurrentPoserConfig,
     "predictor_two_branch": TwoBranchConfig,
     "predictor_two_branch_memory": TwoBranchMemoryConfig,
     "predictor_rotation_only": RotationOnlyConfig,

@@ -18,6 +18,7 @@ from memmlp.config.schema.rules import (
     one_of,
     optional,
     positive,
+    standing,
     target,
 )
 
@@ -75,6 +76,7 @@ class DataConfig:
     min_frames: int = at_least(2)
     strict: bool = key()
     weighting: str = one_of("frames", "clips")
+    mirror: bool = standing(False)
 
 
 @dataclass

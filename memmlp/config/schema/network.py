@@ -119,6 +119,16 @@ class AvatarJLMConfig(AvatarPoserConfig):
 
 
 @dataclass
+class RecurrentPoserConfig(BaselineConfig):
+    """This project's own network, which has no slots either."""
+
+    name: str = called("recurrent_poser")
+    _target_: str = target("memmlp.networks.recurrent_poser.RecurrentPoser")
+    cell: str = one_of("gru", "lstm", "mingru", "lru")
+    expansion: int = at_least(1)
+
+
+@dataclass
 class PredictorConfig:
     """The predictor slot (conf/predictor)."""
 

@@ -176,6 +176,11 @@ def optional(rule: object = None) -> Any:
     return field(default=None, metadata={"rule": rule})
 
 
+def standing(value: object, rule: object = None) -> Any:
+    """Declare a key with a default, which stands for it in runs from before there was the key."""
+    return field(default=value, metadata={"rule": rule})
+
+
 def own(rule: object) -> Any:
     """Declare a list that is empty unless one asks for it, as it is in runs from before there was the key."""
     return field(default_factory=list, metadata={"rule": rule})

@@ -8,6 +8,7 @@ from typing import Optional
 from omegaconf import MISSING
 
 from memmlp.config.schema.rules import (
+    OneOf,
     Text,
     Within,
     at_least,
@@ -16,6 +17,7 @@ from memmlp.config.schema.rules import (
     one_of,
     optional,
     positive,
+    standing,
     target,
 )
 
@@ -107,6 +109,8 @@ class TermsLossConfig(BaselineLossConfig):
     name: str = called("terms")
     _target_: str = target("memmlp.training.losses.TermsLoss")
     error: str = one_of("absolute", "square", "norm", "smooth")
+    weighting: str = standing("fixed", OneOf(("fixed", "learned")))
+    lr: float = standing(1e-2, Within(0, strict=True))
     orientation: Optional[float] = optional(Within(0))
     rotation: Optional[float] = optional(Within(0))
     global_rotation: Optional[float] = optional(Within(0))

@@ -15,6 +15,7 @@ from memmlp.networks.baselines.hmd_poser import HMDPoser
 from memmlp.networks.baselines.rpm import RPM
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
+from memmlp.networks.recurrent_poser import RecurrentPoser
 from memmlp.networks.streaming.baselines import (
     AGRoLDiffusionStream,
     AGRoLMLPStream,
@@ -26,6 +27,7 @@ from memmlp.networks.streaming.baselines import (
     VAEHMDStream,
 )
 from memmlp.networks.streaming.mem_mlp import MemMLPStream
+from memmlp.networks.streaming.recurrent_poser import RecurrentPoserStream
 from memmlp.networks.streaming.ring import StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
@@ -39,6 +41,7 @@ STREAMS: dict[type[WindowModel], type[StreamingGraph]] = {
     AvatarJLM: AvatarJLMStream,
     RPM: RPMStream,
     VAEHMD: VAEHMDStream,
+    RecurrentPoser: RecurrentPoserStream,
     AGRoLMLP: AGRoLMLPStream,
     AGRoLDiffusion: AGRoLDiffusionStream,
 }

@@ -102,6 +102,28 @@ class Uncertainty(nn.Module):
         return {name: float((-s.detach()).exp()) for name, s in self.s.items()}
 
 
+class Learned(Uncertainty):
+    """Weights by uncertainty that begin at given values instead of 1.
+
+    Args:
+        values: the weights to begin with, by the terms' names.
+        lr: learning rate of the s; see Uncertainty.
+
+    Raises:
+        InputError: for a weight of 0, which e^-s never is.
+    """
+
+    def __init__(self, values: Mapping[str, float], lr: float = 1e-2):
+        super().__init__(lr)
+        if none := [name for name, value in values.items() if not value]:
+            raise InputError(
+                f"loss.{none[0]}=0: allowed with loss.weighting=learned is a weight above 0, or null"
+            )
+        self.s = nn.ParameterDict(
+            {name: nn.Parameter(-torch.tensor(float(value)).log()) for name, value in values.items()}
+        )
+
+
 Weighting = Fixed | Uncertainty
 
 

@@ -16,7 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_POSITION
 from memmlp.motion.geometry import forward_kinematics, geodesic_angle, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
-from memmlp.training.losses.loss import Fixed, Loss, Terms, joints
+from memmlp.training.losses.loss import Fixed, Learned, Loss, Terms, Weighting, joints
 
 FEET = (7, 8, 10, 11)  # both ankles, both toes
 TOES = (10, 11)
@@ -197,6 +197,12 @@ TERMS: dict[str, tuple[Callable[[Comparison, Error], Tensor], int]] = {
 """Each term, and how many frames it needs."""
 
 
+WEIGHTINGS: dict[str, Callable[[dict[str, float], float], Weighting]] = {
+    "fixed": lambda weights, lr: Fixed(weights),
+    "learned": Learned,
+}
+
+
 class TermsLoss(Loss):
     """A weighted sum of terms of the library; most baselines' losses are such sums.
 
@@ -204,18 +210,23 @@ class TermsLoss(Loss):
         error: how differences become a number where a term leaves it open: "absolute" (mean absolute
             components), "square" (mean squared ones), "norm" (mean L2 norms of joints), "smooth" (Huber's, as
             torch's smooth L1).
+        weighting: "fixed" if the weights stay, "learned" if they are those that learned ones begin at.
+        lr: learning rate of the learned weights' s.
         weights: weights by the names of TERMS; None leaves a term out.
 
     Raises:
-        InputError: if no term has a weight.
+        InputError: if no term has a weight, or a learned one is to begin at 0.
     """
 
-    def __init__(self, error: str = "absolute", **weights: float | None):
+    def __init__(
+        self, error: str = "absolute", weighting: str = "fixed", lr: float = 1e-2, **weights: float | None
+    ):
         super().__init__()
         chosen = {name: weight for name, weight in weights.items() if weight is not None}
         if not chosen:
             raise InputError(f"loss=terms: no term has a weight; allowed are {', '.join(TERMS)}")
-        self.error, self.weighting = ERRORS[error], Fixed(chosen)
+        self.error = ERRORS[error]
+        self.weighting = WEIGHTINGS[weighting](chosen, lr)
 
     def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
         """Return each term by name, for motion and truth (B, T, 198) and inputs (B, T, 54) in the world.

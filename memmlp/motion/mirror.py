@@ -1,0 +1,73 @@
+"""Motion seen in a mirror: left and right change places, as an augmentation of training data."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from memmlp.motion.body import FRAME_DIM, JOINTS, TRACKED
+from memmlp.motion.dataset import MotionDataset
+
+SIXD_SIGNS = (1.0, -1.0, -1.0, -1.0, 1.0, 1.0)  # the first two columns of S R S with S = diag(-1, 1, 1)
+POINT_SIGNS = (-1.0, 1.0, 1.0)  # S p
+
+
+def _other_side(name: str) -> str:
+    """Return the name of the joint that a joint is in the mirror."""
+    side, _, rest = name.partition("_")
+    return {"left": f"right_{rest}", "right": f"left_{rest}"}.get(side, name)
+
+
+SWAPPED = tuple(JOINTS.index(_other_side(name)) for name in JOINTS)
+TRACKED_SWAPPED = tuple(TRACKED.index(SWAPPED[joint]) for joint in TRACKED)
+
+
+def _layout() -> tuple[Tensor, Tensor]:
+    """Return where each of a frame's features (252,) is taken from in the mirror, and with which sign."""
+    sources, signs = torch.arange(FRAME_DIM), torch.ones(FRAME_DIM)
+    start = 0
+    for joints, of_each in (
+        *((TRACKED_SWAPPED, part) for part in (SIXD_SIGNS, SIXD_SIGNS, POINT_SIGNS, POINT_SIGNS)),
+        *((SWAPPED, part) for part in (SIXD_SIGNS, POINT_SIGNS)),
+    ):
+        size = len(joints) * len(of_each)
+        block = torch.arange(start, start + size).view(len(joints), -1)
+        sources[start : start + size] = block[list(joints)].flatten()
+        signs[start : start + size] = torch.tensor(of_each * len(joints))
+        start += size
+    return sources, signs
+
+
+SOURCES, SIGNS = _layout()
+
+
+def mirrored(frames: Tensor) -> Tensor:
+    """Mirror world frames [X | Theta] (..., 252) at the plane X = 0, with left and right exchanged.
+
+    A body whose rest pose is not its own mirror image becomes its mirror image, too.
+    """
+    return frames[..., SOURCES.to(frames.device)] * SIGNS.to(frames)
+
+
+class MirroredDataset(MotionDataset):
+    """Each clip of a dataset twice: as it is, and, after all of these, in the mirror.
+
+    The frames are there once; what is drawn of a mirrored clip is mirrored when it is drawn.
+    """
+
+    def __init__(self, plain: MotionDataset):
+        names = [*plain.names, *(f"{name} (mirrored)" for name in plain.names)]
+        sources = plain.sources and [*plain.sources] * 2
+        starts, lengths = plain.starts.repeat(2), plain.lengths.repeat(2)
+        super().__init__(plain.frames, starts, lengths, names, [*plain.groups] * 2, sources)
+
+    def segments(self, clip: Tensor, end: Tensor, length: int) -> Tensor:
+        """Return frames (B, length, 252) that end with frame `end` of each clip; see MotionDataset."""
+        plain = super().segments(clip, end, length)
+        turned = (clip >= len(self) // 2).to(plain.device)
+        return torch.where(turned[:, None, None], mirrored(plain), plain)
+
+    def clip(self, index: int) -> Tensor:
+        """Return all frames (N, 252) of a clip."""
+        plain = super().clip(index)
+        return mirrored(plain) if index >= len(self) // 2 else plain

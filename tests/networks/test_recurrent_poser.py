@@ -1,0 +1,175 @@
+"""RecurrentPoser: a stream whatever the calls, its graph, its sizes, its switches."""
+
+import onnx
+import pytest
+import tiny
+import torch
+
+from memmlp.common.errors import InputError
+from memmlp.config.build import build_experiment, untrained
+from memmlp.config.compose import composed
+from memmlp.deploy.export import export
+from memmlp.deploy.parity import TOLERANCE, parity
+from memmlp.deploy.quantization import quantise
+from memmlp.evaluation import modes as evaluation
+from memmlp.motion.body import ROTATION, SPARSE_DIM
+from memmlp.motion.coordinates import Heading
+from memmlp.networks.cells import CELLS
+from memmlp.networks.streaming import streaming
+
+CLIP = tiny.clip(40)
+SPARSE = CLIP[None, :, :SPARSE_DIM]
+
+
+@pytest.mark.parametrize("cell", CELLS)
+@torch.no_grad()
+def test_training_evaluation_and_the_live_graph_are_one_stream(cell):
+    """The unrolled call of training, calls of any size, both modes, and the graph of one frame."""
+    model = tiny.recurrent_poser(Heading(), cell=cell).double()
+    sparse = SPARSE.double()
+    unrolled = model.learn(sparse, model.initial_state(), CLIP[None].double())[0][0]
+    state, made = model.initial_state(), []
+    for part in sparse.split([1, 9, 30], 1):
+        motion, state = model.advance(part, state)
+        made.append(motion[0])
+    graph, carried = streaming(model), streaming(model).initial_state()
+    live = []
+    for frame in sparse.split(1, 1):
+        motion, carried = graph.advance(frame, carried)
+        live.append(motion[0])
+    modes = [evaluation.predict(model, [CLIP.double()], mode, 8)[0] for mode in ("stream", "window")]
+    for found in (torch.cat(made), torch.cat(live), *modes):
+        torch.testing.assert_close(found, unrolled, atol=1e-11, rtol=0)
+
+
+@torch.no_grad()
+def test_the_past_counts_without_end_and_the_future_does_not():
+    model, changed = tiny.recurrent_poser().double(), SPARSE.double().clone()
+    changed[:, 5] += 0.5
+    found, other = (model.advance(of, model.initial_state())[0] for of in (SPARSE.double(), changed))
+    torch.testing.assert_close(found[:, :5], other[:, :5])
+    assert (found[:, 5:] - other[:, 5:]).abs().amax(-1).min() > 1e-9
+
+
+@torch.no_grad()
+def test_positions_are_forward_kinematics_of_the_rotations():
+    model = tiny.recurrent_poser(Heading())
+    motion = evaluation.stream(model, [CLIP])[0]
+    expected = model.normalizer.pose(motion, CLIP[:, :SPARSE_DIM]).flatten(1)
+    torch.testing.assert_close(motion[:, ROTATION.stop :], expected, atol=1e-5, rtol=0)
+
+
+@torch.no_grad()
+def test_side_by_side_is_one_by_one():
+    model, clips = tiny.recurrent_poser(), [tiny.clip(n, seed=n) for n in (4, 25, 14)]
+    for together, clip in zip(evaluation.predict(model, clips, "stream", 8), clips, strict=True):
+        torch.testing.assert_close(together, evaluation.stream(model, [clip])[0], atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("cell", CELLS)
+@torch.no_grad()
+def test_cells_stay_exact_where_layers_are_rounded(cell):
+    model, calls = tiny.recurrent_poser(cell=cell), []
+    block = model.blocks["block2"]
+    block.cell.register_forward_hook(lambda of, given, made: calls.append((given, made)))
+    with torch.autocast("cpu", torch.bfloat16):
+        assert model.blocks["block1"].mlp(torch.zeros(1, 16)).dtype == torch.bfloat16
+        model.learn(SPARSE, model.initial_state(), CLIP[None])
+    given, made = calls[0]
+    for found, expected in zip(made, block.cell(*given), strict=True):
+        assert found.dtype == torch.float32
+        torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+
+
+CHANGES = [
+    {"width": 12},
+    {"depth": 1},
+    {"expansion": 1},
+    {"cell": "lstm"},
+    {"cell": "mingru"},
+    {"cell": "lru"},
+]
+
+
+@pytest.mark.parametrize("change", CHANGES, ids=str)
+@torch.no_grad()
+def test_every_knob_changes_the_motion(change):
+    base, other = (evaluation.stream(tiny.recurrent_poser(**c), [CLIP])[0] for c in ({}, change))
+    assert not torch.allclose(base, other, atol=1e-4)
+
+
+def test_a_training_window_is_all_that_a_step_moves_by():
+    model = tiny.recurrent_poser(frames=9)
+    assert (model.frames, model.stride, model.length) == (9, 9, 0)
+
+
+@pytest.mark.parametrize(("profile", "width", "depth"), [("small", 128, 3), ("paper", 256, 6)])
+def test_parameters(profile, width, depth):
+    """A block's GRU is 6 d d + 6 d, its MLP of 2 d hidden units 4 d d + 3 d, its two norms 4 d."""
+    model = untrained(["model=recurrent_poser", f"profile={profile}"])
+    ends = 54 * width + width + 2 * width + 132 * width + 132
+    assert model.count_parameters() == depth * (10 * width**2 + 13 * width) + ends
+    assert model.count_parameters() < 4_200_000
+
+
+@pytest.mark.slow
+def test_the_file_is_the_network_and_its_inner_layers_become_int8(tmp_path):
+    model, exact, int8 = tiny.recurrent_poser(Heading()), tmp_path / "step.onnx", tmp_path / "int8.onnx"
+    stream = streaming(model)
+    export(stream, exact, "0" * 16)
+    assert parity(model, exact, CLIP) <= TOLERANCE
+    quantise(exact, int8, stream.ends, [CLIP])
+    graph = onnx.load(int8).graph
+    types = {tensor.name: tensor.data_type for tensor in graph.initializer}
+    given = {node.output[0]: node.input[0] for node in graph.node if node.op_type == "DequantizeLinear"}
+    kinds: dict[bool, set[int]] = {True: set(), False: set()}
+    for node in graph.node:
+        if node.op_type in ("Gemm", "MatMul") and (name := given.get(node.input[1], node.input[1])) in types:
+            kinds[".blocks." in name].add(types[name])
+    assert kinds[True] == {onnx.TensorProto.INT8}
+    assert onnx.TensorProto.FLOAT in kinds[False]
+
+
+def test_it_sees_the_world_as_the_head_looks_and_learns_the_weights_of_its_loss():
+    cfg = composed(["model=recurrent_poser", "profile=tiny"])
+    assert (cfg.frame.coordinates, cfg.frame.normalize) == ("heading", True)
+    assert (cfg.memory, cfg.predictor, cfg.hand) == (None, None, None)
+    loss = build_experiment(cfg).training.loss(frozenset({"rotation"}))
+    begun = {name: value for name, value in cfg.loss.items() if name in loss.weighting.weights()}
+    assert loss.weighting.weights() == pytest.approx(begun)
+    assert set(begun) == {"orientation", "rotation", "world_position", "velocity", "velocity_3", "velocity_5"}
+
+
+REFUSED = [
+    (["model.cell=rnn"], "model.cell=rnn"),
+    (["model.expansion=0"], "model.expansion=0"),
+    (["memory=none"], "memory"),
+    (["rollout=own_predictions"], "rollout"),
+    (["rollout=streams", "rollout.streams=7"], "rollout.streams=7"),
+    (["loss.weighting=free"], "loss.weighting=free"),
+    (["loss.lr=0"], "loss.lr=0"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "word"), REFUSED, ids=[" ".join(words) for words, _ in REFUSED])
+def test_what_makes_no_sense_is_refused_in_one_line(overrides, word):
+    with pytest.raises(InputError) as refusal:
+        composed(["model=recurrent_poser", "profile=tiny", *overrides])
+    assert word in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_its_state_may_be_carried_through_training():
+    cfg = composed(["model=recurrent_poser", "profile=tiny", "rollout=streams"])
+    assert build_experiment(cfg).training.rollout.streams == 16
+
+
+def test_each_cell_is_a_run_of_its_own():
+    def identity(*words: str) -> str:
+        return build_experiment(composed(["model=recurrent_poser", "profile=tiny", *words])).identity("d").id
+
+    ids = [identity(f"model.cell={cell}") for cell in CELLS]
+    ids += [identity("loss.weighting=fixed"), identity("loss.lr=0.1"), identity("rollout=streams")]
+    ids += [identity("data.mirror=true")]
+    assert len(set(ids)) == len(ids)
+    assert identity("loss.weighting=fixed", "loss.lr=0.1") == identity("loss.weighting=fixed")
