@@ -1,0 +1,24 @@
+"""What the pages of runs are told of metrics."""
+
+from __future__ import annotations
+
+from own_package import registers_kept
+
+from memmlp.evaluation.units import HIGHER, UNITS
+from memmlp.ui.runs import units
+
+
+def test_units_and_what_is_better_where_somebody_knows():
+    names = ["MPJPE", "Jitter", "GT Jitter", "Score", "Odd"]
+    metrics = [*(f"stream.rotation.{name}" for name in names), "window.rotation.MPJPE", "latency.median_ms"]
+    with registers_kept():
+        UNITS["Score"] = "points"
+        HIGHER.add("Score")
+        assert units(metrics) == {
+            "MPJPE": {"unit": "cm", "better": "lower"},
+            "Jitter": {"unit": "10² m/s³", "better": "lower"},
+            "GT Jitter": {"unit": "10² m/s³", "better": ""},
+            "Score": {"unit": "points", "better": "higher"},
+            "median_ms": {"unit": "ms", "better": "lower"},
+        }
+    assert "Score" not in units(metrics)
