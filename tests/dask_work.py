@@ -1,10 +1,11 @@
-"""What a worker of Dask does in tests: importable where the worker runs."""
+"""What workers of Dask do in tests: importable where they run."""
 
 from __future__ import annotations
 
 import os
 import threading
 from pathlib import Path
+from typing import Any
 
 
 def stay(folder: Path) -> None:
@@ -13,3 +14,8 @@ def stay(folder: Path) -> None:
     mine.write_text(str(os.getppid()))
     mine.rename(mine.with_suffix(".txt"))
     threading.Event().wait()
+
+
+def tasks(dask_worker: Any) -> list[str]:
+    """The states of a worker's tasks."""
+    return [task.state for task in dask_worker.state.tasks.values()]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-from dask_work import stay
+from dask_work import stay, tasks
 from processes import until
 
 from memmlp.common.errors import InputError
@@ -51,8 +51,28 @@ def cluster() -> Iterator[Any]:
         yield made
 
 
+@pytest.fixture
+def connect(cluster: Any) -> Iterator[Callable[..., Dask]]:
+    """Makes executors on the cluster, whose connections end before it does."""
+    made: list[Dask] = []
+
+    def connected(gpus: bool = True, **words: str) -> Dask:
+        made.append(Dask(dask_options({"address": cluster.scheduler_address, **words}), gpus))
+        return made[-1]
+
+    yield connected
+    for one in made:
+        one.client.close()
+
+
 def begun(folder: Path, count: int) -> list[Path]:
     return until(lambda: len(found := [*folder.glob("*.txt")]) == count and found, f"{count} began")
+
+
+def states(executor: Dask) -> list[str]:
+    """What Dask's workers say of their tasks that have not ended."""
+    every = executor.client.run(tasks).values()
+    return sorted(state for states in every for state in states if state != "memory")
 
 
 def gone(pid: int) -> bool:
@@ -61,14 +81,17 @@ def gone(pid: int) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_workers_take_up_gpus_and_are_ended(cluster: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    made = Dask(dask_options({"address": cluster.scheduler_address}))
+def test_workers_take_up_gpus_and_are_ended(
+    cluster: Any, connect: Callable[..., Dask], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    made = connect()
     assert (made.gpus, made.resources) == (True, {"GPU": 1.0})
     (asked,) = made.submit(partial(os.getenv, "NO_SUCH_VARIABLE", "a line"))
     until(lambda: not asked.alive(), "the worker ends")
     assert asked.complaint() == "a line"
 
     three = made.submit(partial(stay, tmp_path), 3)  # of which one waits for a GPU
+    until(lambda: states(made) == ["constrained", "executing", "executing"], "one waits")
     found = begun(tmp_path, 2)
     assert len({path.read_text() for path in found}) == 2
     for path in found:
@@ -77,14 +100,15 @@ def test_workers_take_up_gpus_and_are_ended(cluster: Any, tmp_path: Path, capsys
     until(lambda: sum(worker.alive() for worker in three) == 2, "one is dead")
     dead = next(worker for worker in three if not worker.alive())
     assert dead.complaint() is None
+    assert "ended with -9" in str(dead.future.exception())
     begun(tmp_path, 1)  # the one that waited
     for worker in three:
         worker.cancel()
     until(lambda: all(gone(int(path.stem)) for path in [found[1], *tmp_path.glob("*.txt")]), "all ended")
 
-    bare = Dask(dask_options({"address": cluster.scheduler_address}), gpus=False)
+    bare = connect(gpus=False)
     (worker,) = bare.submit(partial(os.getenv, "CUDA_VISIBLE_DEVICES", "all"))
     until(lambda: not worker.alive(), "the worker ends")
     assert worker.complaint() is None  # empty: it sees none
-    Dask(dask_options({"address": cluster.scheduler_address, "resources.GPU": "2"}))
+    connect(**{"resources.GPU": "2"})
     assert "no worker has 2 GPU; tasks wait until one comes" in capsys.readouterr().err
