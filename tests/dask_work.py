@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import threading
 from pathlib import Path
-from typing import Any
 
 
 def stay(folder: Path) -> None:
@@ -14,8 +13,3 @@ def stay(folder: Path) -> None:
     mine.write_text(str(os.getppid()))
     mine.rename(mine.with_suffix(".txt"))
     threading.Event().wait()
-
-
-def tasks(dask_worker: Any) -> list[str]:
-    """The states of a worker's tasks."""
-    return [task.state for task in dask_worker.state.tasks.values()]

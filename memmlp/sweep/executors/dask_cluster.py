@@ -6,6 +6,7 @@ threads, and where nobody can end them. So a task starts a process and looks aft
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
 import subprocess
@@ -106,17 +107,38 @@ class Dask:
             self.client = Client(address, set_as_default=False)
         except (OSError, ValueError) as error:
             raise InputError(f"dask.address={address}: {' '.join(str(error).split())}") from None
-        there = _resources(self.client)
-        self.resources = ({GPU: 1.0} if gpus and GPU in there else {}) | dict(options.resources)
+        declared = any(GPU in there for there in self._declared())
+        self.resources = ({GPU: 1.0} if gpus and declared else {}) | dict(options.resources)
         self.gpus = self.resources.get(GPU, 0) > 0
+        self.tasks: list[DaskTask] = []
         if gpus and not self.gpus:
             _say("no worker declares a GPU (dask worker --resources GPU=1): runs have none")
-        for name in (name for name, amount in self.resources.items() if amount > there.get(name, 0)):
-            _say(f"no worker has {self.resources[name]:g} {name}; tasks wait until one comes")
+        if not self._room():
+            asked = ", ".join(f"{amount:g} {name}" for name, amount in self.resources.items())
+            _say(f"no worker of the cluster has {asked}; runs wait until one comes")
 
     def submit(self, work: Work, count: int = 1) -> list[DaskTask]:
-        """Start workers."""
-        return [self._submit(work, f"memmlp-{uuid.uuid4().hex}") for _ in range(count)]
+        """Start workers, as many of them as the cluster has room for at present.
+
+        Dask would bind any more to a worker that is taken, and leave them there when another gets free.
+        """
+        self.tasks = [task for task in self.tasks if task.alive()]
+        free = max(self._room() - len(self.tasks), 0)
+        made = [self._submit(work, f"memmlp-{uuid.uuid4().hex}") for _ in range(int(min(count, free)))]
+        self.tasks += made
+        return made
+
+    def _room(self) -> float:
+        """Return how many of our workers have their resources at once; without any, as many as you like."""
+        asked = {name: amount for name, amount in self.resources.items() if amount}
+        if not asked:
+            return math.inf
+        every = self._declared()
+        return sum(min(there.get(name, 0) // amount for name, amount in asked.items()) for there in every)
+
+    def _declared(self) -> list[Mapping[str, float]]:
+        """Return the resources that each of the cluster's workers declares."""
+        return [one["resources"] for one in self.client.scheduler_info(n_workers=-1)["workers"].values()]
 
     def _submit(self, work: Work, name: str) -> DaskTask:
         from distributed import Event
@@ -124,15 +146,6 @@ class Dask:
         wanted = {"resources": dict(self.resources)} if self.resources else {}
         future = self.client.submit(_apart, work, name, self.gpus, key=name, pure=False, **wanted)
         return DaskTask(future, Event(name, self.client))
-
-
-def _resources(client: Any) -> dict[str, float]:
-    """Return the most that one of the cluster's workers has of each resource."""
-    found: dict[str, float] = {}
-    for worker in client.scheduler_info(n_workers=-1)["workers"].values():
-        for name, amount in worker["resources"].items():
-            found[name] = max(amount, found.get(name, 0))
-    return found
 
 
 def _say(line: str) -> None:

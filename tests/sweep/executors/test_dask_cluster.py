@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from dask_work import stay, tasks
+from dask_work import stay
 from processes import until
 
 from memmlp.common.errors import InputError
@@ -69,12 +69,6 @@ def begun(folder: Path, count: int) -> list[Path]:
     return until(lambda: len(found := [*folder.glob("*.txt")]) == count and found, f"{count} began")
 
 
-def states(executor: Dask) -> list[str]:
-    """What Dask's workers say of their tasks that have not ended."""
-    every = executor.client.run(tasks).values()
-    return sorted(state for states in every for state in states if state != "memory")
-
-
 def gone(pid: int) -> bool:
     return not Path("/proc", str(pid)).exists()
 
@@ -86,29 +80,29 @@ def test_workers_take_up_gpus_and_are_ended(
 ):
     made = connect()
     assert (made.gpus, made.resources) == (True, {"GPU": 1.0})
-    (asked,) = made.submit(partial(os.getenv, "NO_SUCH_VARIABLE", "a line"))
-    until(lambda: not asked.alive(), "the worker ends")
-    assert asked.complaint() == "a line"
+    (worker,) = made.submit(partial(os.getenv, "NO_SUCH_VARIABLE", "a line"))
+    until(lambda: not worker.alive(), "the worker ends")
+    assert worker.complaint() == "a line"
 
-    three = made.submit(partial(stay, tmp_path), 3)  # of which one waits for a GPU
-    until(lambda: states(made) == ["constrained", "executing", "executing"], "one waits")
+    both = made.submit(partial(stay, tmp_path), 3)  # a third would wait for a GPU
     found = begun(tmp_path, 2)
-    assert len({path.read_text() for path in found}) == 2
-    for path in found:
-        path.unlink()
+    assert len(both) == len({path.read_text() for path in found}) == 2
+    asked = [cluster.scheduler.tasks[worker.future.key].resource_restrictions for worker in both]
+    assert asked == [{"GPU": 1.0}] * 2
     os.kill(int(found[0].stem), signal.SIGKILL)
-    until(lambda: sum(worker.alive() for worker in three) == 2, "one is dead")
-    dead = next(worker for worker in three if not worker.alive())
+    until(lambda: sum(worker.alive() for worker in both) == 1, "one is dead")
+    dead = next(worker for worker in both if not worker.alive())
     assert dead.complaint() is None
     assert "ended with -9" in str(dead.future.exception())
-    begun(tmp_path, 1)  # the one that waited
-    for worker in three:
+    (third,) = made.submit(partial(stay, tmp_path), 3)  # in its place
+    begun(tmp_path, 3)
+    for worker in (*both, third):
         worker.cancel()
-    until(lambda: all(gone(int(path.stem)) for path in [found[1], *tmp_path.glob("*.txt")]), "all ended")
+    until(lambda: all(gone(int(path.stem)) for path in tmp_path.glob("*.txt")), "all ended")
 
     bare = connect(gpus=False)
     (worker,) = bare.submit(partial(os.getenv, "CUDA_VISIBLE_DEVICES", "all"))
     until(lambda: not worker.alive(), "the worker ends")
     assert worker.complaint() is None  # empty: it sees none
     connect(**{"resources.GPU": "2"})
-    assert "no worker has 2 GPU; tasks wait until one comes" in capsys.readouterr().err
+    assert "no worker of the cluster has 2 GPU; runs wait until one comes" in capsys.readouterr().err
