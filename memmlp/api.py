@@ -40,16 +40,19 @@ Branch = Literal["rotation", "position"]
 COLUMNS = ("run", "seed", "mode", "branch", "clip", "group", "frames", *UNITS)
 
 
-def load_run(name: StrPath, outputs: StrPath | None = None) -> TrainedRun:
+def load_run(name: StrPath, outputs: StrPath | None = None, *, plugins: Sequence[str] = ()) -> TrainedRun:
     """The finished run of a motion network.
 
     Args:
         name: an id, the beginning of one, or a run's folder.
         outputs: the folder of runs; by default that of the command line, $MEMMLP_OUTPUTS or "outputs".
+        plugins: packages with components of your own, whose code may be run. Installed ones that have an
+            entry point need no naming; a run's record alone never makes anything be imported.
 
     Raises:
-        InputError: where there is none, there are several, or it is not finished.
+        InputError: where there is none, there are several, or it is not finished, or a package is not there.
     """
+    _use(plugins)
     run = find_run(_outputs(outputs), os.fspath(name))
     check_trained(run)
     return TrainedRun(run)
@@ -62,12 +65,14 @@ class Runs(Sequence["TrainedRun"]):
 
     Args:
         outputs: the folder of runs; by default that of the command line, $MEMMLP_OUTPUTS or "outputs".
+        plugins: packages with components of your own, as for `load_run`.
 
     Raises:
-        InputError: where it has no runs' folder.
+        InputError: where it has no runs' folder, or a package is not there.
     """
 
-    def __init__(self, outputs: StrPath | None = None):
+    def __init__(self, outputs: StrPath | None = None, *, plugins: Sequence[str] = ()):
+        _use(plugins)
         folder = _outputs(outputs)
         if not (folder / "runs").is_dir():
             raise InputError(f"outputs {folder}: has no folder runs; allowed is what memmlp train wrote to")
@@ -164,7 +169,10 @@ class TrainedRun(os.PathLike[str]):
 
     @cached_property
     def model(self) -> WindowModel:
-        """The trained network, a torch module in evaluation mode on the processor."""
+        """The trained network, a torch module in evaluation mode on the processor.
+
+        Raises InputError where it has code of a package that is not here, or that nobody named.
+        """
         return self._opened.network()
 
     def predict(self, clip: str, mode: Mode = "stream") -> Prediction:
@@ -348,6 +356,16 @@ class Prediction:
 def _outputs(given: StrPath | None) -> Path:
     """The outputs folder of an argument, or the command line's."""
     return Path(os.environ.get("MEMMLP_OUTPUTS", "outputs") if given is None else given)
+
+
+def _use(plugins: Sequence[str]) -> None:
+    """Use packages of one's own. Raises InputError for a single text, or where one is not there."""
+    if isinstance(plugins, str):
+        raise InputError(f"plugins {plugins!r}: allowed is a list of names, [{plugins!r}]")
+    if plugins:
+        from memmlp.config.plugins import activate
+
+        activate(plugins)
 
 
 def _check(key: str, value: object, allowed: Iterable[object]) -> None:

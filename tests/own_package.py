@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from command_line import SMALL
 
 from memmlp.common.plugin import METRICS
 from memmlp.config import plugins
@@ -17,6 +18,9 @@ from memmlp.runs.recipes import RECIPES
 
 EXAMPLE = Path(__file__).parent.parent / "docs/examples/feet"
 PACKAGE = "memmlp_feet"
+TINY = ["profile=tiny", *SMALL, "tracking=none", "threads=1", "optim.validate_every=20"]
+KILLED = [*TINY, "optim.steps=40", "optim.checkpoint_every=5"]
+"""Words of a run that takes long enough to be killed at a checkpoint."""
 REGISTERS = (METRICS, SCHEMAS, SMALLEST, UNITS, RECIPES, HIGHER, plugins._active, plugins._folders)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from own_package import registers_kept
 from PIL import Image
 
 import memmlp
@@ -234,6 +235,30 @@ def test_unknown_clips_and_modes_are_one_line(run: memmlp.TrainedRun):
         run.predict("nobody")
     with refused("mode live", "stream, window"):
         run.predict(run.clips[0], "live")  # type: ignore[arg-type]
+
+
+def test_code_of_ones_own_runs_only_where_the_script_names_its_package(
+    three: memmlp.Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Whatever a run's record names, and be it a module that lies here."""
+    (tmp_path / "mine.py").write_text("from memmlp.training.losses import Term\nclass Still(Term): pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    folder = three[0].folder
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    term = {"name": "still", "_target_": "mine.Still", "weight": 1.0}
+    (folder / "config.yaml").write_text(yaml.safe_dump({**config, "plugins": ["mine"], "term": term}))
+    with registers_kept():
+        with pytest.raises(memmlp.InputError, match=r"trust it, .* in Python plugins=\['mine'\]"):
+            _ = memmlp.load_run(folder).model
+        assert "mine" not in sys.modules
+        assert not memmlp.load_run(folder, plugins=["mine"]).model.training
+    with registers_kept():
+        (found,) = (run for run in memmlp.Runs(tmp_path, plugins=["mine"]) if run.folder == folder)
+        assert found.clips
+    with pytest.raises(memmlp.InputError, match=r"plugins 'mine': allowed is a list of names, \['mine'\]"):
+        memmlp.load_run(folder, plugins="mine")
+    with pytest.raises(memmlp.InputError, match=r"plugin nowhere: there is no such package here"):
+        memmlp.load_run(folder, plugins=["nowhere"])
 
 
 def test_a_picture_is_drawn(prediction: memmlp.Prediction, tmp_path: Path):

@@ -8,14 +8,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from command_line import MAIN, SMALL, run, run_apart
-from own_package import EXAMPLE, PACKAGE
+from command_line import MAIN, run, run_apart
+from own_package import EXAMPLE, KILLED, PACKAGE, TINY
 from processes import started, until
 
 from memmlp.runs.lookup import list_runs
 
-TINY = ["profile=tiny", *SMALL, "tracking=none", "threads=1", "optim.validate_every=20"]
-STEPS = ["optim.steps=40", "optim.checkpoint_every=5"]
 OWN = [f"plugins=[{PACKAGE}]", "experiment=feet"]
 
 
@@ -25,7 +23,7 @@ def test_components_of_ones_own_go_through_everything(
 ):
     home = tmp_path
     # trained, killed, resumed
-    words = ["train", *OWN, *TINY, *STEPS]
+    words = ["train", *OWN, *KILLED]
     with started([*MAIN, *words], cwd=home) as process:
         found = until(lambda: [*home.glob("outputs/runs/*/checkpoint.safetensors")], "a checkpoint", process)
         process.kill()
@@ -48,7 +46,7 @@ def test_components_of_ones_own_go_through_everything(
 
     # swept, shown in a table and a page: one arm is the run that there is
     sweep = shutil.copy(EXAMPLE / "feet.yaml", home)
-    quick = [sweep, *TINY, *STEPS, "export.graph=off"]
+    quick = [sweep, *KILLED, "export.graph=off"]
     shown = run_apart(home, "sweep", *quick, "--workers", "1")
     assert "2 of 2 runs done" in shown
     assert len(list_runs(home / "outputs")) == 2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -22,20 +21,9 @@ if TYPE_CHECKING:
 def record(sweep: Sweep, outputs: Path) -> Path:
     """Return the file where a sweep's rounds are kept."""
     from memmlp.config.plan_sweep import sweep_folder
+    from memmlp.tables.rounds_file import NAME
 
-    return sweep_folder(sweep, outputs) / "rounds.json"
-
-
-def read(path: Path) -> Rounds | None:
-    """Read the rounds of a file; None where there is no file. Raises InputError where it is damaged."""
-    from memmlp.tables.rounds import of_json
-
-    try:
-        return of_json(json.loads(path.read_bytes()))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: no record of rounds ({error}); remove it to begin anew") from None
+    return sweep_folder(sweep, outputs) / NAME
 
 
 def begun(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
@@ -50,6 +38,7 @@ def begun(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
         InputError: where looks were taken of another sweep than it is now, or with another maximum.
     """
     from memmlp.tables.rounds import MOST, begin
+    from memmlp.tables.rounds_file import read
 
     path = record(sweep, outputs)
     kept = read(path)
@@ -92,6 +81,7 @@ def until_decided(
     from dataclasses import replace
 
     from memmlp.config.plan_sweep import planned
+    from memmlp.tables.rounds_file import same_runs
 
     while True:
         spent = rounds.spent(sweep)
@@ -118,6 +108,7 @@ def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
     from memmlp.tables.build_table import finished
     from memmlp.tables.measured_run import load
     from memmlp.tables.rounds import advanced, as_json
+    from memmlp.tables.rounds_file import read
     from memmlp.tables.runs_of_plan import finder
 
     path = record(sweep, outputs)
@@ -133,36 +124,10 @@ def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
 
 def names(rounds: Rounds, sweep: Sweep, plan: Plan) -> dict[str, str]:
     """Return, by label, a digest of the runs that each arm's next look will compare."""
-    ahead = rounds.next_looks(sweep)
-    return {label: _name(rounds, sweep, plan, label, rounds.looks[number]) for label, number in ahead.items()}
+    from memmlp.tables.rounds_file import name_of
 
-
-def _name(rounds: Rounds, sweep: Sweep, plan: Plan, label: str, seeds: int) -> str:
-    """Digest the identities of the first runs, that many seeds, of an arm and its control.
-
-    The identities include the evaluations that the sweep shows of them.
-    """
-    from memmlp.config.plan_sweep import digest
-    from memmlp.tables.rounds import pair_of
-
-    keys = {(entry.label, entry.seed): entry.key for entry in plan.entries}
-    cells = [keys.get((one, seed)) for one in pair_of(sweep, label) for seed in rounds.seeds[:seeds]]
-    return digest(cells)[:16]
-
-
-def same_runs(rounds: Rounds, sweep: Sweep, plan: Plan, path: Path) -> None:
-    """Check that past looks compared the very runs that the sweep's arms have now.
-
-    Raises:
-        InputError: where a look was of other runs, because data, configs or recipes changed since.
-    """
-    for taken in rounds.taken:
-        for label, name in taken.runs.items():
-            if name != _name(rounds, sweep, plan, label, taken.seeds):
-                raise InputError(
-                    f"{path}: its looks were taken of other runs of '{label}': data, configs or recipes "
-                    "changed since; remove it to begin anew"
-                )
+    looks = {label: rounds.looks[number] for label, number in rounds.next_looks(sweep).items()}
+    return {label: name_of(rounds, sweep, plan, label, seeds) for label, seeds in looks.items()}
 
 
 def _difference(kept: Rounds, wanted: Rounds) -> str | None:
@@ -196,6 +161,7 @@ def shown(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> Shown:
     Otherwise the sweep is shown with its own seeds, and a flag says so where rounds were taken.
     """
     from memmlp.config.plan_sweep import planned
+    from memmlp.tables.rounds_file import read, same_runs
 
     path = record(sweep, outputs)
     kept = read(path)
@@ -230,6 +196,8 @@ def of_another(kept: Rounds, sweep: Sweep, chosen: bool = False) -> str | None:
 
 def spent_before(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
     """Return a flag for verdicts of a fixed number of seeds, where rounds were taken of the sweep before."""
+    from memmlp.tables.rounds_file import read
+
     kept = read(record(sweep, outputs))
     if kept is None or not kept.taken:
         return ()
@@ -246,17 +214,15 @@ def schedule(rounds: Rounds) -> str:
 
 def told(rounds: Rounds, sweep: Sweep, last: Look | None = None) -> list[str]:
     """Say how far each arm is: comparisons decided and open, seeds so far, and its next look."""
-    latest = rounds.latest()
-    ahead, counts = rounds.next_looks(sweep), rounds.counts(sweep)
-    tally: dict[str, Counter[str]] = {label: Counter() for label in counts}
-    for finding, _ in latest.values():
-        tally[finding.label]["open" if finding.verdict == "open" else "decided"] += 1
-    decided = sum(one["decided"] for one in tally.values())
+    from memmlp.tables.rounds import standings
+
+    arms = standings(rounds, sweep)
+    decided = sum(arm.decided for arm in arms)
     head = f"look at {last.seeds} seeds ({100 * last.level:.2g} %): " if last else ""
     rows = [("arm", "decided", "open", "seeds", "next")]
-    for label, one in tally.items():
-        following = f"look at {rounds.looks[ahead[label]]}" if label in ahead else ""
-        rows.append((label, str(one["decided"]), str(one["open"]), str(counts[label]), following))
+    for arm in arms:
+        following = f"look at {arm.next}" if arm.next else ""
+        rows.append((arm.label, str(arm.decided), str(arm.open), str(arm.seeds), following))
     return [f"{head}{decided} of {len(rounds.family(sweep))} comparisons decided", *_lined(rows)]
 
 

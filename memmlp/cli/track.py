@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Sequence
-from importlib.util import find_spec
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -95,6 +95,15 @@ def show_in_trackers(plan: Plan, folder: Path, table: Table) -> None:
         build_tracking(OmegaConf.create(dict(plan.tasks[0].config))).sweep(folder)
 
 
+def whole() -> bool:
+    """Return whether MLflow is installed with its page, which mlflow-skinny lacks."""
+    try:
+        metadata.version("mlflow")
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
 @click.command("mlflow")
 @click.option("--port", default=5000, show_default=True)
 @outputs_option
@@ -104,6 +113,6 @@ def mlflow(port: int, outputs: Path) -> None:
 
     store = MLflow(None, outputs).place
     program = shutil.which("mlflow")
-    if program is None or find_spec("mlflow.server") is None:  # mlflow-skinny has no server
+    if program is None or not whole():
         raise InputError("mlflow: its page is not installed; pip install 'memmlp[mlflow]'")
     os.execv(program, [program, "ui", "--backend-store-uri", store, "--port", str(port)])

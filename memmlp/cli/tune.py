@@ -93,7 +93,7 @@ def prepared(words: Sequence[str], config_dir: Path | None, outputs: Path) -> Se
     Raises:
         InputError: naming the key that is wrong.
     """
-    from memmlp.config.plan_sweep import digest
+    from memmlp.common.files import digest
     from memmlp.config.plugins import activate, named
     from memmlp.search.spec import parse_search
 

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from memmlp.sweep.executors.gpus import Share
     from memmlp.sweep.plan import Plan
 
-ENGINES = ("local", "slurm", "ray", "debug")  # the last one is for finding bugs
+ENGINES = ("local", "slurm", "ray", "dask", "debug")  # the last one is for finding bugs
 WITHOUT = {"cpu", "mps"}  # devices of runs that no GPU need be given to
-SETTINGS = ("slurm", "ray")  # executors with words of their own
+SETTINGS = ("slurm", "ray", "dask")  # executors with words of their own
 OWN = "executor"  # the words executor.KEY=VALUE are for one that is the path of a class
 
 
@@ -61,6 +61,10 @@ class Workers:
             from memmlp.sweep.executors.ray_cluster import ray_options
 
             return ray_options(self.words)
+        if self.engine == "dask":
+            from memmlp.sweep.executors.dask_cluster import dask_options
+
+            return dask_options(self.words)
         return None
 
     def script(self, folder: Path) -> str | None:
@@ -174,7 +178,7 @@ def split_executor(words: Iterable[str]) -> tuple[str, dict[str, str], tuple[str
         else:
             rest.append(word)
     if engine not in ENGINES and "." not in engine:
-        raise InputError(f"executor={engine}: allowed is local, slurm or ray, or the path of your own class")
+        raise InputError(f"executor={engine}: allowed is local, slurm, ray or dask, or the path of a class")
     for key, _ in own:
         group = key.split(".")[0]
         if group != (OWN if "." in engine else engine):
@@ -200,6 +204,10 @@ def executor(workers: Workers, folder: Path, shared: list[Share], gpus: bool) ->
         from memmlp.sweep.executors.ray_cluster import Ray
 
         return Ray(workers.settings(), gpus)
+    if workers.engine == "dask":
+        from memmlp.sweep.executors.dask_cluster import Dask
+
+        return Dask(workers.settings(), gpus)
     if "." in workers.engine:
         from memmlp.config.instantiate import located
 

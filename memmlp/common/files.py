@@ -78,6 +78,14 @@ def file_digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def digest(value: Any) -> str:
+    """Return the SHA-256 digest (hex) of a value that JSON can hold.
+
+    What JSON can't hold enters as its text, so a dataclass has to be given as its `asdict`.
+    """
+    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()
+
+
 def read_json(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file, or an empty one if the file is missing or does not parse."""
     try:

@@ -6,15 +6,13 @@ the code and the data are unchanged.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import read_json, write_json
+from memmlp.common.files import digest, read_json, write_json
 from memmlp.config.packaged import packaged
 from memmlp.config.plugins import activate, named, texts
 from memmlp.sweep.kept import keep
@@ -199,11 +197,3 @@ def _remember(sweep: Sweep, plan: Plan, path: Path) -> None:
     before = read_json(path).get("entries", [])
     every = {(e["label"], e["seed"], e["id"]): e for e in [*before, *map(asdict, plan.entries)]}
     write_json(path, {"entries": list(every.values())})
-
-
-def digest(value: Any) -> str:
-    """Return the SHA-256 digest (hex) of a value that JSON can hold.
-
-    What JSON can't hold enters as its text, so a dataclass has to be given as its `asdict`.
-    """
-    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()

@@ -1,8 +1,9 @@
 """Packages with components of one's own: which are in use, and whose code a run may so name.
 
-A package is used where the user's command (`plugins=[NAME]`, `--plugins NAME`), a sweep's base, the
-environment (MEMMLP_PLUGINS) or an installed entry point of the group `memmlp.plugins` names it. Reading a run
-imports no package by itself: a run's folder may come from anybody.
+A package is used where the user's command (`plugins=[NAME]`, `--plugins NAME`) or script (`load_run(ID,
+plugins=[NAME])`), a sweep's base, the environment (MEMMLP_PLUGINS) or an installed entry point of the group
+`memmlp.plugins` names it. Reading a run imports no package by itself: a run's folder may come from anybody,
+and any module that lies on the path (a script in the current folder, too) would do something when imported.
 """
 
 from __future__ import annotations
@@ -257,4 +258,5 @@ def _refusal(name: str, recorded: Mapping[str, Any]) -> str:
     said = f"{name} {version}" if version else name
     if not NAME.fullmatch(name) or importlib.util.find_spec(name.split(".")[0]) is None:
         return f"made with the package {said}, which is not here; install it, or put its folder on PYTHONPATH"
-    return f"names code of the package {said}; to trust it, say --plugins {name} or {VARIABLE}={name}"
+    ways = f"--plugins {name} or {VARIABLE}={name}, in Python plugins=['{name}']"
+    return f"names code of the package {said}; to trust it, say {ways}"

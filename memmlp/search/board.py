@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from optuna.trial import FrozenTrial, TrialState
@@ -15,7 +15,7 @@ from rich.text import Text
 from memmlp.runs.run import Run
 from memmlp.search.spec import Search
 from memmlp.search.study import Study, deviations
-from memmlp.sweep.board import Screen, progress_text
+from memmlp.sweep.board import Screen, device_name, devices, progress_text
 
 SHOWN = 5  # how many of the best trials are shown
 WORDS = {TrialState.COMPLETE: "complete", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
@@ -38,15 +38,25 @@ class SearchBoard(Screen):
         ended = [trial for trial in study.trials if trial.state in WORDS]
         told = {trial.number for trial in ended} if self.told is None else self.told
         new = [trial for trial in ended if trial.number not in told]
-        self.show(lambda: render(study, self.outputs), [line(study.search, t, len(ended)) for t in new])
+        self.show(
+            lambda: render(study, self.outputs),
+            [line(study.search, trial, len(ended), self.outputs) for trial in new],
+        )
         self.told = {trial.number for trial in ended}
 
 
-def line(search: Search, trial: FrozenTrial, ended: int) -> str:
-    """Say how a trial ended."""
+def line(search: Search, trial: FrozenTrial, ended: int, outputs: Path) -> str:
+    """Say how a trial ended, and on which devices its runs were worked on."""
     what = trial.user_attrs.get("reason") if trial.state == TrialState.FAIL else figures(trial)
     params = ", ".join(f"{key}={trial.params[key]:.4g}" for key in trial.params)
-    return f"{ended} of {search.n_trials}; trial {trial.number} {WORDS[trial.state]}: {what} ({params})"
+    names = ", ".join(dict.fromkeys(filter(None, map(device_name, runs_of(trial, outputs)))))
+    how = f"{WORDS[trial.state]} on {names}" if names else WORDS[trial.state]
+    return f"{ended} of {search.n_trials}; trial {trial.number} {how}: {what} ({params})"
+
+
+def runs_of(trial: FrozenTrial, outputs: Path) -> list[Run]:
+    """Return the runs that a trial has wanted so far."""
+    return [Run.of(outputs, run_id) for run_id in trial.user_attrs.get("runs", ())]
 
 
 def figures(trial: FrozenTrial) -> str:
@@ -58,20 +68,20 @@ def figures(trial: FrozenTrial) -> str:
 
 
 def render(study: Study, outputs: Path) -> Group:
-    """Draw the trials under way, the best ones, and the counts."""
+    """Draw the trials under way, the best ones, the counts, and the devices that are at work."""
     table = trials_table(study.search, f"search {study.search.name}")
-    for trial in study.trials:
-        if trial.state not in WORDS:
-            row(table, study.search, trial, _going(trial, outputs))
+    going = [(trial, runs_of(trial, outputs)) for trial in study.trials if trial.state not in WORDS]
+    for trial, runs in going:
+        row(table, study.search, trial, _going(trial, runs))
     ranked = sorted((t for t in study.trials if t.state == TrialState.COMPLETE), key=lambda t: t.values)
     for trial in ranked[:SHOWN]:
         row(table, study.search, trial, Text(figures(trial), style="green"))
-    return Group(table, Text(counts(study)))
+    running = (run for _, runs in going for run in runs if run.stage)
+    return Group(table, Text(counts(study)), *map(Text, devices(running)))
 
 
-def _going(trial: FrozenTrial, outputs: Path) -> Text:
+def _going(trial: FrozenTrial, runs: Sequence[Run]) -> Text:
     """Say how far a trial's runs are."""
-    runs = [Run.of(outputs, run_id) for run_id in trial.user_attrs.get("runs", ())]
     going = next((run for run in runs if run.stage), None)
     count = sum(run.done for run in runs if run is not going)
     done = f"{count} seeds done, " if count else ""

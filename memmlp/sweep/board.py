@@ -102,7 +102,8 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
         cells = {e.seed: cell(plan, tasks[e.key], states[e.key]) for e in plan.entries if e.label == label}
         table.add_row(Text(label), *(cells.get(seed, Text("-")) for seed in seeds))
     below = [_upstream(plan, task, states[task.key]) for task in plan.tasks if task.kind == "vqvae"]
-    below += [Text(_counts(states)), *map(Text, _devices(plan, states))]
+    running = [plan.run_of(task) for task in plan.tasks if states[task.key] == "running"]
+    below += [Text(_counts(states)), *map(Text, devices(running))]
     below += [
         Text(f"{name(plan, task)}: {plan.run_of(task).failure}", style="red")
         for task in plan.tasks
@@ -168,9 +169,8 @@ def time_left(log: list[Metrics], total: int) -> float | None:
     return max((total - recent[-1].step) * seconds / steps - (time.time() - recent[-1].time), 0.0)
 
 
-def _devices(plan: Plan, states: Mapping[str, str]) -> list[str]:
-    """Say, in a line if anything runs, how many runs each device has."""
-    running = [plan.run_of(task) for task in plan.tasks if states[task.key] == "running"]
+def devices(running: Iterable[Run]) -> list[str]:
+    """Say, in a line if anything runs, how many of the runs at work each device has."""
     names = Counter(name for run in running if (name := device_name(run)))
     return [f"running on {', '.join(f'{name}: {count}' for name, count in names.items())}"] if names else []
 

@@ -234,6 +234,39 @@ def outlook(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs]) -> dict[Key,
     return found
 
 
+@dataclass(frozen=True)
+class Standing:
+    """How far an arm is in the rounds.
+
+    Attributes:
+        label: the arm's.
+        decided, open: how many of its comparisons are.
+        seeds: those that it has spent, or needs for a next look.
+        next: the number of seeds of its next look; None where it has none.
+    """
+
+    label: str
+    decided: int
+    open: int
+    seeds: int
+    next: int | None
+
+
+def standings(rounds: Rounds, sweep: Sweep) -> list[Standing]:
+    """Return how far each arm is."""
+    ahead = rounds.next_looks(sweep)
+    found: dict[str, list[Verdict]] = {}
+    for finding, _ in rounds.latest().values():
+        found.setdefault(finding.label, []).append(finding.verdict)
+    standing = []
+    for label, seeds in rounds.counts(sweep).items():
+        verdicts = found.get(label, [])
+        still = verdicts.count(Verdict.OPEN)
+        following = rounds.looks[ahead[label]] if label in ahead else None
+        standing.append(Standing(label, len(verdicts) - still, still, seeds, following))
+    return standing
+
+
 def as_json(rounds: Rounds) -> dict[str, Any]:
     """Return the rounds in types that JSON holds."""
     return asdict(rounds)

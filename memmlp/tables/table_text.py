@@ -14,6 +14,7 @@ from memmlp.tables.table import Cell, Row, Table
 COST_UNITS = {"FLOPs": "G", "MACs": "G", "parameters": "M", "size": "MB", "ms": "", "ratio": "", "FPS": ""}
 MISSING = "-"
 MINUS = "\N{MINUS SIGN}"
+ARROWS = {"lower": "↓", "higher": "↑"}
 
 
 @dataclass(frozen=True)
@@ -60,11 +61,18 @@ def grids(table: Table) -> list[Grid]:
 
 def heading(metric: str) -> str:
     """Return a metric's name with its unit and the direction that is better."""
-    # Of a metric of one's own whose package is not in use, nobody knows here what is better.
-    known = metric in UNITS or metric in COST_UNITS
-    better = "↑" if metric == "FPS" or metric in HIGHER else "↓"
-    words = (metric, f"[{unit(metric)}]" if unit(metric) else "", better if known else "")
+    words = (metric, f"[{unit(metric)}]" if unit(metric) else "", ARROWS.get(better(metric), ""))
     return " ".join(word for word in words if word)
+
+
+def better(metric: str) -> str:
+    """Return what is better of a metric, "lower" or "higher"; empty where nobody knows here.
+
+    That is so of a metric of one's own whose package is not in use.
+    """
+    if metric not in UNITS and metric not in COST_UNITS:
+        return ""
+    return "higher" if metric == "FPS" or metric in HIGHER else "lower"
 
 
 def unit(metric: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,8 @@ from memmlp.runs.lookup import is_trained
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan
 from memmlp.tables.measured_run import load
-from memmlp.ui.facts import read_config
+from memmlp.tables.table_text import better, unit
+from memmlp.ui.facts import COSTS, read_config
 from memmlp.ui.index import Index
 
 SHOWN_FILES = (
@@ -62,6 +63,7 @@ class Rows:
             "minor": minor(keys),
             "paths": list(filter(is_data_path, keys)),
             "metrics": metrics,
+            "units": units(metrics),
             "rows": rows,
             "removed": gone,
         }
@@ -125,6 +127,21 @@ def minor(keys: Sequence[str]) -> list[str]:
 def measured(runs: Any) -> list[str]:
     """Return the names of all numbers that were measured of some run."""
     return list(dict.fromkeys(metric for run in runs for metric in run["metrics"]))
+
+
+def units(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Return, by the last word of their names, the unit of metrics, and what is better of each.
+
+    `better` is "lower" or "higher", and empty for what is no error, as the Jitter of the truth. A metric that
+    nobody knows here, since its package is not in use, is left out.
+    """
+    found = {}
+    for metric in dict.fromkeys(dotted.rpartition(".")[2] for dotted in metrics):
+        if metric in COSTS:
+            found[metric] = {"unit": COSTS[metric], "better": "lower"}
+        elif way := better(metric):
+            found[metric] = {"unit": unit(metric), "better": "" if metric.startswith("GT ") else way}
+    return found
 
 
 def _short(value: float | None) -> float | None:

@@ -8,13 +8,15 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
+from memmlp.common.files import plain
 from memmlp.evaluation.units import UNITS
 from memmlp.runs.run import STAGE_WORDS
+from memmlp.statistics import Verdict
 from memmlp.sweep.board import name as task_name
 from memmlp.sweep.kept import kept
 from memmlp.sweep.plan import Entry, Plan, RunTask
@@ -22,11 +24,23 @@ from memmlp.sweep.spec import Arm, Sweep, parse_sweep
 from memmlp.tables.build_table import collect, finished
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import Measured, load
-from memmlp.tables.table_text import caption, heading, legend
+from memmlp.tables.rounds import Rounds, standings, subject
+from memmlp.tables.rounds_file import NAME as ROUNDS_FILE
+from memmlp.tables.rounds_file import read as read_rounds
+from memmlp.tables.rounds_file import same_runs
+from memmlp.tables.table_text import better, caption, heading, legend
 from memmlp.ui.index import Index
 
 ROUNDS = "seeds were spent in rounds; memmlp table has their verdicts, these do not keep the 5 %"
+OTHERS = "seeds were spent in rounds, but not of these runs: these verdicts do not keep the 5 %"
 NOT_KEPT = "this sweep's file was not kept with it, so its first arm is the control; memmlp table has its own"
+
+
+class Made(NamedTuple):
+    """What was made of a sweep's runs: its table, and its rounds where seeds were spent in rounds."""
+
+    table: dict[str, Any]
+    rounds: dict[str, Any] | None
 
 
 class Sweeps:
@@ -36,7 +50,7 @@ class Sweeps:
         self.index = index
         self.lock = threading.Lock()
         self.plans: dict[Path, tuple[int, Plan]] = {}
-        self.tables: dict[str, tuple[Any, dict[str, Any]]] = {}
+        self.tables: dict[str, tuple[Any, Made]] = {}
         self.bad: dict[str, str] = {}
 
     def known(self) -> list[Plan]:
@@ -55,8 +69,9 @@ class Sweeps:
         return [plan for _, plan in sorted(found.values(), key=lambda one: -one[0])]
 
     def stamp(self) -> str:
-        """Return a text that changes when a sweep comes, goes or is planned anew."""
-        return repr(sorted((str(path), changed) for path, (changed, _) in self.plans.items()))
+        """Return a text that changes when a sweep comes, goes, is planned anew, or took a look."""
+        found = sorted(self.plans.items())
+        return repr([(str(p), seen, _changed(p.with_name(ROUNDS_FILE))) for p, (seen, _) in found])
 
     def rows(self) -> dict[str, Any]:
         """Return a row for each sweep."""
@@ -90,13 +105,14 @@ class Sweeps:
         cells = [self._cell(plan, entry, states, shown.get(entry.label, "")) for entry in plan.entries]
         upstream = [self._upstream(plan, task, states) for task in plan.tasks if task.kind == "vqvae"]
         branches = {arm.branch for arm in sweep.arms}
-        branch = branches.pop() if len(branches) == 1 else ""
+        made = self.made(plan)
         found = {
             "metric": metric,
-            "branch": branch,
+            "branch": branches.pop() if len(branches) == 1 else "",
             "cells": cells,
             "upstream": upstream,
-            "table": self.table(plan),
+            "table": made.table,
+            "rounds": made.rounds,
         }
         return self.progress(plan) | found
 
@@ -164,24 +180,26 @@ class Sweeps:
         )
         return left * statistics.median(paces) / len(running) if left else None
 
-    def table(self, plan: Plan) -> dict[str, Any]:
-        """Return the table with effects and verdicts, made again when one of its runs changed."""
+    def made(self, plan: Plan) -> Made:
+        """Return what was made of a sweep's runs, made again when one of them or its rounds changed."""
         with self.lock:
-            stamp = [(entry.key, self.index.signatures.get(entry.id)) for entry in plan.entries]
+            runs = [(entry.key, self.index.signatures.get(entry.id)) for entry in plan.entries]
+            stamp = (runs, _changed(self._rounds_path(plan)))
             known = self.tables.get(plan.name)
             if known and known[0] == stamp:
                 return known[1]
-            made = self._table(plan)
+            made = self._make(plan)
             self.tables[plan.name] = (stamp, made)
             return made
 
-    def _table(self, plan: Plan) -> dict[str, Any]:
+    def _make(self, plan: Plan) -> Made:
         flags: list[str] = []
         sweep = self._kept(plan.name)
         if sweep is None:
             sweep, flags = of_plan(plan), [NOT_KEPT]
-        if (self.index.outputs / "sweeps" / plan.name / "rounds.json").exists():
-            flags.append(ROUNDS)
+        rounds, doubts = rounds_of(sweep, plan, self._rounds_path(plan)) if not flags else (None, [])
+        sweep = rounds.spent(sweep) if rounds else sweep
+        flags += doubts
         entries = {(entry.label, entry.seed): entry for entry in plan.entries}
 
         def find(arm: Arm, seed: int) -> Measured | None:
@@ -194,8 +212,12 @@ class Sweeps:
                 flags.append(str(error))
                 return None
 
-        made = collect(sweep, finished(sweep, find))
-        return table_words(replace(made, flags=(*made.flags, *flags)))
+        made = collect(sweep, finished(sweep, find), rounds=rounds)
+        table = table_words(replace(made, flags=(*made.flags, *flags)))
+        return Made(table, rounds_words(rounds, sweep) if rounds else None)
+
+    def _rounds_path(self, plan: Plan) -> Path:
+        return self.index.outputs / "sweeps" / plan.name / ROUNDS_FILE
 
     def _kept(self, name: str) -> Sweep | None:
         try:
@@ -204,13 +226,42 @@ class Sweeps:
             return None
 
 
+def rounds_of(sweep: Sweep, plan: Plan, path: Path) -> tuple[Rounds | None, list[str]]:
+    """Return the rounds whose verdicts stand, None for none, and what a reader has to know otherwise."""
+    try:
+        rounds = read_rounds(path)
+        if rounds is None or not rounds.taken:
+            return None, []
+        if rounds.subject != plain(subject(sweep)):
+            return None, [OTHERS]
+        same_runs(rounds, sweep, plan, path)
+    except InputError:
+        return None, [ROUNDS]
+    return rounds, []
+
+
+def rounds_words(rounds: Rounds, sweep: Sweep) -> dict[str, Any]:
+    """Return the looks of a sweep's rounds, what each decided, and how far each arm is."""
+    looks = []
+    for seeds, level in zip(rounds.looks, rounds.levels, strict=True):
+        found = [finding for look in rounds.taken if look.seeds == seeds for finding in look.found]
+        decided = sum(finding.verdict is not Verdict.OPEN for finding in found)
+        looks.append({"seeds": seeds, "level": level, "compared": len(found), "decided": decided})
+    return {
+        "comparisons": len(rounds.family(sweep)),
+        "looks": looks,
+        "arms": [asdict(arm) for arm in standings(rounds, sweep)],
+    }
+
+
 def table_words(table: Any) -> dict[str, Any]:
-    """Return what a table holds, with its columns' heads and what explains it."""
+    """Return what a table holds, with its columns' heads, what is better in each, and what explains it."""
     words = json.loads(as_json(table))
     return {
         **words,
         "caption": caption(table),
         "headings": {m: heading(m) for m in table.metrics},
+        "better": {m: better(m) for m in table.metrics},
         "legend": legend(table),
     }
 
@@ -227,6 +278,14 @@ def of_plan(plan: Plan) -> Sweep:
         label: [] for label in dict.fromkeys(entry.label for entry in plan.entries)
     } or {"-": []}
     return parse_sweep(plan.name, {"title": plan.name, "seeds": seeds, "arms": arms})
+
+
+def _changed(path: Path) -> int:
+    """Return when a file was last changed, ns; 0 where there is none."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def _pace(facts: Mapping[str, Any] | None) -> float | None:

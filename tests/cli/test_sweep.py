@@ -209,7 +209,7 @@ def test_an_interrupted_sweep_ends_its_workers_and_goes_on_later(tmp_path: Path)
         (["99"], "sweep '99': no such sweep"),
         (["missing.yaml"], "missing.yaml: no such file; allowed"),
         (["trial.yaml", "memory=nosuch"], "memory=nosuch"),
-        (["trial.yaml", "executor=cloud"], "executor=cloud: allowed is local, slurm or ray"),
+        (["trial.yaml", "executor=cloud"], "executor=cloud: allowed is local, slurm, ray or dask"),
         (["trial.yaml", "slurm.partition=x"], "slurm.partition: goes with executor=slurm"),
         (["trial.yaml", "executor=slurm", "slurm.nodes=2"], "slurm.nodes: allowed is none"),
         (

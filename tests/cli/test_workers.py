@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from memmlp.cli import workers as workers_module
-from memmlp.cli.workers import Workers, check_devices, hire
+from memmlp.cli.workers import Workers, check_devices, hire, split_executor
 from memmlp.common.errors import InputError
 from memmlp.config import perform_task
 from memmlp.pipeline import devices
@@ -64,6 +64,16 @@ def test_a_cluster_has_the_gpus_that_this_machine_lacks():
 def test_options_of_local_workers_are_refused_elsewhere(option: str):
     with pytest.raises(InputError, match=f"--{option.replace('_', '-')}: goes with workers of this machine"):
         Workers("ray", **{option: 1})
+
+
+@pytest.mark.parametrize("name", ["ray", "dask"])
+def test_words_of_an_executor_are_its_own(name: str):
+    words = (f"executor={name}", f"{name}.address=head:1", f"{name}.resources.big=2", "seed=1")
+    engine, own, rest = split_executor(words)
+    assert (engine, rest) == (name, ("seed=1",))
+    assert Workers(engine, own).settings().address == "head:1"
+    with pytest.raises(InputError, match=f"{name}.address: goes with executor={name}"):
+        split_executor(words[1:])
 
 
 class Shelf:

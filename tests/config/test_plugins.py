@@ -305,7 +305,7 @@ def test_reading_a_run_imports_nothing_by_itself(on_path: Path, monkeypatch: pyt
         config_of(recorded(config, "0.1.0"))
     assert str(error.value) == (
         f"run abc: names code of the package {PACKAGE} 0.1.0; to trust it, say --plugins {PACKAGE} or "
-        f"MEMMLP_PLUGINS={PACKAGE}"
+        f"MEMMLP_PLUGINS={PACKAGE}, in Python plugins=['{PACKAGE}']"
     )
     assert PACKAGE not in sys.modules
     monkeypatch.setattr(sys, "path", [one for one in sys.path if one != str(on_path)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Event
@@ -12,11 +13,14 @@ from chromium import Browser
 from ui.conftest import SEEDS, begun, made, run_of
 from ui.test_replay import motion
 
+from memmlp.cli.rounds import look
+from memmlp.evaluation.units import UNITS
 from memmlp.runs.run import Run
 from memmlp.sweep.kept import kept
 from memmlp.sweep.plan import Plan
 from memmlp.tables.build_table import collect, finished
 from memmlp.tables.measured_run import load
+from memmlp.tables.rounds import begin
 from memmlp.tables.runs_of_plan import finder
 from memmlp.ui.answers import Answers
 from memmlp.ui.one_file import Shown, query, rounded, written
@@ -138,6 +142,60 @@ def test_a_sweep_s_effects_and_curves(browser: Browser, server: Server):
         "holds",
         "holds",
     ]
+
+
+def scored(run: Run, **values: float) -> None:
+    """Add metrics to a run's evaluations, to means and clips alike."""
+    for path in run.evaluations.glob("*.json"):
+        report = json.loads(path.read_text())
+        for errors in (report["mean"], *report["clips"]):
+            errors["rotation"] |= values
+        path.write_text(json.dumps(report))
+
+
+def test_units_and_directions_of_metrics_of_ones_own(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Those of a package in use; of another metric nobody knows what is better."""
+    monkeypatch.setitem(UNITS, "Score", "points")
+    monkeypatch.setattr("memmlp.tables.table_text.HIGHER", {"Score"})
+    made(tmp_path)
+    none, gru = (run_of(tmp_path, arm, 0) for arm in ("none", "gru"))
+    scored(none, Score=5.0, Odd=1.0)
+    scored(gru, Score=7.0, Odd=2.0)
+    with Server(Answers(tmp_path, kept=False), 0, every=0.05) as running:
+        go(browser, running.url, f"run/{gru.id}", "document.querySelectorAll('.grid').length >= 2")
+        rows = browser.value("[...document.querySelectorAll('.grid tbody tr')].map(r => r.textContent)")
+        (row,) = (row for row in rows if row.startswith("Score"))
+        assert row.startswith("Scorepoints ↑")
+        assert "7.00+2.00" in row
+        assert any(re.match(r"Odd[^a-z]*2.00\+1.00", row) for row in rows)  # no unit, no arrow
+        marked = (
+            "[...document.querySelectorAll('.grid td small')].filter(s => s.textContent == '{}')[0].className"
+        )
+        assert browser.value(marked.format("+2.00")) == "better"
+        assert browser.value(marked.format("+1.00")) == ""
+        go(browser, running.url, f"compare?runs={none.id},{gru.id}", "document.querySelectorAll('.lines')[1]")
+        best = (
+            "[...document.querySelectorAll('.lines tbody tr')].filter(r => /{}/.test(r.textContent))"
+            ".map(r => r.querySelector('.least')?.textContent ?? '')[0]"
+        )
+        assert browser.value(best.format("Score")) == "7.00"
+        assert browser.value(best.format("Odd")) == ""
+        assert browser.value(best.format("stream MPJPE")) != ""
+
+
+def test_rounds_of_a_sweep(browser: Browser, tmp_path: Path):
+    sweep, folder = made(tmp_path), tmp_path / "sweeps" / "mine"
+    look(sweep, tmp_path, begin(sweep), Plan.load(folder / "plan.json"))
+    with Server(Answers(tmp_path, kept=False), 0, every=0.05) as running:
+        go(browser, running.url, "sweep/mine", "document.body.textContent.includes('Rounds')")
+        words = browser.value("document.body.textContent")
+        assert "2 of 2 comparisons are decided" in words
+        assert "holdsat 3 seeds" in words
+        rows = browser.value("[...document.querySelectorAll('.pair tbody tr')].map(r => r.textContent)")
+        assert rows[0].startswith("3 seeds")
+        assert "gru203\N{EN DASH}" in rows
 
 
 def test_news_are_shown_without_a_touch(browser: Browser, server: Server, home: Path):

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from memmlp.ui.runs import differing
+from own_package import registers_kept
+
+from memmlp.evaluation.units import HIGHER, UNITS
+from memmlp.ui.runs import differing, units
 
 
 def of(data: str, **config: Any) -> dict[str, Any]:
@@ -16,3 +19,19 @@ def test_one_folder_of_data_has_many_spellings():
     assert differing([of("d", **here), of("d", **there)]) == ["seed"]
     assert differing([of("d", **here), of("e", **there)]) == ["data.root", "seed"]
     assert differing([of("d", **here), of("d", seed=0)]) == []
+
+
+def test_units_and_what_is_better_where_somebody_knows():
+    names = ["MPJPE", "Jitter", "GT Jitter", "Score", "Odd"]
+    metrics = [*(f"stream.rotation.{name}" for name in names), "window.rotation.MPJPE", "latency.median_ms"]
+    with registers_kept():
+        UNITS["Score"] = "points"
+        HIGHER.add("Score")
+        assert units(metrics) == {
+            "MPJPE": {"unit": "cm", "better": "lower"},
+            "Jitter": {"unit": "10² m/s³", "better": "lower"},
+            "GT Jitter": {"unit": "10² m/s³", "better": ""},
+            "Score": {"unit": "points", "better": "higher"},
+            "median_ms": {"unit": "ms", "better": "lower"},
+        }
+    assert "Score" not in units(metrics)

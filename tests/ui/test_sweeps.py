@@ -9,15 +9,17 @@ from pathlib import Path
 import pytest
 from ui.conftest import begun, run_of
 
+from memmlp.cli.rounds import look
 from memmlp.runs.run import Run
 from memmlp.sweep.kept import keep, kept
 from memmlp.sweep.plan import Plan
 from memmlp.tables.build_table import collect, finished
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import load
+from memmlp.tables.rounds import Rounds, begin
 from memmlp.tables.runs_of_plan import finder
 from memmlp.ui.index import Index
-from memmlp.ui.sweeps import NOT_KEPT, ROUNDS, Sweeps
+from memmlp.ui.sweeps import NOT_KEPT, OTHERS, ROUNDS, Sweeps
 
 
 def sweeps_of(outputs: Path) -> Sweeps:
@@ -97,7 +99,50 @@ def test_a_sweep_from_before_has_its_first_arm_as_control_and_says_so(outputs: P
     assert page["table"]["control"] == "none"
 
 
-def test_rounds_are_flagged(outputs: Path):
+def looked(outputs: Path) -> Rounds:
+    """Take the first look, at the three seeds that there are."""
+    folder = outputs / "sweeps" / "mine"
+    sweep = kept(folder)
+    assert sweep is not None
+    return look(sweep, outputs, begin(sweep), Plan.load(folder / "plan.json"))
+
+
+def test_verdicts_of_rounds_and_their_looks_are_shown(outputs: Path):
+    sweeps = sweeps_of(outputs)
+    assert sweeps.page("mine")["rounds"] is None
+    before = sweeps.stamp()
+    rounds = looked(outputs)
+    assert sweeps.stamp() != before
+    page = sweeps.page("mine")
+    effect = page["table"]["rows"][1]["cells"]["stream"]["MPJPE"]["effect"]
+    assert (effect["verdict"], effect["decided"], effect["level"]) == ("holds", 3, rounds.levels[0])
+    assert not {ROUNDS, OTHERS} & set(page["table"]["flags"])
+    first, second = page["rounds"]["looks"][:2]
+    assert first == {"seeds": 3, "level": rounds.levels[0], "compared": 2, "decided": 2}
+    assert (second["compared"], page["rounds"]["comparisons"]) == (0, 2)
+    arms = {arm["label"]: arm for arm in page["rounds"]["arms"]}
+    assert arms["gru"] == {"label": "gru", "decided": 2, "open": 0, "seeds": 3, "next": None}
+
+
+@pytest.mark.parametrize(
+    ("change", "flag"),
+    [
+        ({"subject": {}}, OTHERS),
+        ({"taken": 3}, ROUNDS),
+        ({"taken": [{"seeds": 3, "level": 0.01, "runs": {"gru": "0" * 16}, "found": []}]}, ROUNDS),
+    ],
+)
+def test_rounds_of_something_else_are_flagged(outputs: Path, change: dict, flag: str):
+    looked(outputs)
+    path = outputs / "sweeps" / "mine" / "rounds.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    page = sweeps_of(outputs).page("mine")
+    assert page["rounds"] is None
+    assert flag in page["table"]["flags"]
+    assert page["table"]["rows"][1]["cells"]["stream"]["MPJPE"]["effect"]["decided"] is None
+
+
+def test_damaged_rounds_are_flagged(outputs: Path):
     (outputs / "sweeps" / "mine" / "rounds.json").write_text("{}")
     assert ROUNDS in sweeps_of(outputs).page("mine")["table"]["flags"]
 

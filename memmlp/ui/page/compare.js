@@ -4,7 +4,7 @@ import { h, replace, link, section, select, empty, choice } from './dom.js';
 import { about, address, curvesOf, place, remember, runs } from './store.js';
 import { colourOf, curves } from './charts.js';
 import { differing } from './runs.js';
-import { metricNumber, metricText, word } from './format.js';
+import { bestOf, metricNumber, metricText, word } from './format.js';
 
 const FIRST = ['train loss', 'val rotation MPJPE', 'val rotation MPJRE'];
 
@@ -102,8 +102,8 @@ function results(list, names) {
   if (!rows.length) return null;
   const line = name => {
     const values = list.map(run => run.metrics[name]);
-    const least = Math.min(...values.filter(value => typeof value === 'number'));
-    return [metricText(name), ...values.map(value => h('span', { class: value === least ? 'least' : '' }, metricNumber(name, value)))];
+    const best = bestOf(name, values.filter(value => typeof value === 'number'));
+    return [metricText(name), ...values.map(value => h('span', { class: value !== undefined && value === best ? 'least' : '' }, metricNumber(name, value)))];
   };
   return section('Measured', matrix(rows.map(line), list, names, 'n'));
 }

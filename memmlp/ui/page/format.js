@@ -1,9 +1,7 @@
 // Numbers, times and names as text.
 
-const UNITS = {
-  MPJRE: '°', geodesic: '°', MPJPE: 'cm', 'Hand PE': 'cm', 'Upper PE': 'cm', 'Lower PE': 'cm', 'Root PE': 'cm',
-  MPJVE: 'cm/s', Jitter: '10² m/s³', 'GT Jitter': '10² m/s³', median_ms: 'ms', p95_ms: 'ms',
-};
+import { about } from './store.js';
+
 const COSTS = {
   median_ms: 'latency', p95_ms: 'latency p95', ratio_to_yardstick: '× yardstick', parameters: 'parameters', macs: 'MACs',
   onnx_bytes: 'ONNX bytes',
@@ -60,13 +58,26 @@ export function bytes(count) {
   return `${size >= 100 || units[0] === 'B' ? Math.round(size) : size.toFixed(1)} ${units[0]}`;
 }
 
+const known = name => about.units[name.split('.').at(-1)] ?? { unit: '', better: '' };
+
 // "stream.rotation.MPJPE" -> its parts in words.
 export function metricWords(name) {
   const parts = name.split('.');
   const metric = parts.at(-1);
-  if (parts[0] === 'latency') return { metric: COSTS[metric] ?? metric, where: '', unit: UNITS[metric] ?? '' };
+  const unit = known(name).unit.replace(/^deg$/, '°');
+  if (parts[0] === 'latency') return { metric: COSTS[metric] ?? metric, where: '', unit };
   const where = parts.slice(0, -1).filter(part => part !== 'rotation').join(' ');
-  return { metric, where, unit: UNITS[metric] ?? '' };
+  return { metric, where, unit };
+}
+
+// What is better of a metric: 'lower', 'higher', or '' where nobody knows.
+export const better = name => known(name).better;
+export const ARROWS = { lower: '↓', higher: '↑' };
+
+// The best of these numbers of a metric; null where nobody knows which that is.
+export function bestOf(name, values) {
+  const choose = { lower: Math.min, higher: Math.max }[better(name)];
+  return choose && values.length ? choose(...values) : null;
 }
 
 export function metricText(name) {

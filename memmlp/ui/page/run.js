@@ -2,7 +2,7 @@
 
 import { h, replace, link, section, select, empty, choice, code } from './dom.js';
 import { address, alone, ask, place, remember, runs } from './store.js';
-import { ago, bytes, date, duration, metricNumber, metricWords, number, signed, word } from './format.js';
+import { ago, ARROWS, better, bytes, date, duration, metricNumber, metricWords, number, signed, word } from './format.js';
 import { curvePanel } from './compare.js';
 import { status, tags } from './runs.js';
 
@@ -54,21 +54,30 @@ function facts(run) {
   return h('dl', { class: 'facts' }, pairs.filter(Boolean).map(([key, value]) => h('div', {}, h('dt', {}, key), h('dd', {}, value))));
 }
 
+// Metrics of one's own come after the field's.
+const ordered = names => [...new Set([...METRICS.filter(metric => names.includes(metric)), ...names.filter(name => !name.startsWith('GT '))])];
+
+// The class of a difference from the control's run; none where nobody knows what is better.
+function judged(metric, change) {
+  const way = better(metric);
+  return way && (change < 0 === (way === 'lower') ? 'better' : 'worse');
+}
+
 function results(run) {
   const columns = [...new Set(Object.keys(run.metrics).filter(name => name.split('.').length === 3).map(name => name.split('.').slice(0, 2).join('.')))].sort();
-  const rows = METRICS.filter(metric => columns.some(column => `${column}.${metric}` in run.metrics));
+  const rows = ordered(Object.keys(run.metrics).filter(name => columns.some(column => name.startsWith(`${column}.`))).map(name => name.split('.').at(-1)));
   if (!rows.length) return Object.keys(run.metrics).some(name => name.startsWith('vqvae.')) ? section('Results', pairs(Object.entries(run.metrics).filter(([name]) => name.startsWith('vqvae.')).map(([name, value]) => [name.slice(6), number(value)]))) : null;
   const other = run.control && runs.get(run.control.id)?.metrics;
   const cell = (column, metric) => {
     const name = `${column}.${metric}`;
     const value = run.metrics[name];
     const change = value !== undefined && typeof other?.[name] === 'number' ? value - other[name] : null;
-    return h('td', { class: 'n' }, metricNumber(name, value), change === null ? null : h('small', { class: change < 0 ? 'better' : 'worse' }, signed(change)));
+    return h('td', { class: 'n' }, metricNumber(name, value), change === null ? null : h('small', { class: judged(metric, change) }, signed(change)));
   };
-  return section('Results', h('p', { class: 'faint' }, 'Means over the test clips; lower is better.', other ? ' Small: the difference from the control’s run of the same seed, which alone is no verdict.' : ''),
+  return section('Results', h('p', { class: 'faint' }, 'Means over the test clips; the arrows say what is better.', other ? ' Small: the difference from the control’s run of the same seed, which alone is no verdict.' : ''),
     h('div', { class: 'scroll' }, h('table', { class: 'grid' },
       h('thead', {}, h('tr', {}, h('th', { scope: 'col' }), columns.map(column => h('th', { scope: 'col', class: 'n' }, column.split('.')[0], h('small', {}, column.split('.')[1]))))),
-      h('tbody', {}, rows.map(metric => h('tr', {}, h('th', { scope: 'row' }, metric, h('small', {}, metricWords(metric).unit)), columns.map(column => cell(column, metric))))))));
+      h('tbody', {}, rows.map(metric => h('tr', {}, h('th', { scope: 'row' }, metric, h('small', {}, [metricWords(metric).unit, ARROWS[better(metric)]].filter(Boolean).join(' '))), columns.map(column => cell(column, metric))))))));
 }
 
 // The worst clips, one of which is replayed beside the truth and beside another run.
@@ -113,7 +122,7 @@ function clips(run, replay) {
   const element = h('div');
   function draw() {
     const value = (clip, metric) => clip[mode]?.[sets.branch]?.[metric];
-    const metrics = METRICS.filter(metric => run.clips.some(clip => typeof value(clip, metric) === 'number'));
+    const metrics = ordered([...new Set(run.clips.flatMap(clip => Object.keys(clip[mode]?.[sets.branch] ?? {})))].filter(metric => run.clips.some(clip => typeof value(clip, metric) === 'number')));
     const order = [...run.clips].sort((a, b) => (value(b, sets.by) ?? -1) - (value(a, sets.by) ?? -1));
     const most = value(order[0], sets.by);
     const headCell = metric => h('th', { scope: 'col', class: 'n', 'aria-sort': metric === sets.by ? 'descending' : null }, h('button', { type: 'button', onclick: () => { sets.by = metric; draw(); } }, metric, h('small', {}, metricWords(metric).unit)));

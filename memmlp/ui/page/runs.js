@@ -3,7 +3,7 @@
 import { h, replace, link, empty, code, say } from './dom.js';
 import { about, address, place, remember, runs } from './store.js';
 import { parse, matches } from './filter.js';
-import { ago, date, duration, DASH, metricNumber, metricText, metricWords, number, shortKeys, word } from './format.js';
+import { ago, bestOf, better, date, duration, DASH, metricNumber, metricText, metricWords, number, shortKeys, word } from './format.js';
 
 const STEP = 150; // rows that are drawn at once
 const AUTO = 6; // config columns that are shown unasked
@@ -126,7 +126,8 @@ export function page() {
   function bests(list) {
     const metric = ui.columns.find(name => name.startsWith('stream.')) ?? METRICS[0];
     const known = list.filter(run => run.status === 'done' && typeof run.metrics[metric] === 'number');
-    const first = known.reduce((a, b) => (a && a.metrics[metric] <= b.metrics[metric] ? a : b), null);
+    const value = bestOf(metric, known.map(run => run.metrics[metric]));
+    const first = known.find(run => run.metrics[metric] === value);
     best.hidden = !first;
     ui.sets = [...new Set(list.filter(run => run.status === 'done').map(run => run.data))];
     if (ui.sets.length > 1) {
@@ -156,13 +157,13 @@ export function page() {
     replace(table.tHead ?? table.createTHead(), h('tr', {}, h('th', { scope: 'col', class: 'pick' }, all), cell('name', 'run'), cell('status', 'status'), heads, cell('started', 'started', { class: 'n' }), cell('seconds', 'took', { class: 'n' })));
   }
 
-  const startsDown = name => name === 'started' || name === 'seconds';
+  const startsDown = name => name === 'started' || name === 'seconds' || better(name) === 'higher';
 
   function body() {
     const known = {};
-    for (const name of ui.columns.filter(one => about.metrics.includes(one) && !one.includes('GT'))) {
+    for (const name of ui.columns.filter(one => about.metrics.includes(one))) {
       const values = ui.list.map(run => run.metrics[name]).filter(value => typeof value === 'number');
-      if (values.length > 1 && ui.sets.length < 2) known[name] = Math.min(...values);
+      if (values.length > 1 && ui.sets.length < 2) known[name] = bestOf(name, values);
     }
     const focused = document.activeElement?.dataset?.run;
     const shown = ui.list.slice(0, ui.drawn);

@@ -5,7 +5,7 @@ const answers = embedded ? JSON.parse(embedded.textContent) : null;
 export const alone = answers !== null; // the page is a file without a server
 
 export const runs = new Map();
-export const about = { keys: [], minor: [], paths: [], metrics: [], outputs: '', generation: 0, heads: '' };
+export const about = { keys: [], minor: [], paths: [], metrics: [], units: {}, outputs: '', generation: 0, heads: '' };
 const listeners = new Set();
 let state = alone ? 'file' : 'connecting';
 

@@ -46,7 +46,7 @@ export async function single(name) {
     const running = sweep.counts.done === sweep.tasks ? null : progress(sweep);
     replace(top, h('p', { class: 'trail' }, link('#/sweeps', 'Sweeps')), h('div', { class: 'bar title' }, h('h1', {}, sweep.table.caption)),
       sweep.name === sweep.table.caption ? null : h('p', { class: 'faint sub' }, sweep.name), running, board(sweep));
-    replace(found, effects(sweep.table, draw), section('Table', results(sweep.table)));
+    replace(found, effects(sweep.table, draw), section('Table', results(sweep.table)), sweep.rounds ? rounds(sweep.rounds) : null);
   }
   async function update() {
     if (!alone) sweep = await ask(`sweeps/${name}`);
@@ -85,14 +85,27 @@ function effects(table, draw) {
   const rows = table.rows.filter(row => row.cells[mode]?.[metric]?.effect || (row.cells[mode]?.[metric]?.paper_effect ?? null) !== null).map(row => {
     const cell = row.cells[mode][metric];
     const effect = cell.effect ?? {};
-    const text = effect.mean === undefined ? 'not measured' : `${signed(effect.mean)}${effect.low === null ? '' : ` [${signed(effect.low)}, ${signed(effect.high)}]`}${effect.verdict ? `, ${effect.verdict}` : ''}`;
+    const text = effect.mean === undefined ? 'not measured' : `${signed(effect.mean)}${effect.low === null ? '' : ` [${signed(effect.low)}, ${signed(effect.high)}]`}${effect.verdict ? `, ${effect.verdict}` : ''}${effect.decided ? ` at ${effect.decided} seeds` : ''}`;
     const paper = cell.paper_effect === null ? '' : `; the paper: ${signed(cell.paper_effect)}`;
     return { arm: row.label, mean: effect.mean ?? null, low: effect.low ?? null, high: effect.high ?? null, paper: cell.paper_effect, verdict: effect.verdict, significant: effect.holm !== null && effect.holm < effect.level, words: text + paper };
   });
   const choose = changes => { remember(changes); draw(); };
   return section('Effects', h('div', { class: 'tools' }, choice('Metric', tested.map(one => [one, one]), metric, value => choose({ metric: value })), table.modes.length > 1 ? choice('Mode', table.modes.map(one => [one, one]), mode, value => choose({ mode: value })) : null),
-    h('p', { class: 'faint' }, `Difference from ‘${table.control}’, or from the arm’s own control, with its 95 % interval over seeds and clips; filled where it is significant after Holm’s correction. `, rows.some(row => row.paper !== null) ? [h('span', { class: 'diamond' }, '◇'), ' the paper’s difference. '] : null, 'Left is better. The band is the smallest effect of interest.'),
+    h('p', { class: 'faint' }, `Difference from ‘${table.control}’, or from the arm’s own control, with its 95 % interval over seeds and clips; filled where it is significant after Holm’s correction. `, rows.some(row => row.paper !== null) ? [h('span', { class: 'diamond' }, '◇'), ' the paper’s difference.'] : null, { lower: ' Left is better.', higher: ' Right is better.' }[table.better[metric]], ' The band is the smallest effect of interest.'),
     forest(rows, { label: table.headings[metric].replace(/ ↓| ↑/, ''), smallest: table.smallest[metric] }));
+}
+
+// Looks at a growing number of seeds: what each decided, and how far each arm is.
+function rounds(about) {
+  const percent = level => `${number(Number((100 * level).toPrecision(2)))} %`;
+  const table = (heads, lines) => h('div', { class: 'scroll' }, h('table', { class: 'grid' },
+    h('thead', {}, h('tr', {}, heads.map((head, i) => h('th', { scope: 'col', class: i ? 'n' : null }, head)))),
+    h('tbody', {}, lines.map(([head, ...cells]) => h('tr', {}, h('th', { scope: 'row' }, head), cells.map(cell => h('td', { class: 'n' }, cell)))))));
+  const decided = about.arms.reduce((sum, arm) => sum + arm.decided, 0);
+  return section('Rounds', h('p', { class: 'faint' }, `Seeds were added where verdicts were open: ${decided} of ${about.comparisons} comparisons are decided. What a look decides is final; all looks together spend 5 %.`),
+    h('div', { class: 'pair' },
+      table(['look at', 'spends', 'compared', 'decided'], about.looks.map(look => [`${look.seeds} seeds`, percent(look.level), ...(look.compared ? [number(look.compared), number(look.decided)] : [DASH, DASH])])),
+      table(['arm', 'decided', 'open', 'seeds', 'next'], about.arms.map(arm => [arm.label, number(arm.decided), number(arm.open), number(arm.seeds), arm.next ? `look at ${arm.next}` : DASH]))));
 }
 
 function results(table) {
@@ -107,7 +120,7 @@ function cell(one, metric) {
   const effect = one.effect;
   const lines = [h('span', { class: 'strong' }, one.mean === null ? DASH : metricNumber(metric, one.mean), one.sd === null ? null : h('small', { class: 'faint' }, ` ± ${number(one.sd, one.mean >= 1000 ? 0 : 2)}`))];
   if (effect) lines.push(h('span', { class: effect.holm !== null && effect.holm < effect.level ? 'strong' : '' }, signed(effect.mean), effect.low === null ? null : h('small', { class: 'faint' }, ` [${signed(effect.low)}, ${signed(effect.high)}]`)));
-  if (effect?.verdict) lines.push(h('span', { class: `verdict ${effect.verdict}` }, effect.verdict));
+  if (effect?.verdict) lines.push(h('span', { class: `verdict ${effect.verdict}` }, effect.verdict), effect.decided ? h('small', { class: 'faint' }, `at ${effect.decided} seeds`) : null);
   if (one.paper !== null) lines.push(h('small', { class: 'faint' }, `paper ${number(one.paper)}`, one.paper_effect === null ? null : ` (${signed(one.paper_effect)})`));
   return h('td', { class: 'n' }, lines);
 }
