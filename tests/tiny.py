@@ -19,6 +19,7 @@ from memmlp.networks.baselines.avatar_jlm import AvatarJLM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
 from memmlp.networks.baselines.ego_poser import EgoPoser
 from memmlp.networks.baselines.hmd_poser import HMDPoser
+from memmlp.networks.baselines.manikin import ManikinL, ManikinS
 from memmlp.networks.baselines.rpm import RPM
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
@@ -115,7 +116,14 @@ BASELINES: dict[str, Callable[..., WindowModel]] = {
     "rpm": partial(
         RPM, frames=9, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, context=3, horizon=4
     ),
-}
+    "manikin_s": partial(
+        ManikinS, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.0, parts=1.0, turned=True
+    ),
+    "manikin_l": partial(
+        ManikinL, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, coarse=1.0, parts=1.0,
+        turned=True, offline=False,
+    ),
+}  # fmt: skip
 WINDOWLESS = ["hmd_poser", "vae_hmd", "rpm"]
 """Baselines without a window, which are streams in both modes of evaluation."""
 BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
@@ -129,6 +137,8 @@ BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
     "vae_hmd": partial(TermsLoss, "square", rotation=1.0, position=20.0, angle=0.1),
     "avatar_jlm": partial(TermsLoss, rotation=2.0, position=5.0, velocity_3=16.0, contact=20.0, hand=5.0),
     "rpm": partial(TermsLoss, rotation=1.0, sixd_velocity=1.0, world_position=1.0, velocity=1.0),
+    "manikin_s": partial(TermsLoss, orientation=0.02),
+    "manikin_l": partial(TermsLoss, orientation=0.02, world_position=40.0, velocity=50.0, hand=5.0),
 }
 
 

@@ -47,7 +47,7 @@ PATHS = ("_target_", "_partial_")
 
 EVALUATION = ("evaluation",)
 DEPLOYMENT = ("export",)
-INFERENCE = ("memory.blend", "memory.history", "model.sampling_steps")
+INFERENCE = ("memory.blend", "memory.history", "model.sampling_steps", "model.offline")
 """Keys of the later stages; those of INFERENCE count for both, and for a training that rolls out."""
 
 ID = re.compile(r"[0-9a-f]{16}")

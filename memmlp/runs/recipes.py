@@ -27,6 +27,8 @@ RECIPES: dict[str, int] = {
     "model.vae_hmd": 1,
     "model.rpm": 1,
     "model.avatar_jlm": 1,
+    "model.manikin_s": 1,
+    "model.manikin_l": 1,
     "memory.vq": 1,
     "memory.vq_joint": 1,
     "memory.no_codes": 1,

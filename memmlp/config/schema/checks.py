@@ -177,6 +177,11 @@ def _check_baseline(cfg: DictConfig) -> None:
         raise InputError(
             f"model.frames={cfg.model.frames}: allowed is at least model.context + model.horizon = {least}"
         )
+    if cfg.model.get("offline") and (list(cfg.evaluation.modes) != ["window"] or cfg.export.graph != "off"):
+        raise InputError(
+            "model.offline=true: a frame is made with later ones, so there is no stream: "
+            "allowed is evaluation.modes=[window] with export.graph=off"
+        )
     steps = cfg.model.get("diffusion_steps", 1)
     if cfg.model.get("sampling_steps", 1) > steps:
         raise InputError(

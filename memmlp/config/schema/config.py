@@ -31,6 +31,8 @@ from memmlp.config.schema.network import (
     HMDPoserConfig,
     JointCodeMemoryConfig,
     LSTMMemoryConfig,
+    ManikinLConfig,
+    ManikinSConfig,
     MemoryConfig,
     ModelConfig,
     NoCodesMemoryConfig,
@@ -128,7 +130,17 @@ class ProfileConfig:
     avatar_poser_width: int = at_least(1)
     avatar_poser_feedforward: int = at_least(1)
     ego_poser_frames: Optional[int] = optional(Within(2))
+    hmd_poser_width: Optional[int] = optional(Within(4))
+    hmd_poser_layers: Optional[int] = optional(Within(1))
+    hmd_poser_feedforward: Optional[int] = optional(Within(1))
+    vae_hmd_width: Optional[int] = optional(Within(1))
+    avatar_jlm_width: Optional[int] = optional(Within(4))
+    avatar_jlm_depth: Optional[int] = optional(Within(1))
+    avatar_jlm_heads: Optional[int] = optional(Within(1))
+    avatar_jlm_feedforward: Optional[int] = optional(Within(1))
     rpm_frames: Optional[int] = optional(Within(2))
+    rpm_width: Optional[int] = optional(Within(1))
+    rpm_depth: Optional[int] = optional(Within(1))
     rpm_feedforward: Optional[int] = optional(Within(1))
 
 
@@ -225,6 +237,8 @@ SCHEMAS: dict[str, type] = {
     "model_rpm": RPMConfig,
     "model_avatar_jlm": AvatarJLMConfig,
     "model_vae_hmd": VAEHMDConfig,
+    "model_manikin_s": ManikinSConfig,
+    "model_manikin_l": ManikinLConfig,
     "predictor_two_branch": TwoBranchConfig,
     "predictor_two_branch_memory": TwoBranchMemoryConfig,
     "predictor_rotation_only": RotationOnlyConfig,

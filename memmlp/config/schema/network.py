@@ -119,6 +119,23 @@ class AvatarJLMConfig(AvatarPoserConfig):
 
 
 @dataclass
+class ManikinSConfig(AvatarPoserConfig):
+    name: str = called("manikin_s")
+    _target_: str = target("memmlp.networks.baselines.manikin.ManikinS")
+    parts: float = at_least(0)
+    turned: bool = key()
+
+
+@dataclass
+class ManikinLConfig(AvatarJLMConfig):
+    name: str = called("manikin_l")
+    _target_: str = target("memmlp.networks.baselines.manikin.ManikinL")
+    parts: float = at_least(0)
+    turned: bool = key()
+    offline: bool = key()
+
+
+@dataclass
 class PredictorConfig:
     """The predictor slot (conf/predictor)."""
 

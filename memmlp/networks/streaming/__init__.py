@@ -12,6 +12,7 @@ from memmlp.networks.baselines.avatar_jlm import AvatarJLM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
 from memmlp.networks.baselines.ego_poser import EgoPoser
 from memmlp.networks.baselines.hmd_poser import HMDPoser
+from memmlp.networks.baselines.manikin import ManikinL, ManikinS
 from memmlp.networks.baselines.rpm import RPM
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
@@ -22,6 +23,8 @@ from memmlp.networks.streaming.baselines import (
     AvatarPoserStream,
     EgoPoserStream,
     HMDPoserStream,
+    ManikinLStream,
+    ManikinSStream,
     RPMStream,
     VAEHMDStream,
 )
@@ -39,6 +42,8 @@ STREAMS: dict[type[WindowModel], type[StreamingGraph]] = {
     AvatarJLM: AvatarJLMStream,
     RPM: RPMStream,
     VAEHMD: VAEHMDStream,
+    ManikinS: ManikinSStream,
+    ManikinL: ManikinLStream,
     AGRoLMLP: AGRoLMLPStream,
     AGRoLDiffusion: AGRoLDiffusionStream,
 }
@@ -56,6 +61,8 @@ def streaming(model: WindowModel) -> StreamingGraph:
             "memory.history=latest: its estimates change at each step, which no streaming graph can carry; "
             "allowed is export.graph=naive, or memory.history=first"
         )
+    if not model.streams:
+        raise InputError("model.offline=true: makes frames with later ones; allowed is model.offline=false")
     if not has_stream(model):
         raise InputError(
             "export.graph=streaming: a part of one's own has none; allowed is export.graph=naive"
@@ -66,4 +73,4 @@ def streaming(model: WindowModel) -> StreamingGraph:
 def has_stream(model: WindowModel) -> bool:
     """Return whether there is a streaming graph of a network; of parts of one's own there may be none."""
     graph = STREAMS.get(type(model))
-    return graph is not None and model.settled and graph.fits(model)
+    return graph is not None and model.settled and model.streams and graph.fits(model)
