@@ -23,9 +23,7 @@ def built(*overrides: str) -> WindowModel:
 # MACs of a streaming step: 12 blocks of T T d + T d d, stem and head for AGRoL; its denoiser five times, with
 # a linear a block and the embedding's two for one row. For AvatarPoser and EgoPoser 4 d d + 2 d f a layer and
 # token, and the products of attention.
-SOLVED = (
-    22 * 27 + 43 * 27
-)  # of a frame of MANIKIN's: the trunk's kinematics, and products of 3 x 3 in the limbs
+SOLVED = 22 * 27 + 43 * 27  # of a frame of MANIKIN's: kinematics of the trunk, products of 3 x 3 in the limbs
 PUBLISHED = {
     "agrol_mlp": (3_735_668, 3.74, 12 * (196**2 * 512 + 196 * 512**2) + 196 * 512 * (54 + 132)),
     "agrol_diffusion": (
@@ -61,7 +59,8 @@ PUBLISHED = {
     "manikin_s": (
         4_244_566,
         4.24,
-        3 * 40 * (4 * 256**2 + 2 * 256 * 2048 + 2 * 40 * 256) + 40 * 54 * 256 + 4 * 256**2 + 256 * 86 + SOLVED,
+        3 * 40 * (4 * 256**2 + 2 * 256 * 2048 + 2 * 40 * 256) + 40 * 54 * 256
+        + 4 * 256**2 + 256 * 86 + SOLVED,
     ),
     "manikin_l": (
         63_889_240,
