@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from memmlp.motion.body import FRAME_DIM, builtin_rest_joints
-from memmlp.motion.coordinates import HeadRelative, World
+from memmlp.motion.coordinates import Heading, HeadRelative, World
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.features import motion_frames
 from memmlp.motion.normalizer import Normalizer
@@ -25,6 +25,7 @@ from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import CodeMemory, JointCodeMemory, Memory, NoMemory, RecurrentMemory
 from memmlp.networks.predictor import Predictor, TwoBranch
+from memmlp.networks.refiner import Refined
 from memmlp.networks.vqvae import VQVAE
 from memmlp.networks.window_model import WindowModel
 from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, TermsLoss
@@ -146,3 +147,10 @@ def baseline(name: str, coordinates: World | None = None, seed: int = 0, **chang
     """Make a tiny baseline with random weights, in evaluation mode."""
     torch.manual_seed(seed)
     return BASELINES[name](normalizer(coordinates), **changes).eval()
+
+
+def refined(network: WindowModel | None = None) -> Refined:
+    """Make a network with a tiny refiner of random weights behind it, in evaluation mode."""
+    network = network or model(coordinates=Heading())
+    torch.manual_seed(1)
+    return Refined(network, width=6, depth=2).eval()

@@ -53,7 +53,7 @@ INFERENCE = ("memory.blend", "memory.history", "model.sampling_steps", "model.of
 ID = re.compile(r"[0-9a-f]{16}")
 """What the id of a run looks like."""
 
-SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term")
+SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term", "refiner")
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,8 @@ def inference(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def _rolls_out(config: Mapping[str, Any]) -> bool:
     """Return whether training runs the network as live use does, so that inference keys act in it too."""
-    return (config.get("rollout") or {}).get("name", "teacher_forcing") != "teacher_forcing"
+    rollout = (config.get("rollout") or {}).get("name", "teacher_forcing")
+    return bool(config.get("refiner")) or rollout != "teacher_forcing"
 
 
 def _unused(config: Mapping[str, Any]) -> Iterable[str]:

@@ -39,6 +39,7 @@ RECIPES: dict[str, int] = {
     "predictor.two_branch_memory": 1,
     "predictor.rotation_only": 1,
     "predictor.rotation_only_memory": 1,
+    "refiner.sage": 1,
     "vqvae": 1,
     "codebook.ema": 1,
     "codebook.gradient": 1,

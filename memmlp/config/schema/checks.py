@@ -89,7 +89,7 @@ def _show(value: Any) -> str:
     return str(list(value)) if OmegaConf.is_list(value) else str(value)
 
 
-SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term")
+SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term", "refiner")
 
 
 def _check_names(cfg: DictConfig) -> None:

@@ -38,9 +38,11 @@ from memmlp.config.schema.network import (
     NoCodesMemoryConfig,
     NoMemoryConfig,
     PredictorConfig,
+    RefinerConfig,
     RotationOnlyConfig,
     RotationOnlyMemoryConfig,
     RPMConfig,
+    SAGERefinerConfig,
     TwoBranchConfig,
     TwoBranchMemoryConfig,
     VAEHMDConfig,
@@ -142,6 +144,9 @@ class ProfileConfig:
     rpm_width: Optional[int] = optional(Within(1))
     rpm_depth: Optional[int] = optional(Within(1))
     rpm_feedforward: Optional[int] = optional(Within(1))
+    refiner_width: Optional[int] = optional(Within(1))
+    refiner_frames: Optional[int] = optional(Within(4))
+    refiner_pieces: Optional[int] = optional(Within(1))
 
 
 @dataclass
@@ -214,6 +219,7 @@ class Config:
     loss: LossConfig = field(default_factory=LossConfig)
     hand: Optional[HandConfig] = None
     term: Optional[TermConfig] = None
+    refiner: Optional[RefinerConfig] = None
     optim: OptimConfig = field(default_factory=OptimConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     export: ExportConfig = field(default_factory=ExportConfig)
@@ -261,6 +267,7 @@ SCHEMAS: dict[str, type] = {
     "hand_position": HandPositionConfig,
     "hand_fk": HandFKConfig,
     "hand_off": NoHandConfig,
+    "refiner_sage": SAGERefinerConfig,
     "optim": OptimConfig,
     "evaluation": EvaluationConfig,
     "export": ExportConfig,
@@ -282,6 +289,7 @@ GROUPS = {
     "loss": LossConfig,
     "hand": HandConfig,
     "term": TermConfig,
+    "refiner": RefinerConfig,
     "optim": OptimConfig,
     "evaluation": EvaluationConfig,
     "export": ExportConfig,

@@ -232,6 +232,24 @@ class GRUMemoryConfig(RecurrentMemoryConfig):
 
 
 @dataclass
+class RefinerConfig:
+    """What corrects the stream of a network (conf/refiner); null for nothing."""
+
+    name: str = key(Text())
+    _target_: str = MISSING
+
+
+@dataclass
+class SAGERefinerConfig(RefinerConfig):
+    name: str = called("sage")
+    _target_: str = target("memmlp.networks.refiner.SAGERefiner")
+    width: int = at_least(1)
+    depth: int = at_least(1)
+    frames: int = at_least(4)
+    pieces: int = at_least(1)
+
+
+@dataclass
 class VQVAEConfig:
     """The VQ-VAE and how it is trained (conf/vqvae); exactly one of `epochs` and `steps` is set."""
 

@@ -16,6 +16,7 @@ from memmlp.networks.baselines.manikin import ManikinL, ManikinS
 from memmlp.networks.baselines.rpm import RPM
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
+from memmlp.networks.refiner import Refined
 from memmlp.networks.streaming.baselines import (
     AGRoLDiffusionStream,
     AGRoLMLPStream,
@@ -29,6 +30,7 @@ from memmlp.networks.streaming.baselines import (
     VAEHMDStream,
 )
 from memmlp.networks.streaming.mem_mlp import MemMLPStream
+from memmlp.networks.streaming.refined import RefinedStream
 from memmlp.networks.streaming.ring import StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
@@ -67,10 +69,14 @@ def streaming(model: WindowModel) -> StreamingGraph:
         raise InputError(
             "export.graph=streaming: a part of one's own has none; allowed is export.graph=naive"
         )
+    if isinstance(model, Refined):
+        return RefinedStream(model, streaming(model.network))
     return STREAMS[type(model)](model)
 
 
 def has_stream(model: WindowModel) -> bool:
     """Return whether there is a streaming graph of a network; of parts of one's own there may be none."""
+    if isinstance(model, Refined):
+        return has_stream(model.network)
     graph = STREAMS.get(type(model))
     return graph is not None and model.settled and model.streams and graph.fits(model)
