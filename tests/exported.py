@@ -15,6 +15,7 @@ from memmlp.networks.window_model import WindowModel
 NETWORKS: dict[str, Callable[[], WindowModel]] = {
     "mem_mlp": partial(tiny.model, CodeMemory, coordinates=Heading()),
     "lstm": partial(tiny.model, LSTMMemory, coordinates=Heading()),
+    "refined": lambda: tiny.refined(tiny.baseline("avatar_poser", Heading())),
     **{name: partial(tiny.baseline, name, Heading()) for name in tiny.BASELINES},
 }
 """By name. Relative to the heading, which makes the larger graph."""

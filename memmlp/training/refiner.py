@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -147,6 +147,6 @@ class RefinerTask:
         return {}
 
 
-def streamed(network: WindowModel, pieces: Tensor) -> Sequence[Tensor]:
+def streamed(network: WindowModel, pieces: Tensor) -> list[Tensor]:
     """Return the motion (n, 198) that a network streams of each piece (P, n, 252)."""
     return modes.predict(network, list(pieces), "stream", TOGETHER)

@@ -9,8 +9,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from memmlp.config.build import build_architecture, untrained
 from memmlp.config.compose import composed
-from memmlp.deploy.export import export
-from memmlp.deploy.parity import TOLERANCE, parity
 from memmlp.evaluation import modes
 from memmlp.motion.body import POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.coordinates import Heading
@@ -95,10 +93,3 @@ def test_a_step_is_a_few_products_more():
 def test_what_has_no_stream_has_none_with_a_refiner():
     assert has_stream(tiny.refined(tiny.baseline("rpm")))
     assert not has_stream(tiny.refined(tiny.baseline("manikin_l", offline=True)))
-
-
-@pytest.mark.slow
-def test_torch_and_onnx_agree_on_a_whole_clip(tmp_path):
-    model = tiny.refined(tiny.baseline("avatar_poser"))
-    export(streaming(model), tmp_path / "step.onnx", "0" * 16)
-    assert parity(model, tmp_path / "step.onnx", CLIP.float()) <= TOLERANCE
