@@ -15,9 +15,11 @@ from memmlp.networks.window_model import WindowModel
 NETWORKS: dict[str, Callable[[], WindowModel]] = {
     "mem_mlp": partial(tiny.model, CodeMemory, coordinates=Heading()),
     "lstm": partial(tiny.model, LSTMMemory, coordinates=Heading()),
+    "refined": lambda: tiny.refined(tiny.baseline("avatar_poser", Heading())),
     **{name: partial(tiny.baseline, name, Heading()) for name in tiny.BASELINES},
+    **{name: partial(tiny.baseline, name, depth=1) for name in ("manikin_s", "manikin_l")},
 }
-"""By name. Relative to the heading, which makes the larger graph."""
+"""By name. Relative to the heading, which makes the larger graph, unless it is the largest anyway."""
 
 
 def write(name: str, path: Path) -> None:

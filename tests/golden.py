@@ -42,6 +42,7 @@ from memmlp.networks.memory import (
     State,
 )
 from memmlp.networks.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
+from memmlp.networks.refiner import SAGERefiner
 from memmlp.networks.streaming import streaming
 from memmlp.networks.vqvae import VQVAE
 from memmlp.networks.window_model import WindowModel
@@ -64,6 +65,7 @@ from memmlp.training.losses import (
 from memmlp.training.losses.terms import ERRORS, TERMS
 from memmlp.training.network import MotionTask
 from memmlp.training.optim import Optim, vqvae_optim
+from memmlp.training.refiner import RefinerTask, RefinerTraining, sage_loss
 from memmlp.training.rollout import OwnPredictions, PersistentStreams, Rollout, TeacherForcing
 from memmlp.training.vqvae import VQVAETask
 
@@ -143,7 +145,7 @@ def vqvae(codebook: str = "ema") -> Numbers:
     return _trained(task, optim) | task.validate()
 
 
-def _trained(task: VQVAETask | MotionTask, optim: Optim) -> Numbers:
+def _trained(task: VQVAETask | MotionTask | RefinerTask, optim: Optim) -> Numbers:
     """The losses of three steps, and the weights after them."""
     optimiser, found = optim.build(task.parameter_groups()), {}
     for step in range(optim.steps):
@@ -214,6 +216,14 @@ def training() -> Numbers:
         task = MotionTask(Line(), Squares(), TeacherForcing(), frames(), optim, 0, lambda network: {})
         found |= {f"{name} {key}": value for key, value in _trained(task, optim).items()}
     return found
+
+
+def refiner() -> Numbers:
+    """Three steps of its training behind a network, and what both then stream."""
+    model, split, optim = tiny.refined(), frames(), Optim(steps=3, batch=4, lr=1e-2)
+    pieces = RefinerTraining(0, SAGERefiner(6, 2, 20, 6), optim, "frames").drawn(split)
+    task = RefinerTask(model, sage_loss(), split, pieces, optim, validate=lambda: {})
+    return _trained(task, optim) | summary("stream", evaluation.stream(model.eval(), [tiny.clip(25)])[0])
 
 
 def rollout(make: Callable[[], Rollout]) -> Numbers:
@@ -338,6 +348,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
             "rotation_only_memory": RotationOnlyMemory,
         }.items()
     },
+    "refiner.sage": refiner,
     "vqvae": vqvae,
     **{f"codebook.{name}": partial(vqvae, name) for name in ("ema", "gradient")},
     "sampler": sampler,

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from memmlp.motion.body import FRAME_DIM, builtin_rest_joints
-from memmlp.motion.coordinates import HeadRelative, World
+from memmlp.motion.coordinates import Heading, HeadRelative, World
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.features import motion_frames
 from memmlp.motion.normalizer import Normalizer
@@ -19,12 +19,14 @@ from memmlp.networks.baselines.avatar_jlm import AvatarJLM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
 from memmlp.networks.baselines.ego_poser import EgoPoser
 from memmlp.networks.baselines.hmd_poser import HMDPoser
+from memmlp.networks.baselines.manikin import ManikinL, ManikinS
 from memmlp.networks.baselines.rpm import RPM
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import CodeMemory, JointCodeMemory, Memory, NoMemory, RecurrentMemory
 from memmlp.networks.predictor import Predictor, TwoBranch
 from memmlp.networks.recurrent_poser import RecurrentPoser
+from memmlp.networks.refiner import Refined
 from memmlp.networks.vqvae import VQVAE
 from memmlp.networks.window_model import WindowModel
 from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, TermsLoss
@@ -116,7 +118,14 @@ BASELINES: dict[str, Callable[..., WindowModel]] = {
     "rpm": partial(
         RPM, frames=9, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, context=3, horizon=4
     ),
-}
+    "manikin_s": partial(
+        ManikinS, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.0, parts=1.0, turned=True
+    ),
+    "manikin_l": partial(
+        ManikinL, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, coarse=1.0, parts=1.0,
+        turned=True, offline=False,
+    ),
+}  # fmt: skip
 WINDOWLESS = ["hmd_poser", "vae_hmd", "rpm"]
 """Baselines without a window, which are streams in both modes of evaluation."""
 BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
@@ -130,6 +139,8 @@ BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
     "vae_hmd": partial(TermsLoss, "square", rotation=1.0, position=20.0, angle=0.1),
     "avatar_jlm": partial(TermsLoss, rotation=2.0, position=5.0, velocity_3=16.0, contact=20.0, hand=5.0),
     "rpm": partial(TermsLoss, rotation=1.0, sixd_velocity=1.0, world_position=1.0, velocity=1.0),
+    "manikin_s": partial(TermsLoss, orientation=0.02),
+    "manikin_l": partial(TermsLoss, orientation=0.02, world_position=40.0, velocity=50.0, hand=5.0),
 }
 
 
@@ -144,3 +155,10 @@ def recurrent_poser(coordinates: World | None = None, seed: int = 0, **changes) 
     torch.manual_seed(seed)
     settings = {"frames": 7, "width": 16, "depth": 2, "cell": "gru", "expansion": 2}
     return RecurrentPoser(normalizer(coordinates), **settings | changes).eval()
+
+
+def refined(network: WindowModel | None = None) -> Refined:
+    """Make a network with a tiny refiner of random weights behind it, in evaluation mode."""
+    network = network or model(coordinates=Heading())
+    torch.manual_seed(1)
+    return Refined(network, width=6, depth=2).eval()

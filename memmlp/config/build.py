@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -35,6 +35,7 @@ from memmlp.networks.architecture import (
     Architecture,
     BaselineArchitecture,
     MemMLPArchitecture,
+    RefinedArchitecture,
 )
 from memmlp.networks.memory import Memory
 from memmlp.networks.vqvae import VQVAE
@@ -47,6 +48,7 @@ from memmlp.tracking.feed import Tracking
 from memmlp.training.losses import Loss, MotionLoss, Term
 from memmlp.training.network import NetworkTraining
 from memmlp.training.optim import Optim, vqvae_optim
+from memmlp.training.refiner import RefinerTraining
 from memmlp.training.vqvae import VQVAETraining
 
 COORDINATES: dict[str, type[World]] = {"head_relative": HeadRelative, "world": World, "heading": Heading}
@@ -64,6 +66,7 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
         InputError: where the config's device, or the code of a component of one's own, is not there.
     """
     outputs = Path(cfg.paths.outputs)
+    base = build_experiment(_unrefined(cfg), elsewhere) if cfg.refiner is not None else None
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     config["plugins"] = plugins.used(config)
     metrics = build_metrics(cfg.evaluation.metrics)
@@ -79,16 +82,7 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
             seed=cfg.vqvae.seed,
             optim=partial(build_vqvae_optim, cfg),
         ),
-        training=NetworkTraining(
-            seed=cfg.seed,
-            loss=build_loss(cfg),
-            rollout=built(cfg.rollout),
-            optim=Optim(**config["optim"]),
-            weighting=cfg.data.weighting,
-            shares=shares(cfg.data),
-            metrics=metrics,
-            mirror=cfg.data.mirror,
-        ),
+        training=build_training(cfg, metrics),
         evaluation=Evaluation(
             modes=list(cfg.evaluation.modes),
             batch=cfg.evaluation.batch,
@@ -100,7 +94,25 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
         predictions=Path(cfg.save_predictions) if cfg.save_predictions else None,
         tracking=build_tracking(cfg),
         called=readable_name,
+        base=base,
     )
+
+
+def _unrefined(cfg: DictConfig) -> DictConfig:
+    """Return the config of the same network without its refiner, which is not made again nor shown."""
+    bare = cfg.copy()
+    bare.refiner, bare.force, bare.save_predictions = None, False, None
+    return bare
+
+
+def build_training(cfg: DictConfig, metrics: dict[str, OwnMetric]) -> NetworkTraining | RefinerTraining:
+    """Build how a checked config's network is trained, or the refiner behind it."""
+    optim = Optim(**cast(dict[str, Any], OmegaConf.to_container(cfg.optim, resolve=True)))
+    common = {"seed": cfg.seed, "optim": optim, "weighting": cfg.data.weighting}
+    common |= {"shares": shares(cfg.data), "metrics": metrics}
+    if cfg.refiner is not None:
+        return RefinerTraining(refiner=built(cfg.refiner), **common)
+    return NetworkTraining(loss=build_loss(cfg), rollout=built(cfg.rollout), mirror=cfg.data.mirror, **common)
 
 
 def untrained(overrides: Sequence[str]) -> WindowModel:
@@ -120,6 +132,15 @@ def build_tracking(cfg: DictConfig) -> Tracking:
 
 def build_architecture(cfg: DictConfig) -> Architecture:
     """Build the architecture of a checked config, which makes and loads its network."""
+    network = build_network(cfg)
+    if cfg.refiner is None:
+        return network
+    space = {name: getattr(network, name) for name in ("coordinates", "normalize", "vqvae")}
+    return RefinedArchitecture(**space, network=network, refiner=built(cfg.refiner))
+
+
+def build_network(cfg: DictConfig) -> Architecture:
+    """Build the architecture of a checked config's network, without a refiner."""
     space = {"coordinates": build_coordinates(cfg.frame.coordinates), "normalize": cfg.frame.normalize}
     vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in VQVAE_SETTINGS})
     if "_target_" in cfg.model:

@@ -93,7 +93,8 @@ def check_identity(experiment: Experiment, task: RunTask) -> None:
     from memmlp.config.plan_sweep import tasks_of
 
     digest = experiment.data.prepare().digest
-    if task.key not in {found.key for found in tasks_of(experiment, digest)}:
+    known = tasks_of(experiment, digest)
+    if task.key not in {key for found in known for key in (found.id, found.key)}:
         raise InputError(f"run {task.id}: the data or the code changed since the sweep began; start it again")
 
 

@@ -7,7 +7,7 @@ the code and the data are unchanged.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -148,6 +148,9 @@ def tasks_of(experiment: Experiment, data: str) -> list[RunTask]:
     own = experiment.identity(data)
     above = own.upstream.id if own.upstream else None
     upstream = [RunTask(above, "vqvae", experiment.config)] if above else []
+    if experiment.base:  # the network's training is enough of it
+        *upstream, network = tasks_of(experiment.base, data)
+        upstream = [*upstream, replace(network, stages=())]
     return [*upstream, RunTask(own.id, "memmlp", experiment.config, above, experiment.stages, own.what)]
 
 

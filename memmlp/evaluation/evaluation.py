@@ -41,13 +41,15 @@ class Evaluation:
         """Compute the metrics in a mode.
 
         Returns:
-            "mean", the metrics by branch, and "clips", a row for each clip with its metrics by branch.
+            "mean", the metrics by branch, and "clips", a row for each clip with its metrics by branch; and
+            "offline" of a network that is no stream.
         """
         torch.manual_seed(self.seed)  # a mode's result does not depend on which modes came before it
         found = modes.evaluate(model, test, [mode], self.batch, self.ik, self.metrics)
         facts = ("name", "group", "source", "frames")
         rows = [{key: row[key] for key in facts if key in row} | row[mode] for row in found["clips"]]
-        return {"mean": found["mean"][mode], "clips": rows}
+        label = {} if model.streams else {"offline": True}
+        return {"mean": found["mean"][mode], "clips": rows, **label}
 
 
 def picture(model: WindowModel, test: MotionDataset, path: Path) -> None:

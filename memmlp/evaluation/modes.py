@@ -28,8 +28,11 @@ from memmlp.networks.memory import State
 class Evaluable(Protocol):
     """What can be evaluated: a WindowModel, or anything else with these attributes and methods."""
 
-    normalizer: Normalizer
     frames: int
+
+    @property
+    def normalizer(self) -> Normalizer:
+        """Converts between the world and network space."""
 
     @property
     def shift(self) -> int:

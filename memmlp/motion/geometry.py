@@ -27,11 +27,8 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
     return identity + sine * cross + cosine * (cross @ cross)
 
 
-def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
-    """Convert matrices (..., 3, 3) to axis-angle (..., 3) of norm at most pi.
-
-    It goes by a quaternion, which is accurate at 0 and near pi.
-    """
+def matrix_to_quaternion(matrix: Tensor) -> Tensor:
+    """Convert matrices (..., 3, 3) to unit quaternions (..., 4), the real part first and not negative."""
     m = matrix
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
@@ -49,7 +46,15 @@ def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
     pivot = forms.diagonal(dim1=-2, dim2=-1).argmax(-1)
     index = pivot[..., None, None].expand(*pivot.shape, 1, 4)
     quaternion = F.normalize(forms.gather(-2, index).squeeze(-2), dim=-1)
-    quaternion = torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+    return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+
+
+def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
+    """Convert matrices (..., 3, 3) to axis-angle (..., 3) of norm at most pi.
+
+    It goes by a quaternion, which is accurate at 0 and near pi.
+    """
+    quaternion = matrix_to_quaternion(matrix)
     vector = quaternion[..., 1:]
     sine = vector.norm(dim=-1, keepdim=True)
     angle = 2 * torch.atan2(sine, quaternion[..., :1])

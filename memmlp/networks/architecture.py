@@ -17,6 +17,7 @@ from memmlp.networks import checkpoint
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import Memory
 from memmlp.networks.predictor import Predictor
+from memmlp.networks.refiner import Refined, SAGERefiner
 from memmlp.networks.vqvae import VQVAE
 from memmlp.networks.window_model import WindowModel
 
@@ -137,3 +138,30 @@ class BaselineArchitecture(Architecture):
     def build(self, normalizer: Normalizer, codes: VQVAE | None) -> WindowModel:
         """Build the network with fresh weights; `codes` is not used."""
         return self.network(normalizer)
+
+
+@dataclass(frozen=True)
+class RefinedArchitecture(Architecture):
+    """How a network with a refiner behind it is built.
+
+    Attributes:
+        network: builds the network itself.
+        refiner: makes the refiner around it.
+    """
+
+    network: Architecture
+    refiner: SAGERefiner
+
+    @property
+    def uses_codes(self) -> bool:
+        """Whether the network needs a frozen VQ-VAE."""
+        return self.network.uses_codes
+
+    @property
+    def trains_codes(self) -> bool:
+        """Whether the network has a VQ-VAE of its own that was trained with it."""
+        return self.network.trains_codes
+
+    def build(self, normalizer: Normalizer, codes: VQVAE | None) -> Refined:
+        """Build the network and its refiner with fresh weights."""
+        return self.refiner.around(self.network.build(normalizer, codes))

@@ -49,8 +49,8 @@ class Cell(nn.Module):
 
 def products(layer: nn.RNNBase, x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
     """Return what a layer's gates get from an input (B, d) and from the hidden state (B, d)."""
-    entering = F.linear(x, layer.weight_ih_l0, layer.bias_ih_l0)
-    return entering, F.linear(hidden, layer.weight_hh_l0, layer.bias_hh_l0)
+    of_input, of_hidden, input_bias, hidden_bias = layer.all_weights[0]
+    return F.linear(x, of_input, input_bias), F.linear(hidden, of_hidden, hidden_bias)
 
 
 class GRU(Cell):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import cast
+
 import torch
 from torch import Tensor, nn
 
@@ -76,7 +79,11 @@ class RecurrentPoser(StreamModel):
     def initial_state(self, batch: int = 1) -> State:
         """Return the state of a fresh start: zeros (B, size) of each block's cell, by the block's name."""
         mean = self.normalizer.mean
-        return {name: mean.new_zeros(batch, block.cell.size) for name, block in self.blocks.items()}
+        return {name: mean.new_zeros(batch, block.cell.size) for name, block in self.named_blocks()}
+
+    def named_blocks(self) -> Iterator[tuple[str, RecurrentBlock]]:
+        """Yield the blocks by their names, in order."""
+        return cast(Iterator[tuple[str, RecurrentBlock]], self.blocks.items())
 
     def encoded(self, sparse: Tensor) -> Tensor:
         """Map world inputs (..., 54) to the hidden state (..., d) that enters the blocks."""
@@ -90,7 +97,7 @@ class RecurrentPoser(StreamModel):
         """Take in the newest frames; see WindowModel."""
         wanted = sparse.shape[1] if newest is None else newest
         h, kept = self.encoded(sparse), {}
-        for name, block in self.blocks.items():
+        for name, block in self.named_blocks():
             h, kept[name] = block(h, state[name])
         return self.posed(h[:, -wanted:], sparse[:, -wanted:]), kept
 
@@ -101,6 +108,6 @@ class RecurrentPoser(StreamModel):
             World motion (B, 198), and the state after the frame.
         """
         h, kept = self.encoded(sparse), {}
-        for name, block in self.blocks.items():
+        for name, block in self.named_blocks():
             h, kept[name] = block.step(h, state[name])
         return self.posed(h, sparse), kept

@@ -48,6 +48,11 @@ class WindowModel(nn.Module):
         return False
 
     @property
+    def streams(self) -> bool:
+        """Whether a frame is made without later ones; else it is evaluated in window mode alone."""
+        return True
+
+    @property
     def length(self) -> int:
         """How many past frames of inputs the buffer holds; the last one directly precedes the new ones."""
         return self.frames - 1

@@ -16,6 +16,7 @@ from memmlp.networks.architecture import VQVAE_SETTINGS, Architecture
 from memmlp.runs.identity import Identity, deployment_id, evaluation_id
 from memmlp.tracking.feed import Tracking
 from memmlp.training.network import NetworkTraining
+from memmlp.training.refiner import RefinerTraining
 from memmlp.training.vqvae import VQVAETraining
 
 
@@ -42,6 +43,7 @@ class Experiment:
         predictions: folder for predictions of the test clips; None for no such files.
         tracking: shows runs elsewhere.
         called: makes a name that people can read, of the config of a run and the word for its kind.
+        base: the experiment of the network that a refiner stands behind; None without a refiner.
     """
 
     config: dict[str, Any]
@@ -51,12 +53,13 @@ class Experiment:
     data: MotionSource
     architecture: Architecture
     vqvae: VQVAETraining
-    training: NetworkTraining
+    training: NetworkTraining | RefinerTraining
     evaluation: Evaluation
     deployment: Deployment | None
     predictions: Path | None
     tracking: Tracking
     called: Callable[[str, Mapping[str, Any]], str] = unnamed
+    base: Experiment | None = None
 
     @property
     def evaluations(self) -> dict[str, str]:
@@ -84,4 +87,5 @@ class Experiment:
         own = {key: value for key, value in self.config.items() if key != "vqvae"}
         if self.architecture.trains_codes:
             own["vqvae"] = {key: self.config["vqvae"][key] for key in VQVAE_SETTINGS}
-        return Identity("memmlp", own, data, self.vqvae_identity(data))
+        above = self.base.identity(data) if self.base else self.vqvae_identity(data)
+        return Identity("memmlp", own, data, above)

@@ -56,7 +56,7 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     """
     data = experiment.data.prepare()
     tell(f"data: {len(data.manifest.clips)} clips, prepared in {data.cache}")
-    codes = vqvae_run(experiment, data) if experiment.architecture.uses_codes else None
+    above = upstream_run(experiment, data)
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     with run.lock():
         if experiment.force:
@@ -64,7 +64,7 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
         made = []
         with shown(experiment, run):
             if not run.done:
-                train_run(experiment, run, data, codes, watch)
+                train_run(experiment, run, data, above, watch)
                 made.append("training")
             made += finish(experiment, run, data)
         if experiment.predictions is not None:
@@ -134,6 +134,13 @@ def clip_rows(experiment: Experiment, run: Run) -> list[dict[str, Any]]:
     return list(rows.values())
 
 
+def upstream_run(experiment: Experiment, data: Prepared) -> Run | None:
+    """Return the finished run that the experiment's own builds upon, made if necessary; None for none."""
+    if experiment.base:
+        return run_experiment(experiment.base).run
+    return vqvae_run(experiment, data) if experiment.architecture.uses_codes else None
+
+
 def vqvae_run(experiment: Experiment, data: Prepared) -> Run:
     """Return the finished run of the VQ-VAE that the network uses, training it if necessary."""
     identity = experiment.vqvae_identity(data.digest)
@@ -183,14 +190,14 @@ def shown(experiment: Experiment, run: Run, again: bool = False) -> Iterator[Non
 
 
 def train_run(
-    experiment: Experiment, run: Run, data: Prepared, codes: Run | None, watch: Watch = unwatched
+    experiment: Experiment, run: Run, data: Prepared, above: Run | None, watch: Watch = unwatched
 ) -> None:
     """Train the network of a run, and mark the run as done."""
     tell(f"network: train it for {experiment.training.optim.steps} steps (run {run.id})")
     begin(experiment, run, experiment.identity(data.digest), experiment.config)
     run.write_manifest({"body": data.manifest.body, "partial": partial_words(experiment, data)})
     run.clear_stages()
-    weights = codes.weights() if codes else None
+    weights = above.weights() if above else None
     parallel.of_first("network")
     with timed(run, "train"):
         experiment.training.train(experiment.architecture, data, weights, run, experiment.device, watch)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from memmlp.common import parallel
+from memmlp.common.errors import InputError
 from memmlp.pipeline.experiment import Experiment
 from memmlp.pipeline.run_stages import Outcome, run_experiment
 from memmlp.runs.run import Run
@@ -17,6 +18,8 @@ def run_together(experiment: Experiment) -> Outcome | None:
     Returns:
         None in the processes that trained along.
     """
+    if experiment.base and parallel.size() > 1:
+        raise InputError("refiner: several processes can't train it; allowed is one process, or refiner=null")
     parallel.connect(experiment.device.type)
     if not parallel.first():
         _train_along(experiment)

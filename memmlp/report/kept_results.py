@@ -191,7 +191,7 @@ def _record(run: Measured) -> dict[str, Any]:
     }
     costs = {name: _short(cost) for name, cost in run.costs.items()}
     origin = plain(asdict(run.origin))
-    for name in ("partial", "processes"):  # files from before there were these have none
+    for name in ("partial", "processes", "offline"):  # files from before there were these have none
         if origin[name] == getattr(Origin, name):
             del origin[name]
     return {"origin": origin, "clips": _clips_key(run), "costs": costs, "errors": errors}

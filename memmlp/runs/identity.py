@@ -47,7 +47,7 @@ PATHS = ("_target_", "_partial_")
 
 EVALUATION = ("evaluation",)
 DEPLOYMENT = ("export",)
-INFERENCE = ("memory.blend", "memory.history", "model.sampling_steps")
+INFERENCE = ("memory.blend", "memory.history", "model.sampling_steps", "model.offline")
 """Keys of the later stages; those of INFERENCE count for both, and for a training that rolls out."""
 
 ID = re.compile(r"[0-9a-f]{16}")
@@ -56,7 +56,7 @@ ID = re.compile(r"[0-9a-f]{16}")
 DATA_PATH = re.compile(r"data\.(root|body|split\.folder|sources\..+\.root)")
 """The keys that say where data lies."""
 
-SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term")
+SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term", "refiner")
 
 
 @dataclass(frozen=True)
@@ -254,7 +254,8 @@ def inference(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def _rolls_out(config: Mapping[str, Any]) -> bool:
     """Return whether training runs the network as live use does, so that inference keys act in it too."""
-    return (config.get("rollout") or {}).get("name", "teacher_forcing") != "teacher_forcing"
+    rollout = (config.get("rollout") or {}).get("name", "teacher_forcing")
+    return bool(config.get("refiner")) or rollout != "teacher_forcing"
 
 
 def _unused(config: Mapping[str, Any]) -> Iterable[str]:

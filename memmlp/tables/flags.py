@@ -42,6 +42,7 @@ def flags(
     yield from _missing(sweep, runs, command, state)
     yield from _older(sweep, runs, older)
     yield from _branches(sweep, asked, runs, command)
+    yield from _offline(every)
     yield from _same(sweep, runs)
     yield from _unequal_clips(sweep, runs)
     yield from _unequal_groups(every)
@@ -99,6 +100,13 @@ def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, Runs], command: str
     if lacking:
         branches, labels = _listed(_unique(a.branch for a in lacking)), _quoted(a.label for a in lacking)
         yield f"not evaluated in the branch {branches}: {labels}; do so with: {command}"
+
+
+def _offline(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
+    """Flag networks that are no streams."""
+    found = [label for label, run in every if run.origin.offline]
+    if found:
+        yield f"offline, no stream, for frames are made with later ones: {_quoted(found)}"
 
 
 def _unequal_clips(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:

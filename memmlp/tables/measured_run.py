@@ -41,6 +41,7 @@ class Origin:
         vqvae: the id of the VQ-VAE's run; None where there is none.
         partial: which part of its protocol's list the data is, in words; None where it is all of it.
         plugins: version and digest of the code of each package of one's own that it uses.
+        offline: whether its frames are made with later ones, so that it is no stream.
     """
 
     code: str
@@ -58,6 +59,7 @@ class Origin:
     vqvae: str | None = None
     partial: str | None = None
     plugins: Mapping[str, str] = field(default_factory=dict)
+    offline: bool = False
 
 
 @dataclass(frozen=True)
@@ -250,6 +252,7 @@ def _evaluated(origin: Origin, reports: Sequence[Mapping[str, Any]]) -> Origin:
     """Return the origin of a run together with that of its evaluations, where these differ from it."""
     others = [_origin({**report.get("made_by", {}), **report}) for report in reports]
     found: dict[str, Any] = {"changed": origin.changed or any(other.changed for other in others)}
+    found["offline"] = any(report.get("offline") for report in reports)
     for name in ("code", "hardware", "device", "gpu", "threads", "torch"):
         known = [word for other in others if (word := getattr(other, name)) not in (UNKNOWN, "version ?")]
         found[name] = ", ".join(dict.fromkeys([getattr(origin, name), *known]))

@@ -56,7 +56,7 @@ class NetworkTraining:
         self,
         architecture: Architecture,
         data: Prepared,
-        codes: Path | None,
+        above: Path | None,
         run: Run,
         device: torch.device,
         watch: Watch = unwatched,
@@ -66,7 +66,7 @@ class NetworkTraining:
         Args:
             architecture: builds the network.
             data: the prepared motion.
-            codes: weights of the frozen VQ-VAE, where the architecture uses one.
+            above: weights of the frozen VQ-VAE, where the architecture uses one.
             run: the run whose folder takes checkpoints, log and weights.
             device: the device to train on.
             watch: called after each validation; see `memmlp.training.loop.train`.
@@ -76,7 +76,7 @@ class NetworkTraining:
         """
         dataset = data.open("train").to(device)
         torch.manual_seed(self.seed)
-        frozen = architecture.load_vqvae(codes) if codes else None
+        frozen = architecture.load_vqvae(above) if above else None
         model = architecture.build(architecture.normalizer(data.manifest, dataset.frames), frozen).to(device)
         self.rollout.begin(model)
         pieces = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)

@@ -23,6 +23,7 @@ def built(*overrides: str) -> WindowModel:
 # MACs of a streaming step: 12 blocks of T T d + T d d, stem and head for AGRoL; its denoiser five times, with
 # a linear a block and the embedding's two for one row. For AvatarPoser and EgoPoser 4 d d + 2 d f a layer and
 # token, and the products of attention.
+SOLVED = 22 * 27 + 43 * 27  # of a frame of MANIKIN's: kinematics of the trunk, products of 3 x 3 in the limbs
 PUBLISHED = {
     "agrol_mlp": (3_735_668, 3.74, 12 * (196**2 * 512 + 196 * 512**2) + 196 * 512 * (54 + 132)),
     "agrol_diffusion": (
@@ -54,6 +55,19 @@ PUBLISHED = {
         41 * ((396 + 1024 + 132) * 1024 + 22 * 9 * 512 + 1024 * 512 + (45 * 512 + 132) * 1024)
         + 12 * 41 * 45 * (4 * 512**2 + 2 * 512 * 2048) + 6 * 41 * 45 * 2 * (45 + 41) * 512
         + 41 * 22 * 27,  # the coarse pose of each frame
+    ),
+    "manikin_s": (
+        4_244_566,
+        4.24,
+        3 * 40 * (4 * 256**2 + 2 * 256 * 2048 + 2 * 40 * 256) + 40 * 54 * 256
+        + 4 * 256**2 + 256 * 86 + SOLVED,
+    ),
+    "manikin_l": (
+        63_889_240,
+        63.89,
+        41 * ((396 + 1024 + 132) * 1024 + 22 * 9 * 512 + 1024 * 512 + (45 * 512 + 212) * 1024)
+        + 12 * 41 * 45 * (4 * 512**2 + 2 * 512 * 2048) + 6 * 41 * 45 * 2 * (45 + 41) * 512
+        + 41 * 22 * 27 + 41 * SOLVED,
     ),
     "rpm": (
         9_889_412 - 512 * 513,  # the released code has a layer that nothing uses
@@ -130,6 +144,7 @@ REFUSED = [
     (["model=agrol_mlp", "loss.error=cube"], "loss.error=cube"),
     (["model=avatar_poser", "loss.anchor=foot"], "loss.anchor=foot"),
     (["model=rpm", "model.frames=19"], "model.context + model.horizon = 20"),
+    (["model=manikin_l", "model.offline=true"], "allowed is evaluation.modes=[window] with export.graph=off"),
     (["loss=terms"], "loss=terms is of rotations alone"),
     (["model=agrol_mlp", "loss=terms", "loss.jerk=-1"], "loss.jerk=-1"),
     (["model=agrol_mlp", "loss=terms", "loss.jerks=1"], "loss.jerks"),

@@ -81,6 +81,8 @@ def test_inner_layers_are_int8_and_the_ends_are_not(step_files, tmp_path, networ
         "avatar_poser": {"model.model.embedding.weight", "model.model.orientation.0.weight"},
         "ego_poser": {"model.model.embedding.weight", "model.model.orientation.0.weight"},
         "hmd_poser": {"model.model.pose.0.weight"},
+        "manikin_s": {f"model.model.{head}.0.weight" for head in ("swivel", "places", "rotation")},
+        "manikin_l": {"model.model.regressor.0.weight", "model.model.regressor.3.weight"},
         "avatar_jlm": {"model.model.regressor.0.weight", "model.model.regressor.3.weight"},
         "rpm": {"model.model.head.weight"},
         "vae_hmd": {"model.model.encoder.stem.weight", "model.model.decoder.head.weight"},

@@ -7,7 +7,7 @@ import torch
 from plain_body import posed
 
 from memmlp.common.errors import InputError
-from memmlp.motion.body import ROTATION, SPARSE_DIM, SPARSE_POSITION
+from memmlp.motion.body import PARENTS, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.coordinates import World
 from memmlp.motion.geometry import axis_angle_to_matrix, matrix_to_sixd
 from memmlp.training.losses import TermsLoss
@@ -101,6 +101,33 @@ def test_terms_of_rotations():
     whole = angles[:, None] * depth
     both = (2 * np.abs(np.cos(whole) - 1) + 2 * np.abs(np.sin(whole))) / 6
     assert found["global_rotation"] == pytest.approx(both.mean(), rel=1e-4)
+
+
+def plain_rotations(motion: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Local and global rotations (2, 9, 22, 3, 3), by Gram-Schmidt and down the tree, in NumPy."""
+    x, y = np.moveaxis(motion[..., ROTATION].double().numpy().reshape(2, 9, 22, 2, 3), -2, 0)
+    x = x / np.linalg.norm(x, axis=-1, keepdims=True)
+    y = y - (x * y).sum(-1, keepdims=True) * x
+    y = y / np.linalg.norm(y, axis=-1, keepdims=True)
+    local = np.stack([x, y, np.cross(x, y)], -1)
+    turned = local.copy()
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        turned[:, :, joint] = turned[:, :, parent] @ local[:, :, joint]
+    return local, turned
+
+
+def test_terms_of_any_rotations():
+    """Of random motion: velocities on SO(3), global rotations, and angles by their traces."""
+    (made, made_globally), (true, true_globally) = map(plain_rotations, (MADE, TRUE[..., SPARSE_DIM:]))
+    turns = [one[:, :-1].swapaxes(-1, -2) @ one[:, 1:] for one in (made, true)]
+    trace = np.trace(made_globally.swapaxes(-1, -2) @ true_globally, axis1=-2, axis2=-1)
+    expected = {
+        "turn": np.abs((turns[0] - turns[1])[..., :2]).mean(),
+        "global_rotation": np.abs((made_globally - true_globally)[..., :2]).mean(),
+        "angle": np.arccos(np.clip((trace - 1) / 2, -1, 1)).mean(),
+    }
+    found = terms(**dict.fromkeys(expected, 1.0))
+    assert found == pytest.approx(expected, rel=1e-3)
 
 
 def test_errors_are_of_components_or_of_joints(bodies):

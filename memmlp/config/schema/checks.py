@@ -90,7 +90,7 @@ def _show(value: Any) -> str:
     return str(list(value)) if OmegaConf.is_list(value) else str(value)
 
 
-SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term")
+SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term", "refiner")
 
 
 def _check_names(cfg: DictConfig) -> None:
@@ -182,6 +182,11 @@ def _check_baseline(cfg: DictConfig) -> None:
     if _is(cfg.model, RPMConfig) and cfg.model.frames < (least := cfg.model.context + cfg.model.horizon):
         raise InputError(
             f"model.frames={cfg.model.frames}: allowed is at least model.context + model.horizon = {least}"
+        )
+    if cfg.model.get("offline") and (list(cfg.evaluation.modes) != ["window"] or cfg.export.graph != "off"):
+        raise InputError(
+            "model.offline=true: a frame is made with later ones, so there is no stream: "
+            "allowed is evaluation.modes=[window] with export.graph=off"
         )
     steps = cfg.model.get("diffusion_steps", 1)
     if cfg.model.get("sampling_steps", 1) > steps:

@@ -31,15 +31,19 @@ from memmlp.config.schema.network import (
     HMDPoserConfig,
     JointCodeMemoryConfig,
     LSTMMemoryConfig,
+    ManikinLConfig,
+    ManikinSConfig,
     MemoryConfig,
     ModelConfig,
     NoCodesMemoryConfig,
     NoMemoryConfig,
     PredictorConfig,
     RecurrentPoserConfig,
+    RefinerConfig,
     RotationOnlyConfig,
     RotationOnlyMemoryConfig,
     RPMConfig,
+    SAGERefinerConfig,
     TwoBranchConfig,
     TwoBranchMemoryConfig,
     VAEHMDConfig,
@@ -129,11 +133,24 @@ class ProfileConfig:
     avatar_poser_width: int = at_least(1)
     avatar_poser_feedforward: int = at_least(1)
     ego_poser_frames: Optional[int] = optional(Within(2))
+    hmd_poser_width: Optional[int] = optional(Within(4))
+    hmd_poser_layers: Optional[int] = optional(Within(1))
+    hmd_poser_feedforward: Optional[int] = optional(Within(1))
+    vae_hmd_width: Optional[int] = optional(Within(1))
+    avatar_jlm_width: Optional[int] = optional(Within(4))
+    avatar_jlm_depth: Optional[int] = optional(Within(1))
+    avatar_jlm_heads: Optional[int] = optional(Within(1))
+    avatar_jlm_feedforward: Optional[int] = optional(Within(1))
     rpm_frames: Optional[int] = optional(Within(2))
+    rpm_width: Optional[int] = optional(Within(1))
+    rpm_depth: Optional[int] = optional(Within(1))
     rpm_feedforward: Optional[int] = optional(Within(1))
     recurrent_poser_frames: Optional[int] = optional(Within(2))
     recurrent_poser_width: Optional[int] = optional(Within(1))
     recurrent_poser_depth: Optional[int] = optional(Within(1))
+    refiner_width: Optional[int] = optional(Within(1))
+    refiner_frames: Optional[int] = optional(Within(4))
+    refiner_pieces: Optional[int] = optional(Within(1))
 
 
 @dataclass
@@ -206,6 +223,7 @@ class Config:
     loss: LossConfig = field(default_factory=LossConfig)
     hand: Optional[HandConfig] = None
     term: Optional[TermConfig] = None
+    refiner: Optional[RefinerConfig] = None
     optim: OptimConfig = field(default_factory=OptimConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     export: ExportConfig = field(default_factory=ExportConfig)
@@ -230,6 +248,8 @@ SCHEMAS: dict[str, type] = {
     "model_avatar_jlm": AvatarJLMConfig,
     "model_vae_hmd": VAEHMDConfig,
     "model_recurrent_poser": RecurrentPoserConfig,
+    "model_manikin_s": ManikinSConfig,
+    "model_manikin_l": ManikinLConfig,
     "predictor_two_branch": TwoBranchConfig,
     "predictor_two_branch_memory": TwoBranchMemoryConfig,
     "predictor_rotation_only": RotationOnlyConfig,
@@ -252,6 +272,7 @@ SCHEMAS: dict[str, type] = {
     "hand_position": HandPositionConfig,
     "hand_fk": HandFKConfig,
     "hand_off": NoHandConfig,
+    "refiner_sage": SAGERefinerConfig,
     "optim": OptimConfig,
     "evaluation": EvaluationConfig,
     "export": ExportConfig,
@@ -273,6 +294,7 @@ GROUPS = {
     "loss": LossConfig,
     "hand": HandConfig,
     "term": TermConfig,
+    "refiner": RefinerConfig,
     "optim": OptimConfig,
     "evaluation": EvaluationConfig,
     "export": ExportConfig,

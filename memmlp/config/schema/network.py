@@ -129,6 +129,23 @@ class RecurrentPoserConfig(BaselineConfig):
 
 
 @dataclass
+class ManikinSConfig(AvatarPoserConfig):
+    name: str = called("manikin_s")
+    _target_: str = target("memmlp.networks.baselines.manikin.ManikinS")
+    parts: float = at_least(0)
+    turned: bool = key()
+
+
+@dataclass
+class ManikinLConfig(AvatarJLMConfig):
+    name: str = called("manikin_l")
+    _target_: str = target("memmlp.networks.baselines.manikin.ManikinL")
+    parts: float = at_least(0)
+    turned: bool = key()
+    offline: bool = key()
+
+
+@dataclass
 class PredictorConfig:
     """The predictor slot (conf/predictor)."""
 
@@ -222,6 +239,24 @@ class LSTMMemoryConfig(RecurrentMemoryConfig):
 class GRUMemoryConfig(RecurrentMemoryConfig):
     name: str = called("gru")
     _target_: str = target("memmlp.networks.memory.GRUMemory")
+
+
+@dataclass
+class RefinerConfig:
+    """What corrects the stream of a network (conf/refiner); null for nothing."""
+
+    name: str = key(Text())
+    _target_: str = MISSING
+
+
+@dataclass
+class SAGERefinerConfig(RefinerConfig):
+    name: str = called("sage")
+    _target_: str = target("memmlp.networks.refiner.SAGERefiner")
+    width: int = at_least(1)
+    depth: int = at_least(1)
+    frames: int = at_least(4)
+    pieces: int = at_least(1)
 
 
 @dataclass

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor, nn
 
@@ -61,7 +63,12 @@ class AvatarJLM(WholeWindow):
         feedforward: width of the encoders' hidden layers.
         dropout: dropout rate of the encoders, while training.
         coarse: weight of the loss of the coarse pose's joints.
+
+    Attributes:
+        outputs: how many numbers are read from the tokens of a frame.
     """
+
+    outputs: ClassVar[int] = ROTATION.stop
 
     def __init__(
         self,
@@ -94,7 +101,7 @@ class AvatarJLM(WholeWindow):
             nn.Linear(TOKENS * width, hidden),
             nn.GroupNorm(GROUPS, hidden),
             nn.LeakyReLU(0.1),
-            nn.Linear(hidden, ROTATION.stop),
+            nn.Linear(hidden, self.outputs),
         )
 
     def coarse_joints(self, embedded: Tensor) -> tuple[Tensor, Tensor]:
@@ -131,6 +138,10 @@ class AvatarJLM(WholeWindow):
 
     def rotations(self, encoded: Tensor) -> Tensor:
         """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
+        return self.regressed(encoded)
+
+    def regressed(self, encoded: Tensor) -> Tensor:
+        """Map inputs (B, T, 54) in network space to what is read from their tokens (B, T, n)."""
         h = self.placed(self.tokens(encoded))
         first = h[..., -1:, :]
         for index, layer in enumerate(self.layers):

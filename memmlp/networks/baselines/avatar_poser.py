@@ -10,7 +10,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from memmlp.motion.body import ROTATION, SPARSE_DIM
+from memmlp.motion.body import N_JOINTS, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.encoder import EncoderLayer
 from memmlp.networks.memory import State
@@ -45,9 +45,11 @@ class AvatarPoser(WindowModel):
 
     Attributes:
         inputs: how many features of a frame are embedded.
+        rotated: how many joints' rotations are read beside the root's.
     """
 
     inputs: ClassVar[int] = SPARSE_DIM
+    rotated: ClassVar[int] = N_JOINTS - 1
 
     def __init__(
         self,
@@ -64,7 +66,7 @@ class AvatarPoser(WindowModel):
         self.embedding = nn.Linear(self.inputs, width)
         self.layers = nn.ModuleList(EncoderLayer(width, heads, feedforward, dropout) for _ in range(depth))
         self.orientation = head(width, ROOT)
-        self.rotation = head(width, ROTATION.stop - ROOT)
+        self.rotation = head(width, 6 * self.rotated)
 
     def rotations(self, encoded: Tensor) -> Tensor:
         """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""

@@ -12,10 +12,12 @@ from memmlp.networks.baselines.avatar_jlm import AvatarJLM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
 from memmlp.networks.baselines.ego_poser import EgoPoser
 from memmlp.networks.baselines.hmd_poser import HMDPoser
+from memmlp.networks.baselines.manikin import ManikinL, ManikinS
 from memmlp.networks.baselines.rpm import RPM
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.recurrent_poser import RecurrentPoser
+from memmlp.networks.refiner import Refined
 from memmlp.networks.streaming.baselines import (
     AGRoLDiffusionStream,
     AGRoLMLPStream,
@@ -23,11 +25,14 @@ from memmlp.networks.streaming.baselines import (
     AvatarPoserStream,
     EgoPoserStream,
     HMDPoserStream,
+    ManikinLStream,
+    ManikinSStream,
     RPMStream,
     VAEHMDStream,
 )
 from memmlp.networks.streaming.mem_mlp import MemMLPStream
 from memmlp.networks.streaming.recurrent_poser import RecurrentPoserStream
+from memmlp.networks.streaming.refined import RefinedStream
 from memmlp.networks.streaming.ring import StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
@@ -42,6 +47,8 @@ STREAMS: dict[type[WindowModel], type[StreamingGraph]] = {
     RPM: RPMStream,
     VAEHMD: VAEHMDStream,
     RecurrentPoser: RecurrentPoserStream,
+    ManikinS: ManikinSStream,
+    ManikinL: ManikinLStream,
     AGRoLMLP: AGRoLMLPStream,
     AGRoLDiffusion: AGRoLDiffusionStream,
 }
@@ -59,14 +66,20 @@ def streaming(model: WindowModel) -> StreamingGraph:
             "memory.history=latest: its estimates change at each step, which no streaming graph can carry; "
             "allowed is export.graph=naive, or memory.history=first"
         )
+    if not model.streams:
+        raise InputError("model.offline=true: makes frames with later ones; allowed is model.offline=false")
     if not has_stream(model):
         raise InputError(
             "export.graph=streaming: a part of one's own has none; allowed is export.graph=naive"
         )
+    if isinstance(model, Refined):
+        return RefinedStream(model, streaming(model.network))
     return STREAMS[type(model)](model)
 
 
 def has_stream(model: WindowModel) -> bool:
     """Return whether there is a streaming graph of a network; of parts of one's own there may be none."""
+    if isinstance(model, Refined):
+        return has_stream(model.network)
     graph = STREAMS.get(type(model))
-    return graph is not None and model.settled and graph.fits(model)
+    return graph is not None and model.settled and model.streams and graph.fits(model)

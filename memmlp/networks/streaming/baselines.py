@@ -6,7 +6,7 @@ computes that frame alone. The first layer's products that depend on one frame a
 
 from __future__ import annotations
 
-from typing import cast
+from typing import ClassVar, cast
 
 import torch
 import torch.nn.functional as F
@@ -19,6 +19,7 @@ from memmlp.networks.baselines.avatar_poser import AvatarPoser
 from memmlp.networks.baselines.ego_poser import PLACES, EgoPoser, beside_head, places
 from memmlp.networks.baselines.encoder import EncoderLayer
 from memmlp.networks.baselines.hmd_poser import HMDPoser
+from memmlp.networks.baselines.manikin import ManikinL, ManikinS
 from memmlp.networks.baselines.rpm import RPM
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.layers import MLPBlock
@@ -31,7 +32,7 @@ from memmlp.networks.window_model import WindowModel
 class AvatarPoserStream(StreamingGraph):
     """AvatarPoser's streaming graph; its encoder ignores the order of frames, so a ring's order will do."""
 
-    ends = ("model.embedding", "model.orientation", "model.rotation")
+    ends: ClassVar[tuple[str, ...]] = ("model.embedding", "model.orientation", "model.rotation")
     model: AvatarPoser
     layers: list[EncoderLayer]
 
@@ -46,7 +47,8 @@ class AvatarPoserStream(StreamingGraph):
 
     def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
-        embedded = self.model.embedding(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
+        embedded = self.model.embedding(encoded)
         *earlier, last = self.layers
         attention = self.layers[0].attention
         entering = torch.cat(
@@ -60,7 +62,22 @@ class AvatarPoserStream(StreamingGraph):
             query, key, value = attention.query(h), attention.key(h), attention.value(h)
         attended = last.attention.attend(ring.newest(query)[None], key[None], value[None])[0]
         newest = last.finish(ring.newest(h), attended)
-        return self.normalizer.posed(self.model.read(newest), sparse), {"first": first}
+        return self.normalizer.posed(self.rotation(newest, encoded), sparse), {"first": first}
+
+    def rotation(self, newest: Tensor, encoded: Tensor) -> Tensor:
+        """Map the newest frame's feature (1, d) and inputs (1, 54) to its rotations (1, 132)."""
+        return self.model.read(newest)
+
+
+class ManikinSStream(AvatarPoserStream):
+    """MANIKIN-S' streaming graph: AvatarPoser's, and the limbs of the newest frame."""
+
+    ends = (*AvatarPoserStream.ends, "model.swivel", "model.places")
+    model: ManikinS
+
+    def rotation(self, newest: Tensor, encoded: Tensor) -> Tensor:
+        """Map the newest frame's feature (1, d) and inputs (1, 54) to its rotations (1, 132)."""
+        return self.model.posed(self.model.read(newest), encoded)
 
 
 def newest_frame(layers: list[EncoderLayer], h: Tensor) -> Tensor:
@@ -287,7 +304,21 @@ class AvatarJLMStream(StreamingGraph):
         by_token = h.transpose(0, 1)
         newest = attended(self.layers[-1], by_token[:, -1:], by_token).transpose(0, 1)
         features = self.model.renewed(newest, first[-1:]).flatten(1)
-        return self.normalizer.posed(self.model.regressor(features), sparse), {"tokens": window[1:]}
+        return self.normalizer.posed(self.rotation(features, encoded), sparse), {"tokens": window[1:]}
+
+    def rotation(self, features: Tensor, encoded: Tensor) -> Tensor:
+        """Map the newest frame's tokens (1, 45 d) and inputs (1, 54) to its rotations (1, 132)."""
+        return self.model.regressor(features)
+
+
+class ManikinLStream(AvatarJLMStream):
+    """MANIKIN-L's streaming graph: AvatarJLM's, and the limbs of the newest frame."""
+
+    model: ManikinL
+
+    def rotation(self, features: Tensor, encoded: Tensor) -> Tensor:
+        """Map the newest frame's tokens (1, 45 d) and inputs (1, 54) to its rotations (1, 132)."""
+        return self.model.posed(self.model.regressor(features), encoded)
 
 
 def attended(layer: EncoderLayer, h: Tensor, seen: Tensor) -> Tensor:

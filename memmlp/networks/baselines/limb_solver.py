@@ -1,0 +1,248 @@
+"""Arms and legs in closed form, as MANIKIN has them (Jiang et al., ECCV 2024).
+
+A limb has a base (shoulder, hip), a middle (elbow, knee) and an end (wrist, ankle). Base and end leave the
+middle a circle to be on; the **swivel** is the angle on it. Elbows and knees bend about one axis each.
+
+Vectors and rotations of the four limbs stand side by side: left arm, right arm, left leg, right leg.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from memmlp.motion.body import PARENTS
+from memmlp.motion.geometry import matrix_to_quaternion
+
+BASES, MIDDLES, ENDS = (16, 17, 1, 2), (18, 19, 4, 5), (20, 21, 7, 8)
+ANKLES, TOES = ENDS[2:], (10, 11)
+FLEXION = ((0.189, -0.966, 0.179), (0.085, 0.970, -0.227), (0.985, 0.003, -0.174), (0.995, -0.029, 0.096))
+"""The axes, in the rest pose, about which elbows and knees bend, as published for SMPL's bodies."""
+TWIST = (90.0, 90.0, 40.0, 40.0)
+"""How far, in degrees, shoulders and hips may be twisted about their upper bone, to either side."""
+STRAIGHT = 5e-4  # from 1, of the cosine of the least bend, 1.8 degrees: on a straighter limb rounding is seen
+OFFSET = 1e-3  # metres; which way a limb bends that is straighter than that follows from its axis of flexion
+
+
+def dot(one: Tensor, other: Tensor) -> Tensor:
+    """Return the products (..., 1) of vectors (..., 3)."""
+    return (one * other).sum(-1, keepdim=True)
+
+
+def cross(one: Tensor, other: Tensor) -> Tensor:
+    """Return the cross products (..., 3) of vectors (..., 3)."""
+    return torch.linalg.cross(*torch.broadcast_tensors(one, other), dim=-1)
+
+
+def applied(rotation: Tensor, vector: Tensor) -> Tensor:
+    """Apply rotations (..., 3, 3) to vectors (..., 3)."""
+    return (rotation @ vector[..., None])[..., 0]
+
+
+def about(axis: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
+    """Return the rotations (..., 3, 3) about unit axes (..., 3), of cosines and sines (..., 1) of angles."""
+    x, y, z = axis.unbind(-1)
+    zero = torch.zeros_like(x)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    identity = torch.eye(3, dtype=axis.dtype, device=axis.device)
+    return identity + sine[..., None] * skew + (1 - cosine)[..., None] * (skew @ skew)
+
+
+def aligning(start: Tensor, goal: Tensor) -> Tensor:
+    """Return the smallest rotations (..., 3, 3) that carry unit vectors (..., 3) to others."""
+    axis = cross(start, goal)
+    x, y, z = axis.unbind(-1)
+    zero = torch.zeros_like(x)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    identity = torch.eye(3, dtype=axis.dtype, device=axis.device)
+    return identity + skew + skew @ skew / (1 + dot(start, goal)).clamp_min(1e-6)[..., None]
+
+
+def frame(first: Tensor, second: Tensor) -> Tensor:
+    """Return the rotations (..., 3, 3) whose columns are two perpendicular unit vectors and their product."""
+    return torch.stack([first, second, cross(first, second)], -1)
+
+
+def circle(axis: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the directions (..., 3) from which, and towards which, swivels are counted.
+
+    Args:
+        axis: unit vectors (..., 3) from base to end.
+        up: the bases' Y axes (..., 3).
+    """
+    start = F.normalize(dot(up, axis) * axis - up, dim=-1)
+    return start, cross(start, axis)
+
+
+def swivels(base: Tensor, middle: Tensor, end: Tensor, up: Tensor) -> Tensor:
+    """Return the cosines and sines (..., 2) of limbs' swivels, from joints (..., 3) and the bases' Y axes."""
+    axis = F.normalize(end - base, dim=-1)
+    start, quarter = circle(axis, up)
+    away = middle - base
+    return F.normalize(torch.cat([dot(away, start), dot(away, quarter)], -1), dim=-1)
+
+
+def bend_direction(axis: Tensor, up: Tensor, swivel: Tensor) -> Tensor:
+    """Return the unit vectors (..., 3) from the axis to the middle, at swivels (..., 2)."""
+    start, quarter = circle(axis, up)
+    return swivel[..., :1] * start + swivel[..., 1:] * quarter
+
+
+def middle_at(base: Tensor, end: Tensor, up: Tensor, swivel: Tensor, upper: Tensor, lower: Tensor) -> Tensor:
+    """Return the middles (..., 3) of limbs at swivels (..., 2); lengths of bones are (..., 1), metres."""
+    away = end - base
+    reach = away.norm(dim=-1, keepdim=True).clamp_min(1e-4)
+    axis = away / reach
+    cosine = ((upper.square() + reach.square() - lower.square()) / (2 * upper * reach)).clamp(-1, 1)
+    sine = (1 - cosine.square()).clamp_min(1e-6).sqrt()
+    return base + upper * (cosine * axis + sine * bend_direction(axis, up, swivel))
+
+
+def bones(rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the limbs' upper and lower bones (4, 3) and axes of flexion (4, 3) in a rest pose (22, 3)."""
+    base, middle, end = (rest[list(joints)] for joints in (BASES, MIDDLES, ENDS))
+    return middle - base, end - middle, F.normalize(rest.new_tensor(FLEXION), dim=-1)
+
+
+def flexed(upper: Tensor, lower: Tensor, axis: Tensor, reach: Tensor) -> Tensor:
+    """Return the rotations (..., 4, 3, 3) of middles that bring the ends to a distance from their bases.
+
+    Of the two ways to bend, each limb takes the one about its own axis of flexion. A limb that is asked to
+    reach further, or less far, than it can is as straight, or as bent, as can be.
+
+    Args:
+        upper, lower, axis: see `bones`.
+        reach: the distances (..., 4, 1), metres.
+    """
+    along = dot(upper, axis) * dot(lower, axis)
+    cosine, sine = dot(upper, lower) - along, dot(upper, cross(axis, lower))
+    size = (cosine.square() + sine.square()).sqrt()
+    wanted = (reach.square() - dot(upper, upper) - dot(lower, lower)) / 2 - along
+    bend = (wanted / size).clamp(-1 + STRAIGHT, 1 - STRAIGHT)
+    across, cosine, sine = ((1 - bend) * (1 + bend)).sqrt(), cosine / size, sine / size
+    axes = axis.expand(*bend.shape[:-1], 3)
+    return about(axes, cosine * bend - sine * across, sine * bend + cosine * across)
+
+
+def twist(rotation: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
+    """Return cosines and sines (..., 1) of how far rotations (..., 3, 3) turn about unit axes (..., 3)."""
+    skew = torch.stack(
+        [
+            rotation[..., 2, 1] - rotation[..., 1, 2],
+            rotation[..., 0, 2] - rotation[..., 2, 0],
+            rotation[..., 1, 0] - rotation[..., 0, 1],
+        ],
+        -1,
+    )
+    trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
+    both = torch.cat([trace - dot(axis, applied(rotation, axis)), dot(axis, skew)], -1)
+    cosine, sine = F.normalize(both, dim=-1).split(1, -1)
+    return cosine, sine
+
+
+def untwisting(local: Tensor, bone: Tensor, axis: Tensor) -> Tensor:
+    """Return the smallest rotations (..., 4, 3, 3) about the axes that bring the bases' twists to the limits.
+
+    With h the half of a rotation's angle, the twist of the rotated base is a ratio of sums of sin h and
+    cos h; tan h follows. A base within its limits is not rotated.
+
+    Args:
+        local: the bases' local rotations (..., 4, 3, 3).
+        bone: the upper bones' unit vectors (4, 3) in the rest pose.
+        axis: the unit vectors (..., 4, 3) from base to end, as the bases' parents see them.
+    """
+    real, vector = matrix_to_quaternion(local).split([1, 3], -1)
+    limit = (local.new_tensor(TWIST) * (math.pi / 360)).tan()[:, None]
+    turned = dot(vector, bone)
+    by_sine = real * dot(axis, bone) + dot(cross(axis, vector), bone)
+    found = []
+    for bound in (limit, -limit):
+        share = by_sine + bound * dot(axis, vector)
+        found.append((bound * real - turned) / torch.where(share.abs() < 1e-9, 1e-9, share))
+    nearest = torch.where(found[0].abs() < found[1].abs(), found[0], found[1])
+    half = torch.where(turned.abs() > limit * real, nearest, 0.0)
+    size = 1 + half.square()
+    return about(axis, 2 / size - 1, 2 * half / size)
+
+
+def chain_frame(bent: Tensor, rest: Tensor) -> Tensor:
+    """Return where limbs with bent middles (..., 4, 3, 3) point, in the frames of their bases.
+
+    The first columns of these rotations (..., 4, 3, 3) lead to the ends, the second ones out to the middles.
+    """
+    upper, lower, flexion = bones(rest)
+    chain = F.normalize(upper + applied(bent, lower), dim=-1)
+    side = upper + OFFSET * cross(chain, flexion)
+    return frame(chain, F.normalize(side - dot(side, chain) * chain, dim=-1))
+
+
+def handed(arms: Tensor, hands: Tensor, forearm: Tensor) -> tuple[Tensor, Tensor]:
+    """Share the rotations of hands out to elbows and wrists.
+
+    Args:
+        arms: global rotations (..., 2, 3, 3) of elbows that are bent and not yet rolled.
+        hands: global rotations (..., 2, 3, 3) of the wrists.
+        forearm: the forearms (2, 3) in the rest pose.
+
+    Returns:
+        What the elbows are rolled by about their forearms, and the wrists' local rotations, (..., 2, 3, 3).
+    """
+    seen = arms.transpose(-1, -2) @ hands
+    axis = F.normalize(forearm, dim=-1).expand(*seen.shape[:-2], 3)
+    rolled = about(axis, *twist(seen, axis))
+    return rolled, rolled.transpose(-1, -2) @ seen
+
+
+def footed(shins: Tensor, toe: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
+    """Return where feet point at rest and where they should, unit vectors (..., 2, 3) seen from the knees."""
+    bone = F.normalize(rest[list(TOES)] - rest[list(ANKLES)], dim=-1)
+    goal = applied(shins.transpose(-1, -2), F.normalize(toe, dim=-1))
+    return bone.expand(goal.shape), goal
+
+
+def solved(
+    local: Tensor,
+    turned: Tensor,
+    base: Tensor,
+    end: Tensor,
+    swivel: Tensor,
+    hands: Tensor,
+    toe: Tensor,
+    rest: Tensor,
+) -> Tensor:
+    """Return the local rotations (..., 22, 3, 3) of a body with its limbs solved.
+
+    Wrists and ankles come to their ends as far as the limbs reach. What a hand is turned by about its forearm
+    is the elbow's rotation, the rest the wrist's; a foot is turned the least way to its toe.
+
+    Args:
+        local: local rotations (..., 22, 3, 3), of which those of the limbs do not count.
+        turned: global rotations (..., 22, 3, 3) of the same body.
+        base: positions (..., 4, 3) of shoulders and hips, metres.
+        end: positions (..., 4, 3) of wrists and ankles.
+        swivel: cosines and sines (..., 4, 2).
+        hands: global rotations (..., 2, 3, 3) of the wrists.
+        toe: vectors (..., 2, 3) from the ankles to the toes, of any length.
+        rest: rest positions (22, 3), metres.
+    """
+    upper, lower, _ = bones(rest)
+    away = end - base
+    bent = flexed(*bones(rest), away.norm(dim=-1, keepdim=True))
+    back = turned[..., [PARENTS[joint] for joint in BASES], :, :].transpose(-1, -2)
+    axis = F.normalize(away, dim=-1)
+    direction = bend_direction(axis, turned[..., list(BASES), :, 1], swivel)
+    bases = back @ frame(axis, direction) @ chain_frame(bent, rest).transpose(-1, -2)
+    bases = untwisting(bases, F.normalize(upper, dim=-1), applied(back, axis)) @ bases
+    arms, shins = (back.transpose(-1, -2) @ bases @ bent).split(2, -3)
+    rolled, wrists = handed(arms, hands, lower[:2])
+    ankles = aligning(*footed(shins, toe, rest))
+    middles = torch.cat([bent[..., :2, :, :] @ rolled, bent[..., 2:, :, :]], -3)
+    rows = list(local.unbind(-3))
+    groups = ((BASES, bases), (MIDDLES, middles), (ENDS, torch.cat([wrists, ankles], -3)))
+    for joints, rotations in groups:
+        for joint, rotation in zip(joints, rotations.unbind(-3), strict=True):
+            rows[joint] = rotation
+    return torch.stack(rows, -3)

@@ -1,0 +1,377 @@
+"""MANIKIN (Jiang et al., ECCV 2024): networks predict the trunk and where limbs end; the limbs are solved.
+
+MANIKIN-S has AvatarPoser's encoder, MANIKIN-L AvatarJLM's network. What they predict of a frame (`Parts`) is
+turned into a pose in closed form (memmlp.networks.baselines.limb_solver). Readings: all heights are the
+world's, since a stream does not know the lowest foot of its clip; the head has its tracker's rotation; and a
+straight limb is not held as in the frame before.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from memmlp.common import parallel
+from memmlp.motion.body import (
+    HEAD,
+    N_JOINTS,
+    PARENTS,
+    POSITION,
+    ROOT,
+    ROTATION,
+    SPARSE_DIM,
+    SPARSE_POSITION,
+    SPARSE_ROTATION,
+    TRACKED,
+)
+from memmlp.motion.coordinates import Heading
+from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.baselines.avatar_jlm import AvatarJLM
+from memmlp.networks.baselines.avatar_poser import AvatarPoser, head
+from memmlp.networks.baselines.limb_solver import (
+    ANKLES,
+    BASES,
+    ENDS,
+    MIDDLES,
+    TOES,
+    middle_at,
+    solved,
+    swivels,
+)
+from memmlp.networks.memory import State
+from memmlp.networks.window_model import WindowModel
+
+KEPT = (1, 2, 3, 6, 9, 12, 13, 14, 16, 17)
+"""The joints whose local rotations are predicted, beside the root's: the trunk's, shoulders and hips."""
+SWIVELS, PLACES = 2 * len(BASES), 3 * (len(ANKLES) + len(TOES))
+PREDICTED = 6 * (1 + len(KEPT)) + SWIVELS + PLACES
+AUXILIARY = 6 * (N_JOINTS - 1)  # rotations that MANIKIN-L predicts in training alone
+
+
+def follows(joint: int) -> bool:
+    """Return whether a joint's position follows from rotations that are predicted."""
+    parent = PARENTS[joint]
+    return parent <= ROOT or (parent in KEPT and follows(parent))
+
+
+PLACED = [joint for joint in range(N_JOINTS) if follows(joint)]
+
+
+class Parts(NamedTuple):
+    """What is predicted of a frame, in the network's coordinates without z-scores.
+
+    Attributes:
+        sixd: the local 6D rotations (..., 11, 6) of the root and of the joints KEPT.
+        swivel: cosines and sines (..., 4, 2) of the limbs' swivels, of any size.
+        ankle: both ankles relative to the head (..., 2, 3), metres.
+        toe: both toes relative to their ankles (..., 2, 3), metres.
+    """
+
+    sixd: Tensor
+    swivel: Tensor
+    ankle: Tensor
+    toe: Tensor
+
+    @classmethod
+    def of(cls, made: Tensor, normalizer: Normalizer) -> Parts:
+        """Return the parts of a network's outputs (..., 86 or more)."""
+        chosen = [ROOT, *KEPT]
+        mean, std = (
+            part[SPARSE_DIM:][ROTATION].unflatten(0, (N_JOINTS, 6))[chosen]
+            for part in (normalizer.mean, normalizer.std)
+        )
+        rotations, swivel, ankle, toe = made[..., :PREDICTED].split([6 * len(chosen), SWIVELS, 6, 6], -1)
+        return cls(
+            rotations.unflatten(-1, (len(chosen), 6)) * std + mean,
+            swivel.unflatten(-1, (2, -1)).transpose(-1, -2),
+            *(part.unflatten(-1, (2, 3)) for part in (ankle, toe)),
+        )
+
+    @property
+    def trunk(self) -> Tensor:
+        """The local rotations (..., 22, 3, 3) of a body whose other joints are not turned."""
+        found = sixd_to_matrix(self.sixd)
+        still = torch.eye(3, dtype=found.dtype, device=found.device).expand(found[..., 0, :, :].shape)
+        rows = [still] * N_JOINTS
+        for joint, rotation in zip((ROOT, *KEPT), found.unbind(-3), strict=True):
+            rows[joint] = rotation
+        return torch.stack(rows, -3)
+
+    def body(self, rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the trunk, its global rotations (..., 22, 3, 3), and joints (..., 22, 3) from the pelvis."""
+        trunk = self.trunk
+        return trunk, *forward_kinematics(trunk, torch.zeros_like(trunk[..., ROOT, :, 0]), rest)
+
+    def posed(self, encoded: Tensor, normalizer: Normalizer) -> Tensor:
+        """Return the rotations (..., 132) in network space, the limbs solved, at inputs (..., 54)."""
+        seen = encoded * normalizer.std[:SPARSE_DIM] + normalizer.mean[:SPARSE_DIM]
+        places = seen[..., SPARSE_POSITION].unflatten(-1, (len(TRACKED), 3))
+        trackers = sixd_to_matrix(seen[..., SPARSE_ROTATION].unflatten(-1, (len(TRACKED), 6)))
+        trunk, turned, joints = self.body(normalizer.rest)
+        anchor = places[..., :1, :]
+        joints = joints + (anchor - joints[..., HEAD : HEAD + 1, :])
+        local = solved(
+            trunk,
+            turned,
+            joints[..., list(BASES), :],
+            torch.cat([places[..., 1:, :], anchor + self.ankle], -2),
+            F.normalize(self.swivel, dim=-1),
+            trackers[..., 1:, :, :],
+            self.toe,
+            normalizer.rest,
+        )
+        rows = list(local.unbind(-3))
+        rows[HEAD] = turned[..., PARENTS[HEAD], :, :].transpose(-1, -2) @ trackers[..., 0, :, :]
+        sixd = matrix_to_sixd(torch.stack(rows, -3)).flatten(-2)
+        return (sixd - normalizer.mean[SPARSE_DIM:][ROTATION]) / normalizer.std[SPARSE_DIM:][ROTATION]
+
+
+class Truth:
+    """What the parts of a frame should be.
+
+    Args:
+        motion: true motion (..., 198), in the network's coordinates without z-scores.
+    """
+
+    def __init__(self, motion: Tensor):
+        self.sixd = motion[..., ROTATION].unflatten(-1, (N_JOINTS, 6))
+        self.joints = motion[..., POSITION].unflatten(-1, (N_JOINTS, 3))
+
+    def limbs(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the bases, middles and ends (..., 4, 3) of the limbs."""
+        base, middle, end = (self.joints[..., list(joints), :] for joints in (BASES, MIDDLES, ENDS))
+        return base, middle, end
+
+    def between(self, joints: tuple[int, ...], others: tuple[int, ...]) -> Tensor:
+        """Return the vectors (..., n, 3) from some joints to others."""
+        return self.joints[..., list(others), :] - self.joints[..., list(joints), :]
+
+
+def off(made: Tensor, true: Tensor) -> Tensor:
+    """Return the mean absolute error."""
+    return (made - true).abs().mean()
+
+
+class Manikin(WindowModel):
+    """What both networks have in common: limbs that are solved, and how they are trained.
+
+    Any loss compares the solved pose, through which it reaches all parts; the network's own losses are of the
+    parts themselves, as its authors have them.
+
+    Attributes:
+        parts: weight of all these losses.
+        turned: whether training windows are turned by headings drawn at random.
+    """
+
+    parts: float
+    turned: bool
+    _call: tuple[Tensor, Tensor] | None = None
+
+    def predicted(self, encoded: Tensor) -> Tensor:
+        """Map windows (B, T, 54) in network space to outputs of their last n frames (B, n, 86 or more)."""
+        raise NotImplementedError
+
+    def own_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
+        """Return the losses of the parts, weighted as by its authors, of outputs (B, n, 86 or more)."""
+        raise NotImplementedError
+
+    def posed(self, made: Tensor, encoded: Tensor) -> Tensor:
+        """Map outputs (..., 86 or more) and their frames' inputs (..., 54) to rotations (..., 132)."""
+        return Parts.of(made, self.normalizer).posed(encoded, self.normalizer)
+
+    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
+        """Make a training call with each window turned by a heading of its own; see WindowModel."""
+        inputs, kept = self.taken_in(sparse, state)
+        heading, space = self.heading(truth), Heading()
+        window = space.sparse_in(inputs[:, -self.frames :], heading)
+        encoded = self.normalizer.encode_sparse(window, self.normalizer.origin(window))
+        made = self.predicted(encoded)
+        count = made.shape[1]
+        self._call = made, torch.cat([window, space.motion_in(truth[..., SPARSE_DIM:], heading)], -1)
+        rotation = self.posed(made, encoded[:, -count:])
+        return space.motion_out(self.normalizer.posed(rotation, window[:, -count:]), heading), kept
+
+    def heading(self, truth: Tensor) -> Tensor:
+        """Draw a turn about the world's vertical axis for each window, as an origin (B, 1, 5) of Heading."""
+        angle = self.turned * 2 * math.pi * parallel.drawn(torch.rand_like, truth[:, :1, :1])
+        return torch.cat([torch.zeros_like(truth[:, :1, :3]), angle.cos(), angle.sin()], -1)
+
+    def auxiliary_losses(self, truth: Tensor) -> dict[str, Tensor]:
+        """Return the losses of the parts of the last training call, weighted."""
+        if self._call is None:
+            return super().auxiliary_losses(truth)
+        (made, frames), self._call = self._call, None
+        motion = self.normalizer.coordinates.motion_in(
+            frames[..., SPARSE_DIM:], self.normalizer.origin(frames[..., :SPARSE_DIM])
+        )
+        own = self.own_losses(made, Truth(motion[:, -made.shape[1] :]))
+        return {name: self.parts * term for name, term in own.items()} | super().auxiliary_losses(frames)
+
+
+class ManikinS(Manikin, AvatarPoser):
+    """AvatarPoser's embedding and encoder, with heads for root, rotations, swivels, and ankles and toes.
+
+    It has 4,244,566 parameters at the paper's sizes (AvatarPoser's).
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the window's length.
+        width: d, the width of the features.
+        depth: number of encoder layers.
+        heads: number of attention heads; it divides d.
+        feedforward: width of the feed-forward's hidden layers.
+        dropout: dropout rate in the encoder, while training.
+        parts: weight of the losses of what the limbs are solved from.
+        turned: whether training windows are turned by headings drawn at random.
+    """
+
+    rotated: ClassVar[int] = len(KEPT)
+
+    def __init__(
+        self,
+        normalizer: Normalizer,
+        *,
+        frames: int,
+        width: int,
+        depth: int,
+        heads: int,
+        feedforward: int,
+        dropout: float,
+        parts: float,
+        turned: bool,
+    ):
+        super().__init__(
+            normalizer,
+            frames=frames,
+            width=width,
+            depth=depth,
+            heads=heads,
+            feedforward=feedforward,
+            dropout=dropout,
+        )
+        self.parts, self.turned = parts, turned
+        self.swivel, self.places = head(width, SWIVELS), head(width, PLACES)
+
+    def read(self, newest: Tensor) -> Tensor:
+        """Map the newest frame's feature (..., d) to outputs (..., 86)."""
+        return torch.cat([super().read(newest), self.swivel(newest), self.places(newest)], -1)
+
+    def predicted(self, encoded: Tensor) -> Tensor:
+        """Map windows (B, T, 54) in network space to outputs of their last frame (B, 1, 86)."""
+        return self.encode(self.embedding(encoded))[:, None]
+
+    def rotations(self, encoded: Tensor) -> Tensor:
+        """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
+        return self.posed(self.predicted(encoded), encoded[:, -1:])[:, 0]
+
+    def own_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
+        """Return the losses of the parts, weighted as by its authors, of outputs (B, 1, 86).
+
+        Swivels are counted from the predicted shoulders and hips; of middles and swivels it is the sum over
+        the limbs.
+        """
+        parts = Parts.of(made, self.normalizer)
+        _, turned, joints = parts.body(self.normalizer.rest)
+        base, middle, end = true.limbs()
+        up, angle = turned[..., list(BASES), :, 1], F.normalize(parts.swivel, dim=-1)
+        lengths = [(one - other).norm(dim=-1, keepdim=True) for one, other in ((base, middle), (middle, end))]
+        rooted = (true.joints - true.joints[..., ROOT : ROOT + 1, :])[..., PLACED, :]
+        limbs = len(BASES)
+        return {
+            "trunk_rotation": off(parts.sixd[..., 1:, :], true.sixd[..., list(KEPT), :]),
+            "trunk_position": 5 * off(joints[..., PLACED, :], rooted),
+            "swivel": 0.1 * 2 * limbs * off(parts.swivel, swivels(base, middle, end, up)),
+            "middle": limbs * off(middle_at(base, end, up, angle, *lengths), middle),
+            "ankle": 5 * off(parts.ankle, true.between((HEAD,), ANKLES)),
+            "toe": 0.3 * off(parts.toe, true.between(ANKLES, TOES)),
+        }
+
+
+class ManikinL(Manikin, AvatarJLM):
+    """AvatarJLM's network, whose regressor predicts the parts, and in training all rotations beside them.
+
+    It has 63,889,240 parameters at the paper's sizes (AvatarJLM's). Its authors' MANIKIN-LN are the same
+    weights on windows that do not overlap, all of whose frames count: that is no stream. (They also raise
+    ankles to the true floor, which is left out here.)
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the window's length.
+        width: d, the width of a token; the layers of the coarse pose have 2 d.
+        depth: number of blocks: an encoder layer over a frame's tokens, and one over each token's frames.
+        heads: number of attention heads; it divides d.
+        feedforward: width of the encoders' hidden layers.
+        dropout: dropout rate of the encoders, while training.
+        coarse: weight of the loss of the coarse pose's joints.
+        parts: weight of the losses of what the limbs are solved from.
+        turned: whether training windows are turned by headings drawn at random.
+        offline: whether it is used as MANIKIN-LN.
+    """
+
+    outputs: ClassVar[int] = PREDICTED + AUXILIARY
+
+    def __init__(
+        self,
+        normalizer: Normalizer,
+        *,
+        frames: int,
+        width: int,
+        depth: int,
+        heads: int,
+        feedforward: int,
+        dropout: float,
+        coarse: float,
+        parts: float,
+        turned: bool,
+        offline: bool,
+    ):
+        super().__init__(
+            normalizer,
+            frames=frames,
+            width=width,
+            depth=depth,
+            heads=heads,
+            feedforward=feedforward,
+            dropout=dropout,
+            coarse=coarse,
+        )
+        self.parts, self.turned, self.offline = parts, turned, offline
+
+    @property
+    def streams(self) -> bool:
+        """Whether a frame is made without later ones: not as MANIKIN-LN."""
+        return not self.offline
+
+    def predicted(self, encoded: Tensor) -> Tensor:
+        """Map windows (B, T, 54) in network space to outputs of all their frames (B, T, 212)."""
+        return self.regressed(encoded)
+
+    def rotations(self, encoded: Tensor) -> Tensor:
+        """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
+        return self.posed(self.predicted(encoded), encoded)
+
+    def own_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
+        """Return the losses of the parts, weighted as by its authors, of outputs (B, T, 212).
+
+        Swivels are compared as angles, counted from the true shoulders and hips; toes with the head on its
+        tracker.
+        """
+        parts = Parts.of(made, self.normalizer)
+        turned, _ = forward_kinematics(
+            sixd_to_matrix(true.sixd), torch.zeros_like(true.joints[..., ROOT, :]), self.normalizer.rest
+        )
+        wanted = swivels(*true.limbs(), turned[..., list(BASES), :, 1])
+        (x, y), (cosine, sine) = parts.swivel.unbind(-1), wanted.unbind(-1)
+        toe = true.between((HEAD,), TOES)
+        return {
+            "trunk_rotation": 2 * off(parts.sixd[..., 1:, :], true.sixd[..., list(KEPT), :]),
+            "swivel": 0.1 * torch.atan2(y * cosine - x * sine, x * cosine + y * sine).abs().mean(),
+            "ankle": 5 * off(parts.ankle, true.between((HEAD,), ANKLES)),
+            "toe": 5 * off(parts.ankle + parts.toe, toe),
+            "auxiliary": 2 * off(made[..., PREDICTED:], true.sixd[..., 1:, :].flatten(-2)),
+        }

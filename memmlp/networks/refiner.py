@@ -1,0 +1,131 @@
+"""The refiner slot: what corrects the stream of a network's poses, frame by frame.
+
+SAGE-Net's (Feng et al., CVPR 2024) is a recurrent network behind its decoder; here it may stand behind any
+network. It is trained on the poses that the finished network streams (memmlp.training.refiner).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from memmlp.motion.body import POSITION, ROTATION
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.memory import State
+from memmlp.networks.window_model import WindowModel
+
+HIDDEN = "refiner"  # the name of the refiner's own state
+
+
+@dataclass(frozen=True)
+class SAGERefiner:
+    """How SAGE-Net's refiner is made, and what it is trained on.
+
+    Attributes:
+        width: the width of its recurrent layers.
+        depth: how many there are.
+        frames: frames of a training piece, through which the network streams from a fresh start.
+        pieces: how many pieces are drawn from the training clips.
+    """
+
+    width: int
+    depth: int
+    frames: int
+    pieces: int
+
+    def around(self, network: WindowModel) -> Refined:
+        """Return a network with a refiner of fresh weights behind it."""
+        return Refined(network, self.width, self.depth)
+
+
+class Refined(WindowModel):
+    """A network with recurrent layers behind it that correct its rotations; a stream in both modes.
+
+    With 2 layers of width 512 the refiner has 2,635,908 parameters. Rotations are corrected in the world.
+    Learned positions stay as they are; others follow from the corrected rotations.
+
+    Args:
+        network: the network; it is not trained any more.
+        width: the width of the recurrent layers (GRU).
+        depth: how many there are.
+    """
+
+    def __init__(self, network: WindowModel, width: int, depth: int):
+        nn.Module.__init__(self)
+        self.network, self.frames, self.branches = network, network.frames, network.branches
+        self.layers = nn.GRU(ROTATION.stop, width, depth, batch_first=True)
+        self.head = nn.Linear(width, ROTATION.stop)
+
+    @property
+    def normalizer(self) -> Normalizer:  # type: ignore[override]
+        """The network's normalizer."""
+        return self.network.normalizer
+
+    @property
+    def settled(self) -> bool:
+        """Whether what the network recalls of a frame never changes."""
+        return self.network.settled
+
+    @property
+    def streams(self) -> bool:
+        """Whether a frame is made without later ones."""
+        return self.network.streams
+
+    @property
+    def windowless(self) -> bool:
+        """Whether the network has no window: this one corrects a stream."""
+        return True
+
+    @property
+    def length(self) -> int:
+        """How many past frames of inputs the network's buffer holds."""
+        return self.network.length
+
+    def initial_state(self, batch: int = 1) -> State:
+        """Return the state of a fresh start, zeros: the network's, and the hidden one (B, depth, width)."""
+        hidden = torch.zeros(batch, self.layers.num_layers, self.layers.hidden_size)
+        return {**self.network.initial_state(batch), HIDDEN: hidden.to(self.normalizer.mean)}
+
+    def running_state(self, sparse: Tensor) -> State:
+        """Return the state after world inputs (B, length, 54), without any history of motion yet."""
+        return self.initial_state(len(sparse)) | self.network.running_state(sparse)
+
+    def true_state(self, frames: Tensor) -> State:
+        """Return the state after world frames (B, length, 252), without any corrections yet."""
+        return self.initial_state(len(frames)) | self.network.true_state(frames)
+
+    def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
+        """Take in the newest frames, one after the other; see WindowModel.
+
+        By default the n new frames are returned, which are the most that it can make.
+        """
+        made, kept = [], {name: tensor for name, tensor in state.items() if name != HIDDEN}
+        for frame in sparse.split(1, 1):
+            motion, kept = self.network.advance(frame, kept, 1)
+            made.append(motion)
+        refined, hidden = self.refined(torch.cat(made, 1), sparse, state[HIDDEN])
+        wanted = sparse.shape[1] if newest is None else newest
+        return refined[:, -wanted:], {**kept, HIDDEN: hidden}
+
+    def refined(self, motion: Tensor, sparse: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Correct the motion of consecutive frames.
+
+        Args:
+            motion: the network's motion (B, n, 198), world.
+            sparse: world inputs (B, n, 54).
+            hidden: hidden states (B, depth, width) before these frames.
+
+        Returns:
+            Motion (B, n, 198), and the hidden states after it.
+        """
+        rotation = motion[..., ROTATION]
+        with torch.autocast(motion.device.type, enabled=False):
+            features, after = self.layers(rotation, hidden.transpose(0, 1).contiguous())
+        rotation = rotation + self.head(features)
+        positions = motion[..., POSITION]
+        if "position" not in self.branches:
+            with torch.no_grad():
+                positions = self.normalizer.pose(torch.cat([rotation, positions], -1), sparse).flatten(-2)
+        return torch.cat([rotation, positions], -1), after.transpose(0, 1)

@@ -1,0 +1,41 @@
+"""The streaming graph of a network with a refiner behind it."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from memmlp.networks.memory import State
+from memmlp.networks.refiner import HIDDEN, Refined
+from memmlp.networks.streaming.ring import Ring, StreamingGraph
+from memmlp.networks.window_model import WindowModel
+
+
+class RefinedStream(StreamingGraph):
+    """The network's own streaming graph, and a step of the recurrent layers.
+
+    Args:
+        model: the network with its refiner.
+        graph: the network's streaming graph.
+    """
+
+    model: Refined
+
+    def __init__(self, model: Refined, graph: StreamingGraph):
+        super().__init__(model)
+        self.graph = graph
+        self.ends = (*(f"graph.{name}" for name in graph.ends), "model.head")  # type: ignore[misc]
+
+    def build(self, model: WindowModel) -> None:
+        """Keep a copy of the refiner; of the network the graph has one."""
+        assert isinstance(model, Refined)
+        self.model = model
+
+    def windows(self) -> State:
+        """Return what the network's graph carries, and the hidden states (1, depth, width): zeros."""
+        return {**self.graph.windows(), HIDDEN: self.model.initial_state(1)[HIDDEN]}
+
+    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+        motion, kept = self.graph.step(sparse, state, ring)
+        refined, hidden = self.model.refined(motion[None], sparse[None], state[HIDDEN])
+        return refined[0], {**kept, HIDDEN: hidden}

@@ -1,0 +1,154 @@
+"""The stage that trains a refiner, on what a finished network streams."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from memmlp.evaluation import modes
+from memmlp.evaluation.metrics import OwnMetrics
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.dataset import MotionDataset, WindowSampler
+from memmlp.motion.preparing.source import Prepared
+from memmlp.networks import checkpoint
+from memmlp.networks.architecture import Architecture, RefinedArchitecture
+from memmlp.networks.refiner import HIDDEN, Refined, SAGERefiner
+from memmlp.networks.window_model import WindowModel
+from memmlp.runs.run import Run
+from memmlp.training.loop import StepResult, Watch, train, unwatched
+from memmlp.training.losses import Loss, TermsLoss
+from memmlp.training.network import VALIDATION_PIECE
+from memmlp.training.optim import Optim
+
+TOGETHER = 64  # pieces that the network streams through side by side
+
+
+def sage_loss() -> Loss:
+    """Return the loss that SAGE-Net's refiner is trained with, of the library's terms."""
+    return TermsLoss(
+        "smooth",
+        orientation=0.01,
+        rotation=0.01,
+        world_position=0.01,
+        hand=0.01,
+        velocity=60.0,
+        velocity_3=20.0,
+        jerk=0.03,
+    )
+
+
+@dataclass(frozen=True)
+class RefinerTraining:
+    """How a refiner is trained.
+
+    Attributes:
+        seed: seed of its weights, pieces and batches.
+        refiner: says which pieces.
+        optim: steps, learning rates and intervals; a batch is of pieces.
+        weighting: how pieces are drawn, "frames" or "clips" (see WindowSampler).
+        shares: how often a piece is of each source (see WindowSampler).
+        metrics: metrics of one's own, measured at validations.
+    """
+
+    seed: int
+    refiner: SAGERefiner
+    optim: Optim
+    weighting: str
+    shares: Mapping[str, float] | None = None
+    metrics: OwnMetrics = field(default_factory=dict)
+
+    def train(
+        self,
+        architecture: Architecture,
+        data: Prepared,
+        above: Path | None,
+        run: Run,
+        device: torch.device,
+        watch: Watch = unwatched,
+    ) -> WindowModel:
+        """Train a refiner, from the run's checkpoint if there is one, and write the weights of both.
+
+        Args:
+            architecture: builds the network with its refiner.
+            data: the prepared motion.
+            above: weights of the finished network.
+            run: the run whose folder takes checkpoints, log and weights.
+            device: the device to train on.
+            watch: called after each validation; see `memmlp.training.loop.train`.
+
+        Returns:
+            The refined network in evaluation mode.
+        """
+        assert isinstance(architecture, RefinedArchitecture)
+        assert above is not None
+        dataset = data.open("train").to(device)
+        finished = architecture.network.load(above).to(device).requires_grad_(False)
+        torch.manual_seed(self.seed)
+        model = self.refiner.around(finished).to(device)
+        validation = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)
+        task = RefinerTask(
+            model,
+            sage_loss(),
+            dataset,
+            self.drawn(dataset),
+            self.optim,
+            validate=lambda: modes.quick_stream(model.eval(), validation, self.metrics),
+        )
+        train(task, self.optim, run, self.seed, "refiner", watch)
+        finished.requires_grad_(True)
+        checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
+        return model.eval()
+
+    def drawn(self, dataset: MotionDataset) -> tuple[Tensor, Tensor]:
+        """Draw the pieces: frames (P, n, 252), and the indices (P,) of the clips that they are from."""
+        pieces = WindowSampler(
+            dataset, self.refiner.pieces, self.refiner.frames, self.seed, self.weighting, self.shares
+        )
+        clips, end = pieces.draw(0)
+        return dataset.segments(clips, end, self.refiner.frames), clips
+
+
+class RefinerTask:
+    """The training task of a refiner: its loss on pieces that the network streamed through."""
+
+    def __init__(
+        self,
+        model: Refined,
+        loss: Loss,
+        dataset: MotionDataset,
+        pieces: tuple[Tensor, Tensor],
+        optim: Optim,
+        validate: Callable[[], dict[str, float]],
+    ):
+        self.model, self.loss, self.dataset, self.batch = model, loss, dataset, optim.batch
+        self.frames, self.clips = pieces
+        self.module: nn.Module = nn.ModuleDict({"layers": model.layers, "head": model.head})
+        model.network.eval()
+        self.streamed = torch.stack(streamed(model.network, self.frames))
+        self.validate = validate
+
+    def parameter_groups(self) -> list[dict]:
+        """Return the refiner's parameters."""
+        return [{"params": list(self.module.parameters())}]
+
+    def step(self, step: int) -> StepResult:
+        """Compute the loss on a batch of pieces."""
+        drawn = torch.randint(len(self.frames), (self.batch,)).to(self.frames.device)
+        sparse, truth = self.frames[drawn].split([SPARSE_DIM, self.frames.shape[-1] - SPARSE_DIM], -1)
+        hidden = self.model.initial_state(len(drawn))[HIDDEN]
+        motion, _ = self.model.refined(self.streamed[drawn], sparse, hidden)
+        loss, terms = self.loss(motion, truth, sparse, self.model.normalizer)
+        return StepResult(loss, terms, self.clips[drawn])
+
+    def report(self) -> dict[str, float]:
+        """Return nothing to log beside the loss terms."""
+        return {}
+
+
+def streamed(network: WindowModel, pieces: Tensor) -> list[Tensor]:
+    """Return the motion (n, 198) that a network streams of each piece (P, n, 252)."""
+    return modes.predict(network, list(pieces), "stream", TOGETHER)

@@ -1,0 +1,83 @@
+"""A refiner's run builds upon the run of its network, which is that without a refiner."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from memmlp.common import parallel
+from memmlp.common.errors import InputError
+from memmlp.config.build import build_experiment, config_of
+from memmlp.config.compose import composed
+from memmlp.config.perform_task import check_identity
+from memmlp.config.plan_sweep import tasks_of
+from memmlp.networks.refiner import Refined
+from memmlp.pipeline.together import run_together
+from memmlp.runs.lookup import list_runs
+
+SHORT = [
+    "profile=tiny", "data.synth.minutes=0.2", "tracking=none", "threads=1", "optim.steps=2",
+    "export.graph=off", "model=vae_hmd",
+]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_one_command_trains_the_network_and_then_its_refiner(memmlp):
+    assert memmlp("train", *SHORT, "evaluation.modes=[stream]").code == 0
+    (bare,) = list_runs(Path("outputs"))
+    weights = bare.model.read_bytes()
+    ran = memmlp("train", *SHORT, "refiner=sage")
+    assert ran.code == 0, ran.err
+    (refined,) = (run for run in list_runs(Path("outputs")) if run.id != bare.id)
+    assert refined.manifest["upstream"] == bare.id
+    assert bare.model.read_bytes() == weights
+    assert refined.manifest["recipes"].keys() - bare.manifest["recipes"].keys() == {"refiner.sage"}
+    assert set(refined.results) == {"window", "stream"}
+    assert refined.results["window"] == refined.results["stream"]
+    assert refined.results["stream"]["rotation"]["MPJPE"] != bare.results["stream"]["rotation"]["MPJPE"]
+    assert isinstance(build_experiment(config_of(refined)).architecture.load(refined.model), Refined)
+    assert "finished already" in memmlp("train", *SHORT, "refiner=sage").out
+
+
+def experiment(*overrides: str):
+    return build_experiment(composed([*SHORT, *overrides]))
+
+
+@pytest.mark.slow
+def test_its_identity_is_of_all_that_its_pieces_follow_from():
+    bare, refined = experiment().identity("d"), experiment("refiner=sage").identity("d")
+    assert refined.upstream == bare
+    assert refined.id not in (bare.id, experiment("refiner=sage", "refiner.pieces=9").identity("d").id)
+    words = ["model=agrol_diffusion", "refiner=sage"]
+    sampled = [experiment(*words, f"model.sampling_steps={steps}").identity("d") for steps in (2, 3)]
+    assert sampled[0].upstream.id == sampled[1].upstream.id
+    assert sampled[0].id != sampled[1].id
+
+
+@pytest.mark.slow
+def test_a_sweep_trains_what_is_upstream_first():
+    """VQ-VAE, network, refiner; each task's config is one that makes its run."""
+    refined = build_experiment(composed(["profile=tiny", "refiner=sage"]))
+    tasks = tasks_of(refined, "d")
+    assert [task.kind for task in tasks] == ["vqvae", "memmlp", "memmlp"]
+    assert [task.upstream for task in tasks] == [None, tasks[0].id, tasks[1].id]
+    assert [bool(task.stages) for task in tasks] == [False, False, True]
+    assert tasks[1].id == build_experiment(composed(["profile=tiny"])).identity("d").id
+    assert [task.config["refiner"] is None for task in tasks] == [True, True, False]
+
+    class Data:
+        grouped = None
+
+        def prepare(self):
+            return type("Prepared", (), {"digest": "d"})
+
+    for task, own in zip(tasks[1:], (refined.base, refined), strict=True):
+        object.__setattr__(own, "data", Data())
+        check_identity(own, task)
+
+
+def test_several_processes_are_refused(monkeypatch):
+    monkeypatch.setattr(parallel, "size", lambda: 2)
+    with pytest.raises(InputError, match="refiner: several processes"):
+        run_together(experiment("refiner=sage"))

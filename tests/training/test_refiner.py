@@ -1,0 +1,106 @@
+"""Training of a refiner behind a finished network."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import tiny
+import torch
+
+from memmlp.evaluation import modes
+from memmlp.motion.body import ROTATION, SPARSE_DIM
+from memmlp.networks.refiner import SAGERefiner
+from memmlp.runs.run import Run
+from memmlp.training.loop import train
+from memmlp.training.optim import Optim
+from memmlp.training.refiner import RefinerTask, RefinerTraining, sage_loss, streamed
+
+OPTIM = Optim(steps=12, batch=4, lr=1e-2, final_lr=1e-3, schedule="cosine", checkpoint_every=5, log_every=4)
+REFINER = SAGERefiner(width=6, depth=2, frames=20, pieces=6)
+
+
+def task(optim: Optim = OPTIM) -> RefinerTask:
+    dataset, model = tiny.frames(), tiny.refined(tiny.baseline("avatar_poser"))
+    training = RefinerTraining(0, REFINER, optim, "frames")
+    return RefinerTask(model, sage_loss(), dataset, training.drawn(dataset), optim, validate=lambda: {})
+
+
+def test_pieces_are_of_the_training_clips_and_the_network_streams_through_each():
+    one, dataset = task(), tiny.frames()
+    assert one.frames.shape == (6, 20, 252)
+    for piece, clip, motion in zip(one.frames, one.clips, one.streamed, strict=True):
+        known = dataset.clip(int(clip)).unfold(0, 20, 1).transpose(1, 2)
+        assert (known == piece).flatten(1).all(1).any()
+        torch.testing.assert_close(motion, modes.stream(one.model.network, [piece])[0], atol=1e-5, rtol=0)
+
+
+def test_a_step_compares_the_corrected_pieces_and_reaches_the_refiner_alone():
+    one = task()
+    torch.manual_seed(3)
+    result = one.step(0)
+    result.loss.backward()
+    slopes = {name for name, weight in one.model.named_parameters() if weight.grad is not None}
+    parts = ((part, getattr(one.model, part).named_parameters()) for part in ("layers", "head"))
+    assert slopes == {f"{part}.{name}" for part, weights in parts for name, _ in weights}
+    torch.manual_seed(3)
+    drawn = torch.randint(6, (4,))
+    motion = modes.stream(one.model, list(one.frames[drawn]))
+    true = one.frames[drawn]
+    terms = one.loss.terms(
+        torch.stack(motion), true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], one.model.normalizer
+    )
+    found = {name: float(term.detach()) for name, term in result.terms.items()}
+    assert found == pytest.approx({name: float(term) for name, term in terms.items()}, rel=1e-3)
+    assert torch.equal(one.clips[drawn], result.clips)
+
+
+def test_it_smooths_what_the_network_makes():
+    """A few steps bring the loss down, mostly that of velocities."""
+    one = task(optim := replace(OPTIM, steps=60, checkpoint_every=100))
+    weights = optim.build(one.parameter_groups())
+    losses = []
+    for step in range(60):
+        torch.manual_seed(step)
+        result = one.step(step)
+        weights.zero_grad()
+        result.loss.backward()
+        weights.step()
+        losses.append(float(result.loss.detach()))
+    assert sum(losses[-10:]) < 0.9 * sum(losses[:10])
+
+
+class Killed(Exception):
+    """Raised where a process is killed."""
+
+
+def test_killed_and_resumed_it_has_the_same_weights_bit_for_bit(tmp_path: Path):
+    whole, cut = Run(tmp_path / "whole"), Run(tmp_path / "cut")
+    for run in (whole, cut):
+        run.folder.mkdir()
+    train(one := task(), OPTIM, whole, 0, "refiner")
+    dying = task()
+    step = dying.step
+
+    def last(number: int):
+        if number == 8:
+            raise Killed
+        return step(number)
+
+    dying.step = last
+    with pytest.raises(Killed):
+        train(dying, OPTIM, cut, 0, "refiner")
+    train(again := task(), OPTIM, cut, 0, "refiner")
+    for name, weight in one.model.state_dict().items():
+        assert torch.equal(weight, again.model.state_dict()[name]), name
+
+
+def test_the_network_streams_without_slopes_and_without_dropout():
+    model = tiny.baseline("avatar_poser").train()
+    refined = tiny.refined(model)
+    pieces = torch.stack([tiny.clip(12, seed) for seed in (1, 2)])
+    RefinerTask(refined, sage_loss(), tiny.frames(), (pieces, torch.tensor([0, 1])), OPTIM, lambda: {})
+    found = streamed(model, pieces)
+    assert not any(motion.requires_grad for motion in found)
+    torch.testing.assert_close(found[0][:, ROTATION], streamed(model, pieces)[0][:, ROTATION])
