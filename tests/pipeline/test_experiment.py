@@ -36,7 +36,7 @@ BASE = [
 
 CHANGES: dict[str, str] = {
     "seed": "1", "device": "cpu", "threads": "2", "force": "true", "save_predictions": "elsewhere",
-    "data.name": "other", "data.min_frames": "43", "data.strict": "true", "data.weighting": "clips",
+    "data.name": "other", "data.min_frames": "43", "data.strict": "true", "data.weighting": "clips", "data.mirror": "true",
     "data.split.test": "0.3", "data.split.val": "0.3",
     "data.split.seed": "1", "data.split.groups": "['[a-d]1']", "data.split.groups_file": "groups.csv",
     "frame.coordinates": "world", "frame.normalize": "false",
@@ -68,6 +68,7 @@ UNTRIED = {
     "plugins": "changes no run by itself: tests/config/test_plugins.py",
     "term": "one of a package of one's own: tests/config/test_plugins.py",
     "evaluation.metrics": "of a package of one's own: tests/config/test_plugins.py",
+    "refiner": "a run of its own, behind the network's: tests/pipeline/test_refiner.py",
     "vqvae.epochs": "steps by another name: the two exclude each other (tests/config/test_compose.py)",
 }
 LAST_DIGITS = {
