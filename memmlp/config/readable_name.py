@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -89,7 +90,7 @@ def _word(value: Any) -> str:
     """Return a value as it is typed on a command line."""
     if isinstance(value, list):
         return f"[{','.join(map(_word, value))}]"
-    return {None: "null", True: "true", False: "false"}.get(value, str(value))
+    return json.dumps(value) if value is None or isinstance(value, bool) else str(value)  # 1 is not true
 
 
 @functools.lru_cache(maxsize=64)
