@@ -67,6 +67,9 @@ def checks(text: str) -> None:
         targets = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
         assert targets
         assert {word for word in rest if "=" not in word} <= set(targets[1].split())
+    elif program == "dask":
+        command = importlib.import_module(f"distributed.cli.dask_{rest[0]}").main
+        command.make_context("dask", rest[1:])  # raises for an option that there is not
     elif program == "docker":
         known = re.findall(r"^ARG (\w+)", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
         given = [words[at + 1].partition("=")[0] for at, word in enumerate(words) if word == "--build-arg"]
