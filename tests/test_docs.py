@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import re
 import shlex
-import sys
 import tomllib
 from pathlib import Path
 from types import ModuleType
@@ -14,7 +13,7 @@ import pytest
 import yaml
 from command_lines import ROOT, Line, blocks, inline_lines, shell_lines, takes
 from omegaconf import OmegaConf
-from own_package import PACKAGE
+from own_package import PACKAGE, registers_kept
 
 from memmlp.cli.main import COMMANDS
 from memmlp.config.build import build_loss
@@ -186,9 +185,9 @@ def test_the_component_of_the_guide_works(tmp_path: Path, monkeypatch: pytest.Mo
     (tmp_path / "mine.py").write_text(examples("components", "python")[0])
     (tmp_path / "myconf/hand/feet.yaml").write_text(examples("components", "yaml")[0])
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "mine", raising=False)
-    cfg = composed(["--config-dir", str(tmp_path / "myconf"), "hand=feet"])
-    loss = build_loss(cfg)(frozenset({"rotation", "position"}))
+    with registers_kept():  # other tests have modules of that name
+        cfg = composed(["--config-dir", str(tmp_path / "myconf"), "hand=feet"])
+        loss = build_loss(cfg)(frozenset({"rotation", "position"}))
     assert type(loss.hand).__name__ == "FeetPosition"
 
 
