@@ -113,7 +113,7 @@ def test_parameters(profile, width, depth):
 
 
 @pytest.mark.slow
-def test_the_file_is_the_network_and_its_inner_layers_become_int8(tmp_path):
+def test_the_file_is_the_network_and_its_cells_become_int8(tmp_path):
     model, exact, int8 = tiny.recurrent_poser(Heading()), tmp_path / "step.onnx", tmp_path / "int8.onnx"
     stream = streaming(model)
     export(stream, exact, "0" * 16)
@@ -125,9 +125,9 @@ def test_the_file_is_the_network_and_its_inner_layers_become_int8(tmp_path):
     kinds: dict[bool, set[int]] = {True: set(), False: set()}
     for node in graph.node:
         if node.op_type in ("Gemm", "MatMul") and (name := given.get(node.input[1], node.input[1])) in types:
-            kinds[".blocks." in name].add(types[name])
+            kinds[".cell." in name].add(types[name])
     assert kinds[True] == {onnx.TensorProto.INT8}
-    assert onnx.TensorProto.FLOAT in kinds[False]
+    assert kinds[False] == {onnx.TensorProto.FLOAT}
 
 
 def test_it_sees_the_world_as_the_head_looks_and_learns_the_weights_of_its_loss():

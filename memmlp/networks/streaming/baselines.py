@@ -6,7 +6,7 @@ computes that frame alone. The first layer's products that depend on one frame a
 
 from __future__ import annotations
 
-from typing import ClassVar, cast
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -32,7 +32,7 @@ from memmlp.networks.window_model import WindowModel
 class AvatarPoserStream(StreamingGraph):
     """AvatarPoser's streaming graph; its encoder ignores the order of frames, so a ring's order will do."""
 
-    ends: ClassVar[tuple[str, ...]] = ("model.embedding", "model.orientation", "model.rotation")
+    ends: tuple[str, ...] = ("model.embedding", "model.orientation", "model.rotation")
     model: AvatarPoser
     layers: list[EncoderLayer]
 

@@ -8,13 +8,23 @@ from memmlp.networks.memory import State
 from memmlp.networks.recurrent_poser import RecurrentPoser
 from memmlp.networks.streaming.baselines import FrameStream
 from memmlp.networks.streaming.ring import Ring
+from memmlp.networks.window_model import WindowModel
 
 
 class RecurrentPoserStream(FrameStream):
-    """The network as it is, its cells as plain layers for one frame."""
+    """The network as it is, its cells as plain layers for one frame.
 
-    ends = ("model.stem", "model.head")
+    Quantised, the cells alone are int8: a state averages what rounding adds to each frame, whereas the MLPs
+    hand it on to the motion, where it is seen as jitter.
+    """
+
     model: RecurrentPoser
+
+    def build(self, model: WindowModel) -> None:
+        """Make the graph's parts from a copy of the network."""
+        assert isinstance(model, RecurrentPoser)
+        self.model = model
+        self.ends = ("model.stem", "model.head", *(f"model.blocks.{name}.mlp" for name in model.blocks))
 
     def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""

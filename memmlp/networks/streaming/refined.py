@@ -23,7 +23,7 @@ class RefinedStream(StreamingGraph):
     def __init__(self, model: Refined, graph: StreamingGraph):
         super().__init__(model)
         self.graph = graph
-        self.ends = (*(f"graph.{name}" for name in graph.ends), "model.head")  # type: ignore[misc]
+        self.ends = (*(f"graph.{name}" for name in graph.ends), "model.head")
 
     def build(self, model: WindowModel) -> None:
         """Keep a copy of the refiner; of the network the graph has one."""

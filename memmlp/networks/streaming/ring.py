@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -62,7 +62,7 @@ class StreamingGraph(nn.Module):
             to the motion. They stay in float32 when the graph is quantised.
     """
 
-    ends: ClassVar[tuple[str, ...]]
+    ends: tuple[str, ...]
 
     def __init__(self, model: WindowModel):
         super().__init__()
