@@ -23,7 +23,8 @@ def built(*overrides: str) -> WindowModel:
 # MACs of a streaming step: 12 blocks of T T d + T d d, stem and head for AGRoL; its denoiser five times, with
 # a linear a block and the embedding's two for one row. For AvatarPoser and EgoPoser 4 d d + 2 d f a layer and
 # token, and the products of attention.
-SOLVED = 22 * 27 + 43 * 27  # of a frame of MANIKIN's: kinematics of the trunk, products of 3 x 3 in the limbs
+# Of each frame of MANIKIN's, kinematics of the trunk and products of 3 x 3 in the limbs; of the bones, once.
+SOLVED, BONES = 22 * 27 + 87 * 27, 16 * 9
 PUBLISHED = {
     "agrol_mlp": (3_735_668, 3.74, 12 * (196**2 * 512 + 196 * 512**2) + 196 * 512 * (54 + 132)),
     "agrol_diffusion": (
@@ -60,14 +61,14 @@ PUBLISHED = {
         4_244_566,
         4.24,
         3 * 40 * (4 * 256**2 + 2 * 256 * 2048 + 2 * 40 * 256) + 40 * 54 * 256
-        + 4 * 256**2 + 256 * 86 + SOLVED,
+        + 4 * 256**2 + 256 * 86 + SOLVED + BONES,
     ),
     "manikin_l": (
         63_889_240,
         63.89,
         41 * ((396 + 1024 + 132) * 1024 + 22 * 9 * 512 + 1024 * 512 + (45 * 512 + 212) * 1024)
         + 12 * 41 * 45 * (4 * 512**2 + 2 * 512 * 2048) + 6 * 41 * 45 * 2 * (45 + 41) * 512
-        + 41 * 22 * 27 + 41 * SOLVED,
+        + 41 * 22 * 27 + 41 * SOLVED + BONES,
     ),
     "rpm": (
         9_889_412 - 512 * 513,  # the released code has a layer that nothing uses

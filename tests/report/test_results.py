@@ -81,10 +81,11 @@ def test_a_run_that_diverged_stays_one(sweep: Sweep, kept: Kept, tmp_path: Path,
 def test_a_run_on_a_part_of_its_list_stays_marked(kept: Kept, tmp_path: Path):
     """And files of runs on the whole of it are as they were before there were parts."""
     run = kept.runs["2"][1]
-    kept.runs["2"][1] = replace(run, origin=replace(run.origin, partial="3 of 5 clips"))
+    kept.runs["2"][1] = replace(run, origin=replace(run.origin, partial="3 of 5 clips", offline=True))
     save(tmp_path / "kept.json", kept)
     assert (tmp_path / "kept.json").read_text().count('"partial"') == 1
-    assert load_kept(tmp_path / "kept.json").runs["2"][1].origin.partial == "3 of 5 clips"
+    found = load_kept(tmp_path / "kept.json").runs["2"][1].origin
+    assert (found.partial, found.offline) == ("3 of 5 clips", True)
 
 
 def test_kept_results_that_were_cut_are_refused(kept: Kept, tmp_path: Path):

@@ -135,6 +135,16 @@ def test_runs_of_different_origin_are_flagged(
     assert any("one seed" in flag for flag in table.flags)
 
 
+def test_what_is_no_stream_is_said_in_every_format(sweep: Sweep, tmp_path: Path):
+    late = {"by position": {"offline": True}}
+    runs = {
+        arm.label: fake_run(tmp_path, arm.label, evaluated=late.get(arm.label)) for arm in sweep.runnable()
+    }
+    table = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label])
+    assert "offline, no stream, for frames are made with later ones: 'by position'" in table.flags
+    assert all("offline, no stream" in write(table) for write in FORMATS.values())
+
+
 def test_equal_origins_are_not_flagged(table: Table):
     assert [flag for flag in table.flags if "a group of its own" not in flag] == []
 

@@ -23,6 +23,8 @@ FLEXION = ((0.189, -0.966, 0.179), (0.085, 0.970, -0.227), (0.985, 0.003, -0.174
 """The axes, in the rest pose, about which elbows and knees bend, as published for SMPL's bodies."""
 TWIST = (90.0, 90.0, 40.0, 40.0)
 """How far, in degrees, shoulders and hips may be twisted about their upper bone, to either side."""
+SKEW = ((0, 0, 0, 0, 0, -1, 0, 1, 0), (0, 0, 1, 0, 0, 0, -1, 0, 0), (0, -1, 0, 1, 0, 0, 0, 0, 0))
+"""What each component of a vector adds to the 3 x 3 matrix of its cross product, row by row."""
 STRAIGHT = 5e-4  # from 1, of the cosine of the least bend, 1.8 degrees: on a straighter limb rounding is seen
 OFFSET = 1e-3  # metres; which way a limb bends that is straighter than that follows from its axis of flexion
 
@@ -32,9 +34,14 @@ def dot(one: Tensor, other: Tensor) -> Tensor:
     return (one * other).sum(-1, keepdim=True)
 
 
+def skew(vector: Tensor) -> Tensor:
+    """Return the matrices (..., 3, 3) that take the cross product of vectors (..., 3) with another."""
+    return (vector @ vector.new_tensor(SKEW)).unflatten(-1, (3, 3))
+
+
 def cross(one: Tensor, other: Tensor) -> Tensor:
     """Return the cross products (..., 3) of vectors (..., 3)."""
-    return torch.linalg.cross(*torch.broadcast_tensors(one, other), dim=-1)
+    return applied(skew(one), other)
 
 
 def applied(rotation: Tensor, vector: Tensor) -> Tensor:
@@ -44,21 +51,14 @@ def applied(rotation: Tensor, vector: Tensor) -> Tensor:
 
 def about(axis: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
     """Return the rotations (..., 3, 3) about unit axes (..., 3), of cosines and sines (..., 1) of angles."""
-    x, y, z = axis.unbind(-1)
-    zero = torch.zeros_like(x)
-    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
-    identity = torch.eye(3, dtype=axis.dtype, device=axis.device)
-    return identity + sine[..., None] * skew + (1 - cosine)[..., None] * (skew @ skew)
+    across, identity = skew(axis), torch.eye(3, dtype=axis.dtype, device=axis.device)
+    return identity + sine[..., None] * across + (1 - cosine)[..., None] * (across @ across)
 
 
 def aligning(start: Tensor, goal: Tensor) -> Tensor:
     """Return the smallest rotations (..., 3, 3) that carry unit vectors (..., 3) to others."""
-    axis = cross(start, goal)
-    x, y, z = axis.unbind(-1)
-    zero = torch.zeros_like(x)
-    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
-    identity = torch.eye(3, dtype=axis.dtype, device=axis.device)
-    return identity + skew + skew @ skew / (1 + dot(start, goal)).clamp_min(1e-6)[..., None]
+    across, identity = skew(cross(start, goal)), torch.eye(3, dtype=goal.dtype, device=goal.device)
+    return identity + across + across @ across / (1 + dot(start, goal)).clamp_min(1e-6)[..., None]
 
 
 def frame(first: Tensor, second: Tensor) -> Tensor:
@@ -129,16 +129,9 @@ def flexed(upper: Tensor, lower: Tensor, axis: Tensor, reach: Tensor) -> Tensor:
 
 def twist(rotation: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
     """Return cosines and sines (..., 1) of how far rotations (..., 3, 3) turn about unit axes (..., 3)."""
-    skew = torch.stack(
-        [
-            rotation[..., 2, 1] - rotation[..., 1, 2],
-            rotation[..., 0, 2] - rotation[..., 2, 0],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ],
-        -1,
-    )
-    trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
-    both = torch.cat([trace - dot(axis, applied(rotation, axis)), dot(axis, skew)], -1)
+    flat = rotation.flatten(-2)
+    turned, trace = flat @ flat.new_tensor(SKEW).T, flat @ torch.eye(3).to(flat).flatten()[:, None]
+    both = torch.cat([trace - dot(axis, applied(rotation, axis)), dot(axis, turned)], -1)
     cosine, sine = F.normalize(both, dim=-1).split(1, -1)
     return cosine, sine
 

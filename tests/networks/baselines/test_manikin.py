@@ -7,6 +7,8 @@ import torch
 from plain_body import posed
 
 from memmlp.common.errors import InputError
+from memmlp.evaluation.evaluation import Evaluation
+from memmlp.evaluation.ik import NoIK
 from memmlp.motion.body import PARENTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.coordinates import Heading, World
 from memmlp.motion.geometry import forward_kinematics, sixd_to_matrix
@@ -173,6 +175,9 @@ def test_offline_it_is_no_stream():
     model = tiny.baseline("manikin_l", offline=True)
     assert not model.streams
     assert not has_stream(model)
+    evaluation = Evaluation(["window"], 4, NoIK(), 0)
+    assert evaluation.report(model, tiny.frames((20,)), "window")["offline"]
+    assert "offline" not in evaluation.report(tiny.baseline("manikin_l"), tiny.frames((20,)), "window")
     with pytest.raises(InputError, match=r"model\.offline=true"):
         streaming(model)
     assert tiny.baseline("manikin_l").streams
