@@ -64,7 +64,7 @@ from memmlp.training.losses import (
 )
 from memmlp.training.losses.terms import ERRORS, TERMS
 from memmlp.training.network import MotionTask
-from memmlp.training.optim import Optim, vqvae_optim
+from memmlp.training.optim import Muon, Optim, ScheduleFree, vqvae_optim
 from memmlp.training.refiner import RefinerTask, RefinerTraining, sage_loss
 from memmlp.training.rollout import OwnPredictions, PersistentStreams, Rollout, TeacherForcing
 from memmlp.training.vqvae import VQVAETask
@@ -148,10 +148,13 @@ def vqvae(codebook: str = "ema") -> Numbers:
 def _trained(task: VQVAETask | MotionTask | RefinerTask, optim: Optim) -> Numbers:
     """The losses of three steps, and the weights after them."""
     optimiser, found = optim.build(task.parameter_groups()), {}
+    average = optim.average(task.module, optimiser)
     for step in range(optim.steps):
         seed_step(0, step)
         result = train_step(task, optim, optimiser, step)
+        average.update(step + 1)
         found |= {f"{name} {step}": float(term.detach()) for name, term in result.terms.items()}
+    average.show()
     weights = torch.cat([p.detach().flatten() for p in task.module.parameters()])
     return found | summary("weights", weights)
 
@@ -208,14 +211,19 @@ class Squares(Loss):
 
 
 def training() -> Numbers:
-    """Three steps of the loop, with each optimiser, and clipped."""
+    """Three steps of the loop, with AdamW and Adam, and clipped."""
     found = {}
     for name, changes in {"adamw": {}, "adam": {"decoupled": False}, "clipped": {"clip_norm": 0.1}}.items():
-        torch.manual_seed(2)
-        optim = Optim(steps=3, batch=4, lr=1e-2, final_lr=1e-3, weight_decay=0.1, **changes)
-        task = MotionTask(Line(), Squares(), TeacherForcing(), frames(), optim, 0, lambda network: {})
-        found |= {f"{name} {key}": value for key, value in _trained(task, optim).items()}
+        found |= {f"{name} {key}": value for key, value in optimised(**changes).items()}
     return found
+
+
+def optimised(kind: type[Optim] = Optim, **changes: float) -> Numbers:
+    """Three steps of the loop with an optimiser."""
+    torch.manual_seed(2)
+    optim = kind(steps=3, batch=4, lr=1e-2, final_lr=1e-3, weight_decay=0.1, **changes)
+    task = MotionTask(Line(), Squares(), TeacherForcing(), frames(), optim, 0, lambda network: {})
+    return _trained(task, optim)
 
 
 def refiner() -> Numbers:
@@ -355,6 +363,10 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "mirror": mirror,
     "training": training,
     **{f"schedule.{name}": partial(schedule, name) for name in ("step", "cosine", "milestones")},
+    "optim.muon": partial(optimised, Muon),
+    "optim.schedule_free": partial(optimised, ScheduleFree),
+    "ema": partial(optimised, ema=0.5),
+    "warmup": partial(optimised, warmup=3),
     "rollout.teacher_forcing": partial(rollout, TeacherForcing),
     "rollout.own_predictions": partial(rollout, partial(OwnPredictions, 2)),
     "rollout.streams": partial(rollout, partial(PersistentStreams, 4)),
@@ -413,8 +425,8 @@ def changed(now: Mapping[str, float], before: Mapping[str, float], tolerance: fl
 
 
 def tolerance(case: str) -> float:
-    """How far processors' numbers may differ: int8 rounds, so that one step more or less is possible."""
-    return 2e-2 if case == "int8" else 2e-4
+    """How far processors' numbers may differ: int8 and Muon's bfloat16 round, by one more or less."""
+    return 2e-2 if case in ("int8", "optim.muon") else 2e-4
 
 
 def stored() -> dict[str, dict[str, object]]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -107,8 +107,7 @@ def _unrefined(cfg: DictConfig) -> DictConfig:
 
 def build_training(cfg: DictConfig, metrics: dict[str, OwnMetric]) -> NetworkTraining | RefinerTraining:
     """Build how a checked config's network is trained, or the refiner behind it."""
-    optim = Optim(**cast(dict[str, Any], OmegaConf.to_container(cfg.optim, resolve=True)))
-    common = {"seed": cfg.seed, "optim": optim, "weighting": cfg.data.weighting}
+    common = {"seed": cfg.seed, "optim": built(cfg.optim), "weighting": cfg.data.weighting}
     common |= {"shares": shares(cfg.data), "metrics": metrics}
     if cfg.refiner is not None:
         return RefinerTraining(refiner=built(cfg.refiner), **common)

@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from memmlp.config.compose import VERSION_BASE
 from memmlp.config.packaged import packaged
 from memmlp.config.schema import register
-from memmlp.runs.identity import SLOTS, flatten, trained_by
+from memmlp.runs.identity import SLOTS, chosen, flatten, trained_by
 
 KINDS = {"vqvae": "VQ-VAE"}
 MOST = 6  # words
@@ -78,8 +78,7 @@ def _keys(config: Mapping[str, Any], default: Mapping[str, Any], foreign: list[s
 
 def _option(config: Mapping[str, Any], slot: str) -> str | None:
     """Return the name of the option in a slot. Mem-MLP itself is no option with a name."""
-    node = config.get(slot) or {}
-    return node.get("name", "mem_mlp" if slot == "model" else None)
+    return chosen(config, slot) or ("mem_mlp" if slot == "model" else None)
 
 
 def _shipped(slot: str, option: str | None) -> bool:

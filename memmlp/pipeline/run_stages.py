@@ -56,8 +56,10 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     """
     data = experiment.data.prepare()
     tell(f"data: {len(data.manifest.clips)} clips, prepared in {data.cache}")
-    above = upstream_run(experiment, data)
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
+    if not run.done:
+        experiment.training.optim.check_installed()
+    above = upstream_run(experiment, data)
     with run.lock():
         if experiment.force:
             run.reset()

@@ -56,7 +56,10 @@ ID = re.compile(r"[0-9a-f]{16}")
 DATA_PATH = re.compile(r"data\.(root|body|split\.folder|sources\..+\.root)")
 """The keys that say where data lies."""
 
-SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term", "refiner")
+SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term", "refiner", "optim")
+
+UNNAMED = {"optim": "adamw"}
+"""The options of slots that runs have from before these were slots; their names do not count."""
 
 
 @dataclass(frozen=True)
@@ -186,16 +189,22 @@ def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
         yield "mirror"
     if coordinates := config.get("frame", {}).get("coordinates"):
         yield f"coordinates.{coordinates}"
-    names = {slot: (config.get(slot) or {}).get("name") for slot in SLOTS}
-    yield from (f"{slot}.{name}" for slot, name in names.items() if name)
+    names = {slot: chosen(config, slot) for slot in SLOTS}
+    yield from (f"{slot}.{name}" for slot, name in names.items() if name and name != UNNAMED.get(slot))
     if (config.get("loss") or {}).get("weighting") == "learned":
         yield "weighting.learned"
     if schedule := config.get("optim", {}).get("schedule"):
         yield f"schedule.{schedule}"
+    yield from (name for name in ("warmup", "ema") if config.get("optim", {}).get(name))
     if kind == "vqvae" or names["memory"] == "vq_joint":
         yield from ("vqvae", f"codebook.{config.get('vqvae', {}).get('codebook')}")
     if kind == "vqvae":
         yield "schedule.milestones"
+
+
+def chosen(config: Mapping[str, Any], slot: str) -> str | None:
+    """Return the name of the option in a slot; None for an empty slot, and for Mem-MLP in `model`."""
+    return (config.get(slot) or {}).get("name", UNNAMED.get(slot))
 
 
 def trained_by(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -262,6 +271,10 @@ def _unused(config: Mapping[str, Any]) -> Iterable[str]:
     """Yield the keys that nothing reads, given the others."""
     if config.get("optim", {}).get("schedule", "step") != "step":
         yield "optim.drop_at"
+    if chosen(config, "optim") == UNNAMED["optim"]:
+        yield "optim.name"
+    if not config.get("optim", {}).get("warmup"):
+        yield "optim.warmup"
     if config.get("vqvae", {}).get("codebook", "ema") != "ema":
         yield "vqvae.decay"
     loss = config.get("loss") or {}

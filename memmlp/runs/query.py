@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
-from memmlp.runs.identity import SLOTS, flatten, trained_by
+from memmlp.runs.identity import SLOTS, chosen, flatten, trained_by
 from memmlp.runs.name import run_name
 from memmlp.runs.notes import read_notes
 from memmlp.runs.run import STATUSES, Run
@@ -39,7 +39,7 @@ def record(run: Run) -> dict[str, Any]:
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     results, flat = flatten(run.results), flatten(config)
     short = {key.replace(".rotation.", "."): value for key, value in results.items()}
-    slots = {slot: (config.get(slot) or {}).get("name") for slot in SLOTS if slot in config}
+    slots = {slot: chosen(config, slot) for slot in SLOTS if slot in config}
     facts = {name: manifest.get(name) for name in ("kind", "started", "data", "upstream", "user")}
     facts |= {"id": run.id, "name": run_name(manifest, flat), "status": run.status}
     facts |= {"tag": notes.tags, "note": notes.note}

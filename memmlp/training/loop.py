@@ -22,6 +22,7 @@ from memmlp.common.progress import Count, counting
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks import checkpoint, layers
 from memmlp.runs.run import Run
+from memmlp.training.averaging import Average
 from memmlp.training.optim import Optim
 
 
@@ -81,7 +82,8 @@ def train(
 ) -> None:
     """Train to `optim.steps`, starting from the run's checkpoint if there is one.
 
-    The last checkpoint stays in the run's folder.
+    The last checkpoint stays in the run's folder. The module is left with the weights that count, which may
+    be an average over steps.
 
     Args:
         task: what to train.
@@ -97,17 +99,21 @@ def train(
     """
     check_shares(task, optim, description)
     optimiser = optim.build(task.parameter_groups())
-    start = resume(task, optimiser, run)
+    average = optim.average(task.module, optimiser)
+    start = resume(task, optimiser, average, run)
     parallel.align(task.module)
     with counting(description, optim.steps, start, shown=parallel.first()) as count:
         for step in range(start, optim.steps):
             seed_step(seed, step)
             result = train_step(task, optim, optimiser, step)
-            validation = record(task, optim, run, step + 1, result, count) if parallel.first() else {}
+            average.update(step + 1)
+            first = parallel.first()
+            validation = record(task, optim, average, run, step + 1, result, count) if first else {}
             if (step + 1) % optim.checkpoint_every == 0 or step + 1 == optim.steps:
-                save(task, optimiser, run, step + 1)
+                save(task, optimiser, average, run, step + 1)
             if validation:
                 watch(step + 1, validation)
+    average.show()
 
 
 def check_shares(task: TrainingTask, optim: Optim, description: str) -> None:
@@ -168,7 +174,13 @@ def check_finite(task: TrainingTask, result: StepResult, step: int) -> None:
 
 
 def record(
-    task: TrainingTask, optim: Optim, run: Run, step: int, result: StepResult, count: Count
+    task: TrainingTask,
+    optim: Optim,
+    average: Average,
+    run: Run,
+    step: int,
+    result: StepResult,
+    count: Count,
 ) -> dict[str, float]:
     """Log and show a finished step, and validate if it is time.
 
@@ -187,14 +199,20 @@ def record(
         count.note(f"loss {loss:.3g}")
     count.advance()
     if step % optim.validate_every == 0 or last:
-        task.module.eval()
-        values = task.validate()
+        values = validated(task, average)
         run.log(step, values, phase="val")
         return values
     return {}
 
 
-def save(task: TrainingTask, optimiser: torch.optim.Optimizer, run: Run, step: int) -> None:
+def validated(task: TrainingTask, average: Average) -> dict[str, float]:
+    """Return the task's validation of the weights that count."""
+    task.module.eval()
+    with average.shown():
+        return task.validate()
+
+
+def save(task: TrainingTask, optimiser: torch.optim.Optimizer, average: Average, run: Run, step: int) -> None:
     """Write a checkpoint with all that a later process needs to go on after `step` steps.
 
     Of several processes the first one writes, and the others go on with its weights.
@@ -204,11 +222,12 @@ def save(task: TrainingTask, optimiser: torch.optim.Optimizer, run: Run, step: i
         return
     rates = [group["initial_lr"] for group in optimiser.param_groups]
     tensors = checkpoint.module_tensors("module", task.module) | checkpoint.optimiser_tensors(optimiser)
+    tensors |= average.tensors()
     tensors["rng.torch"] = torch.get_rng_state()
     checkpoint.write(run.checkpoint, tensors, {"step": step, "initial_lr": rates})
 
 
-def resume(task: TrainingTask, optimiser: torch.optim.Optimizer, run: Run) -> int:
+def resume(task: TrainingTask, optimiser: torch.optim.Optimizer, average: Average, run: Run) -> int:
     """Load the run's checkpoint, if there is one, and return the number of finished steps."""
     found = checkpoint.read(run.checkpoint) if parallel.first() and run.checkpoint.exists() else None
     found = parallel.of_first(found)
@@ -217,6 +236,7 @@ def resume(task: TrainingTask, optimiser: torch.optim.Optimizer, run: Run) -> in
     tensors, values = found
     checkpoint.load_module("module", task.module, tensors)
     checkpoint.load_optimiser(optimiser, tensors)
+    average.load(tensors)
     torch.set_rng_state(tensors["rng.torch"])
     for group, rate in zip(optimiser.param_groups, values["initial_lr"], strict=True):
         group["initial_lr"] = rate

@@ -1,4 +1,7 @@
-"""How a module is optimised: steps, batches, learning rates, precision."""
+"""How a module is optimised: optimiser, steps, batches, learning rates, precision, averaged weights.
+
+Slot `optim`: Optim (AdamW), Muon, ScheduleFree.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from torch import nn
+
+from memmlp.common.errors import InputError
+from memmlp.training.averaging import EMA, Average, LastWeights, ScheduleFreeAverage
+from memmlp.training.composed import ComposedOptimiser
 
 SCHEDULES: dict[str, Callable[[float, float, float], float]] = {
     # Each maps the progress in [0, 1), final rate / first rate and `drop_at` to the factor on the first rate.
@@ -18,7 +26,7 @@ SCHEDULES: dict[str, Callable[[float, float, float], float]] = {
 
 @dataclass(frozen=True)
 class Optim:
-    """How a module is optimised.
+    """How a module is optimised: by AdamW, unless a subclass says otherwise.
 
     Attributes:
         steps: number of training steps.
@@ -28,6 +36,9 @@ class Optim:
         schedule: "step" (falls to `final_lr` at the fraction `drop_at` of the steps), "cosine", or
             "milestones" (times 0.2 at 20, 50 and 70 % of the steps, App. A).
         drop_at: see `schedule`.
+        warmup: over how many steps the learning rate first grows, in equal parts; 0 for none.
+        ema: decay of an exponential moving average of the weights, which is what is validated and kept; None
+            for the weights of the last step.
         weight_decay: weight decay.
         betas: Adam's two decay rates.
         decoupled: whether weight decay is AdamW's; otherwise it is Adam's.
@@ -45,6 +56,8 @@ class Optim:
     final_lr: float = 0.0
     schedule: str = "step"
     drop_at: float = 0.75
+    warmup: int = 0
+    ema: float | None = None
     weight_decay: float = 1e-4
     betas: tuple[float, float] = (0.9, 0.999)
     decoupled: bool = True
@@ -57,12 +70,103 @@ class Optim:
 
     def factor(self, step: int) -> float:
         """Return the learning rate at a step as a fraction of the first one."""
-        return SCHEDULES[self.schedule](step / self.steps, self.final_lr / self.lr, self.drop_at)
+        course = SCHEDULES[self.schedule](step / self.steps, self.final_lr / self.lr, self.drop_at)
+        return self.warm(step) * course
+
+    def warm(self, step: int) -> float:
+        """Return the part of its learning rate that a step has: less than 1 in the warm-up."""
+        return min(1.0, (step + 1) / self.warmup) if self.warmup else 1.0
+
+    def check_installed(self) -> None:
+        """Raise InputError where the optimiser's library is not there."""
 
     def build(self, groups: list[dict]) -> torch.optim.Optimizer:
         """Make the optimiser over parameter groups; a group's own `lr` and `weight_decay` take precedence."""
         kind = torch.optim.AdamW if self.decoupled else torch.optim.Adam
         return kind(groups, lr=self.lr, weight_decay=self.weight_decay, betas=self.betas)
+
+    def average(self, module: nn.Module, optimiser: torch.optim.Optimizer) -> Average:
+        """Make what says which weights of the module count."""
+        return EMA(module, self.ema) if self.ema else LastWeights(module)
+
+
+@dataclass(frozen=True)
+class Muon(Optim):
+    """Optimised by Muon for matrices, and by AdamW for all other parameters (Jordan et al. 2024).
+
+    Muon's steps have the length that AdamW's typically have (Liu et al. 2025), so that AdamW's learning rates
+    and weight decay fit both. It is torch.optim.Muon, which multiplies matrices in bfloat16.
+
+    Attributes:
+        momentum: Muon's momentum, of Nesterov's kind.
+        rest_lr: learning rate at the start of what is no matrix; None for `lr`. It has the same schedule.
+    """
+
+    momentum: float = 0.95
+    rest_lr: float | None = None
+
+    def check_installed(self) -> None:
+        """Raise InputError where torch has no Muon."""
+        if not hasattr(torch.optim, "Muon"):
+            raise InputError(f"optim=muon: torch {torch.__version__} has no Muon; allowed is 2.9 or newer")
+
+    def build(self, groups: list[dict]) -> torch.optim.Optimizer:
+        """Make both optimisers as one; a group's own `lr` and `weight_decay` take precedence."""
+        self.check_installed()
+        matrices, rest = _split(groups)
+        parts: list[torch.optim.Optimizer] = []
+        if matrices:
+            scaled = {"momentum": self.momentum, "adjust_lr_fn": "match_rms_adamw"}
+            parts.append(torch.optim.Muon(matrices, self.lr, self.weight_decay, **scaled))  # type: ignore
+        if rest:
+            lr = self.rest_lr or self.lr
+            parts.append(torch.optim.AdamW(rest, lr, weight_decay=self.weight_decay, betas=self.betas))
+        return ComposedOptimiser(parts)
+
+
+@dataclass(frozen=True)
+class ScheduleFree(Optim):
+    """Optimised by schedule-free AdamW (Defazio et al. 2024), of the package schedulefree.
+
+    It averages the weights itself and has no schedule but the warm-up: `schedule`, `final_lr`, `drop_at` and
+    `ema` do nothing.
+    """
+
+    def factor(self, step: int) -> float:
+        """Return the learning rate at a step as a fraction of `lr`."""
+        return self.warm(step)
+
+    def check_installed(self) -> None:
+        """Raise InputError where the package is not there."""
+        try:
+            import schedulefree  # noqa: F401
+        except ImportError:
+            raise InputError(
+                "optim=schedule_free: needs the package schedulefree; pip install 'memmlp[schedulefree]'"
+            ) from None
+
+    def build(self, groups: list[dict]) -> torch.optim.Optimizer:
+        """Make the optimiser, ready to train; a group's own `lr` and `weight_decay` take precedence."""
+        self.check_installed()
+        from schedulefree import AdamWScheduleFree
+
+        optimiser = AdamWScheduleFree(groups, self.lr, self.betas, weight_decay=self.weight_decay)
+        optimiser.train()
+        return optimiser
+
+    def average(self, module: nn.Module, optimiser: torch.optim.Optimizer) -> Average:
+        """Make what shows the optimiser's own average."""
+        return ScheduleFreeAverage(module, optimiser)
+
+
+def _split(groups: list[dict]) -> tuple[list[dict], list[dict]]:
+    """Divide parameter groups into those of matrices and those of all else; none is empty."""
+    parts: tuple[list[dict], list[dict]] = ([], [])
+    for group in groups:
+        for chosen, matrices in zip(parts, (True, False), strict=True):
+            own = [one for one in group["params"] if (one.dim() == 2) == matrices]
+            chosen += [{**group, "params": own}] if own else []
+    return parts
 
 
 def vqvae_optim(

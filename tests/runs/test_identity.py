@@ -118,5 +118,9 @@ def test_keys_that_older_runs_lack_count_only_where_they_change_something():
         return Identity("memmlp", config, "d").what  # recipe numbers, which move as well, do not count
 
     assert of(loss={"weighting": "fixed", "lr": 0.01}, data={"mirror": False}) == of()
+    names = {"name": "adamw", "_target_": "memmlp.training.optim.Optim"}
+    assert of(optim={**names, "warmup": 0, "ema": None}) == of()
+    others = [{"warmup": 2}, {"ema": 0.9}, {**names, "name": "muon"}]
+    assert len({of(), *(of(optim=other) for other in others)}) == 4
     learned = of(loss={"weighting": "learned", "lr": 0.01})
     assert len({of(), learned, of(loss={"weighting": "learned", "lr": 0.1}), of(data={"mirror": True})}) == 4

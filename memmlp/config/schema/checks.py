@@ -22,6 +22,7 @@ from memmlp.config.schema.training import (
     TeacherForcingConfig,
     TermsLossConfig,
 )
+from memmlp.runs.identity import SLOTS
 
 
 def check(cfg: DictConfig) -> None:
@@ -90,9 +91,6 @@ def _show(value: Any) -> str:
     return str(list(value)) if OmegaConf.is_list(value) else str(value)
 
 
-SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term", "refiner")
-
-
 def _check_names(cfg: DictConfig) -> None:
     """Refuse a component from outside this package that uses the name of one of this package's options."""
     for slot in SLOTS:
@@ -110,8 +108,10 @@ def _check_names(cfg: DictConfig) -> None:
 def _check_combinations(cfg: DictConfig) -> None:
     """Check what no key alone can tell: whether the values go together."""
     _check_names(cfg)
-    if cfg.optim.final_lr > cfg.optim.lr:
+    if "final_lr" in cfg.optim and cfg.optim.final_lr > cfg.optim.lr:
         raise InputError(f"optim.final_lr={cfg.optim.final_lr}: allowed is at most optim.lr={cfg.optim.lr}")
+    if cfg.optim.warmup > cfg.optim.steps:
+        raise InputError(f"optim.warmup={cfg.optim.warmup}: allowed is at most optim.steps={cfg.optim.steps}")
     if _is(cfg.model, BaselineConfig):
         _check_baseline(cfg)
     else:

@@ -66,6 +66,7 @@ from memmlp.config.schema.rules import (
     target,
 )
 from memmlp.config.schema.training import (
+    AdamWConfig,
     AGRoLLossConfig,
     AvatarPoserLossConfig,
     HandConfig,
@@ -73,16 +74,19 @@ from memmlp.config.schema.training import (
     HandPositionConfig,
     LossConfig,
     ManualConfig,
+    MuonConfig,
     NoHandConfig,
     OptimConfig,
     OwnPredictionsConfig,
     RolloutConfig,
+    ScheduleFreeConfig,
     StreamsConfig,
     TeacherForcingConfig,
     TermConfig,
     TermsLossConfig,
     UncertaintyConfig,
 )
+from memmlp.runs.identity import chosen
 
 # OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
 # The fields' helpers make dataclass fields, not shared defaults.
@@ -273,7 +277,10 @@ SCHEMAS: dict[str, type] = {
     "hand_fk": HandFKConfig,
     "hand_off": NoHandConfig,
     "refiner_sage": SAGERefinerConfig,
-    "optim": OptimConfig,
+    "optim": AdamWConfig,  # its name up to version 0.2, for configs of one's own
+    "optim_adamw": AdamWConfig,
+    "optim_muon": MuonConfig,
+    "optim_schedule_free": ScheduleFreeConfig,
     "evaluation": EvaluationConfig,
     "export": ExportConfig,
     "tracking_mlflow": MLflowConfig,
@@ -326,7 +333,7 @@ def _restored(group: str, content: Mapping[str, Any]) -> Any:
     """
     if group == "tracking":
         return _trackers(content)
-    option = SCHEMAS.get(f"{group}_{content.get('name')}")
+    option = SCHEMAS.get(f"{group}_{chosen({group: content}, group)}")
     ours = option is None or option.__module__.startswith("memmlp.")
     if group == "data" and ours:
         schema = SynthDataConfig if content["synth"] else DATA[content["split"]["name"]]

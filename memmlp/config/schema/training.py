@@ -13,6 +13,7 @@ from memmlp.config.schema.rules import (
     Within,
     at_least,
     called,
+    fraction,
     key,
     one_of,
     optional,
@@ -170,18 +171,48 @@ class TermConfig:
 
 @dataclass
 class OptimConfig:
-    """How the network is trained (conf/optim)."""
+    """The optim slot: how the network is trained (conf/optim)."""
 
+    name: str = key(Text())
+    _target_: str = MISSING
     steps: int = at_least(1)
     batch: int = at_least(1)
     lr: float = positive()
-    final_lr: float = at_least(0)
-    schedule: str = one_of("step", "cosine")
-    drop_at: float = key(Within(0, 1, strict=True))
     weight_decay: float = at_least(0)
+    warmup: int = standing(0, Within(0))
     clip_norm: float = at_least(0)
     precision: str = one_of("fp32", "bf16")
     compile: bool = key()
     checkpoint_every: int = at_least(1)
     validate_every: int = at_least(1)
     log_every: int = at_least(1)
+
+
+@dataclass
+class ScheduledConfig(OptimConfig):
+    """An optimiser whose learning rate falls."""
+
+    final_lr: float = at_least(0)
+    schedule: str = one_of("step", "cosine")
+    drop_at: float = key(Within(0, 1, strict=True))
+    ema: Optional[float] = optional(Within(0, 1, strict=True))
+
+
+@dataclass
+class AdamWConfig(ScheduledConfig):
+    name: str = called("adamw")
+    _target_: str = target("memmlp.training.optim.Optim")
+
+
+@dataclass
+class MuonConfig(ScheduledConfig):
+    name: str = called("muon")
+    _target_: str = target("memmlp.training.optim.Muon")
+    momentum: float = fraction()
+    rest_lr: Optional[float] = optional(Within(0, strict=True))
+
+
+@dataclass
+class ScheduleFreeConfig(OptimConfig):
+    name: str = called("schedule_free")
+    _target_: str = target("memmlp.training.optim.ScheduleFree")

@@ -1,0 +1,157 @@
+"""Which weights of a module count while it is trained: those of the last step, or an average over the steps.
+
+The weights that count are validated, and kept at the end. A checkpoint has the last step's and the average,
+so that a resumed training goes on as if it had never stopped. Averaged are parameters; buffers, such as a
+codebook's statistics, are the last step's.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
+
+
+class Average(ABC):
+    """The weights of a module that count.
+
+    Args:
+        module: the module that is trained.
+    """
+
+    def __init__(self, module: nn.Module):
+        self.parameters = dict(module.named_parameters())
+
+    @abstractmethod
+    def update(self, steps: int) -> None:
+        """Take in the weights after `steps` steps."""
+
+    @abstractmethod
+    def show(self) -> None:
+        """Put the weights that count into the module, for good."""
+
+    @abstractmethod
+    def tensors(self) -> dict[str, Tensor]:
+        """Return what a checkpoint must hold, names preceded by "average."."""
+
+    @abstractmethod
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """Load what `tensors` returned, from among a checkpoint's tensors."""
+
+    @contextlib.contextmanager
+    def shown(self) -> Iterator[None]:
+        """Have the weights that count in the module herein, and then the last step's again, to the bit."""
+        before = {name: one.detach().clone() for name, one in self.parameters.items()}
+        self.show()
+        try:
+            yield
+        finally:
+            self._put(before)
+
+    @torch.no_grad()
+    def _put(self, values: dict[str, Tensor]) -> None:
+        """Copy values by name into the module's parameters."""
+        for name, one in self.parameters.items():
+            one.copy_(values[name])
+
+
+class LastWeights(Average):
+    """No average: the weights of the last step."""
+
+    def update(self, steps: int) -> None:
+        """Do nothing."""
+
+    def show(self) -> None:
+        """Do nothing: they are in the module."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return nothing."""
+        return {}
+
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """Do nothing."""
+
+
+class EMA(Average):
+    """An exponential moving average of the weights.
+
+    The decay grows to its value as (1 + steps) / (10 + steps), so that the random first weights are soon
+    forgotten.
+
+    Args:
+        module: the module that is trained.
+        decay: what is kept of the average in a step, in (0, 1).
+    """
+
+    def __init__(self, module: nn.Module, decay: float):
+        super().__init__(module)
+        self.decay = decay
+        self.averages = {name: one.detach().clone() for name, one in self.parameters.items()}
+
+    def update(self, steps: int) -> None:
+        """Take in the weights after `steps` steps."""
+        decay = min(self.decay, (1 + steps) / (10 + steps))
+        weights = [one.detach() for one in self.parameters.values()]
+        get_ema_multi_avg_fn(decay)(list(self.averages.values()), weights, steps)
+
+    def show(self) -> None:
+        """Put the average into the module."""
+        self._put(self.averages)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the average, by parameter."""
+        return {f"average.{name}": value for name, value in self.averages.items()}
+
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """Load the average."""
+        for name, value in self.averages.items():
+            value.copy_(tensors[f"average.{name}"])
+
+
+class ScheduleFreeAverage(Average):
+    """The average that a schedule-free optimiser makes itself, which it has in its mode of evaluation.
+
+    Args:
+        module: the module that is trained.
+        optimiser: an optimiser of the package schedulefree, in its mode of training.
+    """
+
+    COUNTERS = ("k", "weight_sum", "lr_max")
+    """What its groups count beside their settings: steps, sum of the average's weights, largest rate."""
+
+    def __init__(self, module: nn.Module, optimiser: torch.optim.Optimizer):
+        super().__init__(module)
+        self.optimiser = optimiser
+
+    def update(self, steps: int) -> None:
+        """Do nothing: the optimiser's step has."""
+
+    def show(self) -> None:
+        """Put the average into the module."""
+        self.optimiser.eval()  # type: ignore[attr-defined]
+
+    @contextlib.contextmanager
+    def shown(self) -> Iterator[None]:
+        """Have the average in the module herein, and then the last step's weights again, to the bit.
+
+        The optimiser can go back to them by itself, but not to the bit.
+        """
+        with super().shown():
+            yield
+            self.optimiser.train()  # type: ignore[attr-defined]
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the counters of each parameter group (groups, 3)."""
+        counted = [[group[name] for name in self.COUNTERS] for group in self.optimiser.param_groups]
+        return {"average.counters": torch.tensor(counted, dtype=torch.float64)}
+
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """Load the counters."""
+        counted = tensors["average.counters"].tolist()
+        for group, values in zip(self.optimiser.param_groups, counted, strict=True):
+            steps, weight_sum, lr_max = values
+            group.update(zip(self.COUNTERS, (int(steps), weight_sum, lr_max), strict=True))

@@ -1,0 +1,41 @@
+"""Several optimisers, each with parameters of its own, as one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch.optim import Optimizer
+
+
+class ComposedOptimiser(Optimizer):
+    """Several optimisers as one, with the parameter groups and the state of all of them.
+
+    Args:
+        parts: the optimisers, which have no parameter in common.
+    """
+
+    def __init__(self, parts: Sequence[Optimizer]):
+        self.parts = tuple(parts)
+        super().__init__([group for part in parts for group in part.param_groups], {})
+        self._share()
+
+    def _share(self) -> None:
+        """Let the parts have the groups and the state of the whole, not copies."""
+        start = 0
+        for part in self.parts:
+            end = start + len(part.param_groups)
+            part.param_groups, part.state = self.param_groups[start:end], self.state
+            start = end
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> None:  # type: ignore[override]
+        """Take a step of each part. There is no closure."""
+        for part in self.parts:
+            part.step()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Load groups and state of all parts."""
+        super().load_state_dict(state_dict)
+        self._share()

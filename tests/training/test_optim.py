@@ -1,0 +1,137 @@
+"""Optimisers: what each does, that a resumed training is the same training, and which weights count."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_tasks import OPTIM, motion_task, weights
+
+from memmlp.common.errors import InputError
+from memmlp.config.build import build_experiment
+from memmlp.config.compose import composed
+from memmlp.runs.run import Run
+from memmlp.training.loop import Watch, train, unwatched
+from memmlp.training.network import MotionTask
+from memmlp.training.optim import Muon, Optim, ScheduleFree
+
+COMMON = {"steps": 12, "batch": 4, "lr": 1e-2, "checkpoint_every": 5, "log_every": 4}
+OPTIMS: dict[str, Optim] = {
+    "muon": Muon(**COMMON, final_lr=1e-4, schedule="cosine"),
+    "muon, ema": Muon(**COMMON, ema=0.9),
+    "schedule_free": ScheduleFree(**COMMON, warmup=6),
+    "ema": Optim(**COMMON, ema=0.9),
+    "warmup": Optim(**COMMON, warmup=8),
+}
+KINDS = {"adamw": Optim, "muon": Muon, "schedule_free": ScheduleFree}
+
+
+class Kill(Exception):
+    """Raised where a process is killed."""
+
+
+def kill(step: int, values: dict[str, float]) -> None:
+    raise Kill
+
+
+def trained(optim: Optim, folder: Path, watch: Watch = unwatched) -> tuple[MotionTask, Run]:
+    """A task after its training, and the run."""
+    folder.mkdir(exist_ok=True)
+    task, run = motion_task("forced", optim), Run(folder)
+    train(task, optim, run, 0, "optim", watch)
+    return task, run
+
+
+def same(ours: dict[str, torch.Tensor], theirs: dict[str, torch.Tensor]) -> bool:
+    assert ours.keys() == theirs.keys()
+    return all(torch.equal(value, theirs[name]) for name, value in ours.items())
+
+
+@pytest.mark.parametrize("name", OPTIMS)
+def test_a_resumed_training_is_the_same_however_often_it_was_validated(name: str, tmp_path: Path):
+    """It is killed at its validation after 7 steps, two after the last checkpoint; the other has more."""
+    optim = OPTIMS[name]
+    whole, run = trained(replace(optim, validate_every=2), tmp_path / "whole")
+    with pytest.raises(Kill):
+        trained(replace(optim, validate_every=7), tmp_path / "killed", kill)
+    again, resumed = trained(replace(optim, validate_every=7), tmp_path / "killed")
+    assert same(weights(run), weights(resumed))
+    assert same(whole.module.state_dict(), again.module.state_dict())
+    ended, _ = trained(optim, tmp_path / "killed")  # nothing is left to do
+    assert same(whole.module.state_dict(), ended.module.state_dict())
+
+
+@pytest.mark.parametrize(("name", "averaged"), [("ema", True), ("schedule_free", True), ("muon", False)])
+def test_the_weights_that_are_validated_are_kept(name: str, averaged: bool, tmp_path: Path):
+    optim, seen = OPTIMS[name], []
+    task, run = motion_task("forced", optim), Run(tmp_path)
+
+    def validate() -> dict[str, float]:
+        seen.append(task.model.stem.weight.detach().clone())
+        return {}
+
+    task.validate = validate
+    train(task, optim, run, 0, "validate")
+    assert torch.equal(seen[-1], task.model.stem.weight)
+    assert torch.equal(seen[-1], weights(run)["module.model.stem.weight"]) is not averaged
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("muon", {"momentum": 0.5}), ("muon", {"rest_lr": 1e-3}), ("muon", {"weight_decay": 0.5}),
+        ("muon", {"lr": 2e-2}), ("schedule_free", {"lr": 2e-2}), ("schedule_free", {"warmup": 0}),
+        ("schedule_free", {"weight_decay": 0.5}), ("ema", {"ema": 0.3}), ("ema", {"ema": None}),
+        ("warmup", {"warmup": 0}),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_every_knob_changes_the_weights(name: str, changes: dict, tmp_path: Path):
+    optim = replace(OPTIMS[name], steps=8)
+    one, other = trained(optim, tmp_path / "a")[0], trained(replace(optim, **changes), tmp_path / "b")[0]
+    assert not torch.equal(one.model.stem.weight, other.model.stem.weight)
+
+
+def test_optimisers_are_not_the_same(tmp_path: Path):
+    every = {"adamw": Optim(**COMMON), "muon": Muon(**COMMON), "free": ScheduleFree(**COMMON)}
+    found = [trained(optim, tmp_path / name)[0].model.stem.weight for name, optim in every.items()]
+    assert not any(torch.equal(found[i], found[j]) for i, j in ((0, 1), (0, 2), (1, 2)))
+
+
+def test_muon_has_the_matrices_and_adamw_the_rest():
+    matrix, row, cube = (torch.nn.Parameter(torch.rand(shape)) for shape in ((3, 4), (4,), (2, 3, 4)))
+    optimiser = replace(OPTIMS["muon"], rest_lr=0.5).build(
+        [{"params": [matrix, row]}, {"params": [cube], "lr": 0.1, "weight_decay": 0.0}]
+    )
+    muon, adamw = optimiser.parts
+    assert [group["params"] for group in muon.param_groups] == [[matrix]]
+    assert [group["params"] for group in adamw.param_groups] == [[row], [cube]]
+    assert [group["lr"] for group in optimiser.param_groups] == [1e-2, 0.5, 0.1]
+    assert [group["weight_decay"] for group in optimiser.param_groups] == [1e-4, 1e-4, 0]
+
+
+def test_the_warm_up_grows_in_equal_parts_and_then_the_schedule_is_what_it_was():
+    plain = Optim(steps=10, batch=1, lr=1.0, final_lr=0.1, schedule="cosine")
+    warm = replace(plain, warmup=4)
+    parts = [warm.factor(step) / plain.factor(step) for step in range(10)]
+    assert parts == pytest.approx([0.25, 0.5, 0.75, *[1.0] * 7])
+    assert [replace(OPTIMS["schedule_free"], warmup=2).factor(step) for step in range(4)] == [0.5, 1, 1, 1]
+
+
+def test_a_library_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(__import__("sys").modules, "schedulefree", None)
+    with pytest.raises(InputError, match=r"optim=schedule_free: .* pip install 'memmlp\[schedulefree\]'"):
+        OPTIMS["schedule_free"].check_installed()
+    monkeypatch.delattr(torch.optim, "Muon")
+    with pytest.raises(InputError, match=r"optim=muon: .*2\.9 or newer"):
+        OPTIMS["muon"].check_installed()
+    OPTIM.check_installed()
+
+
+@pytest.mark.parametrize("name", ["adamw", "muon", "schedule_free"])
+def test_an_option_builds_the_optimiser_of_its_name(name: str):
+    cfg = composed([f"optim={name}", "optim.warmup=7"])
+    optim = build_experiment(cfg).training.optim
+    assert (optim.warmup, optim.steps, type(optim)) == (7, cfg.optim.steps, KINDS[name])
