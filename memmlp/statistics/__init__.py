@@ -9,7 +9,7 @@ docs/statistics.md explains the method and how well it keeps its promises.
 
 from __future__ import annotations
 
-from memmlp.statistics.effects import Effects, equivalence_p, paired_effects
+from memmlp.statistics.effects import Effects, equivalence_p, paired_effects, seed_effects
 from memmlp.statistics.power import detectable, seeds_needed
 from memmlp.statistics.robust import (
     interquartile_mean,
@@ -29,6 +29,7 @@ __all__ = [
     "paired_effects",
     "performance_profile",
     "probability_of_improvement",
+    "seed_effects",
     "seeds_needed",
     "sequential",
     "spending",

@@ -42,6 +42,14 @@ def paired_effects(differences: np.ndarray, groups: Groups = None) -> Effects:
     return Effects(mean, mean - half, mean + half, p, known.conditional)
 
 
+def seed_effects(differences: np.ndarray) -> Effects:
+    """Return the effects of differences (K, S) of what each seed has one of, such as a time."""
+    alone = differences[:, :, None]
+    effects, several = paired_effects(alone), differences.shape[1] > 1
+    p = error(alone).level(np.abs(effects.mean)) if several else effects.p
+    return effects._replace(p=p, conditional="" if several else "seeds")
+
+
 def equivalence_p(differences: np.ndarray, margin: float | np.ndarray, groups: Groups = None) -> np.ndarray:
     """Return the p-values (K,) of the claim that means of differences (K, S, C) lie within +-margin.
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 from torch import nn
+from torch.autograd.profiler import record_function
 
 from memmlp.common import parallel
 from memmlp.evaluation import modes
@@ -24,6 +25,7 @@ from memmlp.training.loop import StepResult, Watch, train, unwatched
 from memmlp.training.losses import Loss
 from memmlp.training.optim import Optim
 from memmlp.training.rollout import Rollout
+from memmlp.training.step_profile import SAMPLING
 
 VALIDATION_PIECE = 240  # frames, 4 s: validation streams through pieces of clips of this length
 
@@ -74,13 +76,23 @@ class NetworkTraining:
         Returns:
             The trained network in evaluation mode.
         """
+        task = self.task(architecture, data, codes, device)
+        train(task, self.optim, run, self.seed, "network", watch)
+        if parallel.first():
+            checkpoint.write(run.model, checkpoint.module_tensors("model", task.model), {})
+        return task.model.eval()
+
+    def task(
+        self, architecture: Architecture, data: Prepared, codes: Path | None, device: torch.device
+    ) -> MotionTask:
+        """Make the task of training a network that is not yet trained; for the arguments see `train`."""
         dataset = data.open("train").to(device)
         torch.manual_seed(self.seed)
         frozen = architecture.load_vqvae(above) if above else None
         model = architecture.build(architecture.normalizer(data.manifest, dataset.frames), frozen).to(device)
         self.rollout.begin(model)
         pieces = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)
-        task = MotionTask(
+        return MotionTask(
             model,
             self.loss(model.branches).to(device),
             self.rollout.to(device),
@@ -91,10 +103,6 @@ class NetworkTraining:
             weighting=self.weighting,
             shares=self.shares,
         )
-        train(task, self.optim, run, self.seed, "network", watch)
-        if parallel.first():
-            checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
-        return model.eval()
 
 
 class MotionTask:
@@ -125,7 +133,8 @@ class MotionTask:
 
     def step(self, step: int) -> StepResult:
         """Compute the loss of one training call."""
-        call = self.rollout.draw(self.model, self.dataset, self.sampler, step)
+        with record_function(SAMPLING):
+            call = self.rollout.draw(self.model, self.dataset, self.sampler, step)
         motion, state = self.learn(call.sparse, call.state, call.truth)
         self.rollout.keep(state)
         true = call.truth[:, -motion.shape[1] :]

@@ -11,6 +11,7 @@ from memmlp.cli.bench.prepare_data import prepare
 from memmlp.cli.bench.soak import soak
 from memmlp.cli.bench.stream_evaluation import stream
 from memmlp.cli.bench.tracking import tracking
+from memmlp.cli.bench.train import train
 from memmlp.cli.bench.ui_page import ui
 from memmlp.cli.bench.verdict_simulation import calibration
 
@@ -20,5 +21,7 @@ def bench() -> None:
     """Measure this machine: speed as rates and ratios within one run, sweeps under kills, verdicts, pages."""
 
 
-for command in (prepare, stream, latency, avatar, soak, tracking, chaos, chaos_tune, calibration, ui):
+for command in (
+    prepare, stream, train, latency, avatar, soak, tracking, chaos, chaos_tune, calibration, ui,
+):  # fmt: skip
     bench.add_command(command)

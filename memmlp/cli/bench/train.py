@@ -1,0 +1,266 @@
+"""`memmlp bench train`: how soon a recipe reaches the validation error that today's ends with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from memmlp.cli.options import Finite, config_dir_option, plugins_option
+from memmlp.evaluation.units import UNITS
+
+if TYPE_CHECKING:
+    from memmlp.pipeline.experiment import Experiment
+    from memmlp.training.time_to_error import Learner, Validation
+
+ERRORS = ("MPJRE", "MPJPE", "MPJVE", "Jitter")
+ARMS = ("today", "recipe")
+BASE = ("profile=small", "device=cpu", "tracking=none")
+WARM_UP = 3  # steps of each that are taken before any is timed
+
+
+@click.command("train")
+@click.option("--recipe", default="", help="Overrides that make the recipe of today's, separated by spaces.")
+@click.option("--seeds", default=5, show_default=True, type=click.IntRange(1), help="How many seeds, from 0.")
+@click.option(
+    "--error", default="MPJPE", show_default=True, type=click.Choice(ERRORS), help="Which error counts."
+)
+@click.option(
+    "--every",
+    default=50,
+    show_default=True,
+    type=click.IntRange(1),
+    help="Steps between validations, and of each when it is its turn.",
+)
+@click.option(
+    "--times",
+    default=1.0,
+    show_default=True,
+    type=Finite(min=0, min_open=True),
+    help="How many times sooner is claimed.",
+)
+@click.option(
+    "--json",
+    "file",
+    type=click.Path(path_type=Path),
+    help="File of what was measured, written after each seed; what it has already is not measured again.",
+)
+@click.option(
+    "--profile",
+    type=click.IntRange(1),
+    metavar="STEPS",
+    help="Show instead where the time of a step goes, over so many steps of each.",
+)
+@click.argument("overrides", nargs=-1)
+@config_dir_option
+@plugins_option
+def train(
+    recipe: str,
+    seeds: int,
+    error: str,
+    every: int,
+    times: float,
+    file: Path | None,
+    profile: int | None,
+    overrides: tuple[str, ...],
+) -> None:
+    """Time a recipe of training beside today's.
+
+    Today's recipe is `memmlp train` with OVERRIDES (by default profile=small); the recipe has the overrides
+    of --recipe, too. For each seed both are trained on the CPU, in turn, piece by piece. Printed are when
+    each first had the validation error (stream mode) that today's ends with, in steps and in seconds of the
+    processor without validations, and the ratio of the seconds with an interval over seeds.
+    """
+    import shlex
+
+    own = tuple(shlex.split(recipe))
+    if profile:
+        for arm, words in zip(ARMS, ((), own), strict=True):
+            if words or arm == ARMS[0]:
+                show_profile(arm, (*BASE, *overrides, *words), profile)
+        return
+    subject = {"overrides": list(overrides), "recipe": list(own), "error": error, "every": every}
+    rows = known_rows(file, subject)
+    for seed in range(seeds):
+        words = (*BASE, *overrides)
+        arms = (built((*words, f"seed={seed}")), built((*words, *own, f"seed={seed}")))
+        experiments = dict(zip(ARMS, arms, strict=True))
+        rows[seed] = measured(experiments, seed, error, every, rows.get(seed))
+        click.echo(told(rows[seed], error))
+        if file:
+            write(file, subject, rows, times)
+    click.echo(conclusion(summary([rows[seed] for seed in range(seeds)], times)))
+
+
+def known_rows(file: Path | None, subject: dict[str, Any]) -> dict[int, dict[str, Any]]:
+    """Return by seed what a file has already; empty where there is none.
+
+    Raises:
+        InputError: where the file is of another comparison, or can't be written.
+    """
+    from memmlp.common.errors import InputError
+    from memmlp.common.files import read_json
+
+    if file is None:
+        return {}
+    if not file.absolute().parent.is_dir():
+        raise InputError(f"--json {file}: there is no folder {file.parent}")
+    if not file.exists():
+        return {}
+    content = read_json(file)
+    if content.get("subject") != subject:
+        raise InputError(
+            f"--json {file}: is of another comparison; allowed is a new file, or the same options"
+        )
+    return {row["seed"]: row for row in content["seeds"]}
+
+
+def built(words: Sequence[str]) -> Experiment:
+    """Build the experiment of overrides, and let torch have its number of threads.
+
+    Raises:
+        InputError: for bad overrides, and for a device other than the CPU.
+    """
+    import torch
+
+    from memmlp.common.errors import InputError
+    from memmlp.config.build import build_experiment
+    from memmlp.config.compose import composed
+
+    experiment = build_experiment(composed(words))
+    if experiment.device.type != "cpu":
+        raise InputError(f"device={experiment.device}: allowed is cpu, whose time is measured")
+    if threads := experiment.config["threads"]:
+        torch.set_num_threads(threads)
+    return experiment
+
+
+def measured(
+    experiments: dict[str, Experiment], seed: int, error: str, every: int, known: dict[str, Any] | None
+) -> dict[str, Any]:
+    """Return the row of a seed: the error, when each arm had it, and the runs that they are.
+
+    Args:
+        experiments: of both arms.
+        seed: their seed.
+        error: the error's name.
+        every: steps between validations.
+        known: the row that there is already.
+
+    Raises:
+        InputError: where the arms differ in what is not timed, or the known row is of other runs.
+    """
+    from memmlp.common.errors import InputError
+
+    data = {arm: experiment.data.prepare() for arm, experiment in experiments.items()}
+    runs = {arm: experiment.identity(data[arm].digest) for arm, experiment in experiments.items()}
+    ids = {arm: run.id for arm, run in runs.items()}
+    if known is not None:
+        if known["runs"] != ids:
+            raise InputError(
+                "--json: what is measured there is of other code, configs or data; use a new file"
+            )
+        return known
+    if len({(run.data, run.upstream.id if run.upstream else None) for run in runs.values()}) > 1:
+        raise InputError(
+            "--recipe: changes the data or the VQ-VAE; allowed is the network and how it is trained"
+        )
+    learners = {arm: learner(experiments[arm], data[arm], error) for arm in ARMS}
+    reached, target = raced(learners, every, f"seed {seed}")
+    marks = {arm: one._asdict() if one else None for arm, one in reached.items()}
+    return {"seed": seed, "runs": ids, "target": target, **marks}
+
+
+def learner(experiment: Experiment, data: Any, error: str = "MPJPE") -> Learner:
+    """Return a training of an experiment that can go on piece by piece; its VQ-VAE is found or trained."""
+    from memmlp.pipeline.run_stages import vqvae_run
+    from memmlp.training.time_to_error import Learner
+
+    training = experiment.training
+    training.optim.check_installed()
+    codes = vqvae_run(experiment, data).weights() if experiment.architecture.uses_codes else None
+    task = training.task(experiment.architecture, data, codes, experiment.device)
+    return Learner(task, training.optim, training.seed, f"rotation {error}")
+
+
+def raced(
+    learners: dict[str, Learner], every: int, description: str
+) -> tuple[dict[str, Validation | None], float]:
+    """Train both in turn; return when each first had the error that today's ends with, and that error."""
+    from memmlp.common.progress import progress
+    from memmlp.training.time_to_error import first_at, in_turn
+
+    with progress() as bar:
+        total = sum(one.optim.steps for one in learners.values())
+        row = bar.add_task(description, total=total, note="")
+        for steps in in_turn([learners[arm] for arm in reversed(ARMS)], every):  # today's not on a cold start
+            bar.advance(row, steps)
+    target = learners[ARMS[0]].validations[-1].error
+    return {arm: first_at(one.validations, target) for arm, one in learners.items()}, target
+
+
+def summary(rows: Sequence[dict[str, Any]], times: float) -> dict[str, Any]:
+    """Return the ratio of today's seconds to the recipe's, with a 95 % interval over seeds and a verdict.
+
+    Ratios are averaged as logarithms. A seed that never had the error leaves no number, and an open verdict.
+    """
+    import numpy as np
+
+    from memmlp.statistics import seed_effects, verdict
+
+    ratios = [row["today"]["seconds"] / row["recipe"]["seconds"] if row["recipe"] else np.nan for row in rows]
+    mean, low, high, p = (float(part[0]) for part in seed_effects(np.log([ratios]) - np.log(times))[:4])
+    values = {"ratio": times * np.exp(mean), "low": times * np.exp(low), "high": times * np.exp(high), "p": p}
+    numbers = {name: float(value) if np.isfinite(value) else None for name, value in values.items()}
+    never = [row["seed"] for row in rows if not row["recipe"]]
+    return {**numbers, "verdict": str(verdict(p, np.nan, mean, 1.0)), "times": times, "never": never}
+
+
+def write(file: Path, subject: dict[str, Any], rows: dict[int, dict[str, Any]], times: float) -> None:
+    """Write what was measured, with the number of threads and the summary so far."""
+    import torch
+
+    from memmlp.common.files import write_json
+
+    every = list(rows.values())
+    told = {"threads": torch.get_num_threads(), "torch": torch.__version__}
+    write_json(file, {"subject": subject, **told, "seeds": every, "summary": summary(every, times)})
+
+
+def told(row: dict[str, Any], error: str) -> str:
+    """Return a seed's line."""
+    parts = [f"seed {row['seed']}: {error} {row['target']:.3f} {UNITS[error]}"]
+    for arm in ARMS:
+        mark = row[arm]
+        parts.append(f"{arm} {mark['steps']} steps, {mark['seconds']:.1f} s" if mark else f"{arm} never")
+    return "; ".join(parts)
+
+
+def conclusion(found: dict[str, Any]) -> str:
+    """Return the last line: ratio, interval, verdict."""
+    claim = f"at least {found['times']:g} times: {found['verdict']}"
+    if found["never"]:
+        return f"the recipe never had the error with seed {', '.join(map(str, found['never']))}; {claim}"
+    several = found["low"] is not None
+    interval = f"{found['low']:.2f} to {found['high']:.2f}" if several else "none, of one seed"
+    return f"{found['ratio']:.2f} times sooner (95 % interval over seeds: {interval}); {claim}"
+
+
+def show_profile(arm: str, words: Sequence[str], steps: int) -> None:
+    """Print how long a step takes, and each part of it."""
+    from memmlp.training.step_profile import PARTS, step_parts
+
+    experiment = built((*words, f"optim.steps={WARM_UP + 2 * steps}"))
+    one = learner(experiment, experiment.data.prepare())
+    one.take(WARM_UP)
+    before = one.seconds
+    one.take(steps)
+    alone = 1000 * (one.seconds - before) / steps
+    parts = step_parts(one.take, steps)
+    whole = sum(parts.values())
+    click.echo(f"{arm}: a step takes {alone:.1f} ms of the processor; with the profiler {whole:.1f} ms pass,")
+    click.echo(f"  {whole / parts[PARTS[0]]:.2f} times its matrix products:")
+    for name, value in parts.items():
+        click.echo(f"  {name:<16}{value:8.2f} ms  {100 * value / whole:5.1f} %")

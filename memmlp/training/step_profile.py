@@ -1,0 +1,62 @@
+"""Where the time of a training step goes on a CPU, by torch's profiler."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from torch.autograd.profiler import profile, record_function
+
+SAMPLING = "sampling"
+"""What the drawing of a batch is called in a profile (memmlp.training.network)."""
+
+MATRIX_PRODUCTS = frozenset(
+    f"aten::{name}"
+    for name in (
+        "mm", "addmm", "bmm", "baddbmm", "addmv", "mv", "_addmm_activation", "mkldnn_linear",
+        "mkldnn_convolution", "mkldnn_convolution_backward", "_slow_conv2d_forward", "_slow_conv2d_backward",
+        "mkldnn_rnn_layer", "mkldnn_rnn_layer_backward", "_scaled_dot_product_flash_attention_for_cpu",
+        "_scaled_dot_product_flash_attention_for_cpu_backward",
+    )
+)  # fmt: skip
+"""Kernels that are matrix products, or mostly: those of recurrences and of attention are one kernel."""
+
+PARTS = ("matrix products", "other kernels", "optimiser", SAMPLING, "rest")
+"""The parts of a step.
+
+Optimiser and sampling are all that happens in them. The rest is Python, autograd's own time, and what
+torch.compile made.
+"""
+
+
+def step_parts(take: Callable[[int], None], steps: int) -> dict[str, float]:
+    """Return how long each of PARTS takes of a step, milliseconds; together they are a profiled step.
+
+    The profiler itself takes time for each operation, so that a step is longer than without it; matrix
+    products, which are few and long, have the least of that.
+
+    Args:
+        take: takes so many training steps.
+        steps: how many to profile.
+    """
+    with profile(use_kineto=False) as profiled, record_function("steps"):  # Kineto writes to stderr
+        take(steps)
+    parts = dict.fromkeys(PARTS, 0.0)
+    for event in profiled.function_events or ():
+        parts[_part(event)] += event.self_cpu_time_total / 1000 / steps
+    return parts
+
+
+def _part(event: Any) -> str:
+    """Return the part that an event's own time belongs to."""
+    inside, above = [event.name], event.cpu_parent
+    while above is not None:
+        inside.append(above.name)
+        above = above.cpu_parent
+    if SAMPLING in inside:
+        return SAMPLING
+    if any(name.startswith("Optimizer.") for name in inside):
+        return "optimiser"
+    if event.name in MATRIX_PRODUCTS:
+        return "matrix products"
+    return "other kernels" if event.name.startswith("aten::") else "rest"
