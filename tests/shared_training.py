@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -19,15 +19,25 @@ from tiny_tasks import OPTIM, TASKS
 from memmlp.common import parallel
 from memmlp.runs.run import Run
 from memmlp.training.loop import TrainingTask, train
+from memmlp.training.optim import Muon, Optim, ScheduleFree
 from memmlp.training.vqvae import VQVAETask
 
 STEPS = replace(OPTIM, steps=50, checkpoint_every=20, validate_every=25)
+OPTIMS = {
+    "muon": Muon(**asdict(replace(STEPS, ema=0.9))),
+    "schedule_free": ScheduleFree(**asdict(STEPS)),
+}
 DEATH = 27  # the step at which the second process dies
+
+
+def optim_of(name: str) -> Optim:
+    """How a task is optimised."""
+    return OPTIMS.get(name, STEPS)
 
 
 def precise(name: str) -> TrainingTask:
     """A task in float64: in float32 the order of sums alone sets two trainings apart within 50 steps."""
-    task = TASKS[name](optim=STEPS)
+    task = TASKS[name](optim=optim_of(name))
     task.module.double()
     task.dataset.frames = task.dataset.frames.double()
     if isinstance(task, VQVAETask):
@@ -43,7 +53,7 @@ def main(folder: Path, names: list[str]) -> None:
         task = precise(name)
         if name != word and parallel.rank() == 1:
             task.step = dying(task.step, partial(os.kill, os.getpid(), signal.SIGKILL))
-        train(task, STEPS, Run(folder / name), 0, name)
+        train(task, optim_of(name), Run(folder / name), 0, name)
 
 
 def dying(step: Callable, die: Callable[[], object]) -> Callable:

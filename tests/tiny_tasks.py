@@ -59,6 +59,8 @@ TASKS = {
     **{name: partial(motion_task, name) for name in ROLLOUTS},
     **{name: partial(baseline_task, name) for name in tiny.BASELINES},
     **{f"recurrent {name}": partial(recurrent_task, name) for name in ("forced", "streams")},
+    "muon": partial(motion_task, "forced"),
+    "schedule_free": partial(motion_task, "forced"),
     "vqvae": vqvae_task,
     "joint": partial(motion_task, kind=JointCodeMemory),
 }

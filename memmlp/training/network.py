@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 from torch import nn
-from torch.autograd.profiler import record_function
+from torch.profiler import record_function
 
 from memmlp.common import parallel
 from memmlp.evaluation import modes
@@ -76,14 +76,14 @@ class NetworkTraining:
         Returns:
             The trained network in evaluation mode.
         """
-        task = self.task(architecture, data, codes, device)
+        task = self.task(architecture, data, above, device)
         train(task, self.optim, run, self.seed, "network", watch)
         if parallel.first():
             checkpoint.write(run.model, checkpoint.module_tensors("model", task.model), {})
         return task.model.eval()
 
     def task(
-        self, architecture: Architecture, data: Prepared, codes: Path | None, device: torch.device
+        self, architecture: Architecture, data: Prepared, above: Path | None, device: torch.device
     ) -> MotionTask:
         """Make the task of training a network that is not yet trained; for the arguments see `train`."""
         dataset = data.open("train").to(device)

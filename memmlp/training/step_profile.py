@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from torch.autograd.profiler import profile, record_function
+from torch.profiler import ProfilerActivity, profile, record_function
 
 SAMPLING = "sampling"
 """What the drawing of a batch is called in a profile (memmlp.training.network)."""
@@ -39,10 +39,10 @@ def step_parts(take: Callable[[int], None], steps: int) -> dict[str, float]:
         take: takes so many training steps.
         steps: how many to profile.
     """
-    with profile(use_kineto=False) as profiled, record_function("steps"):  # Kineto writes to stderr
+    with profile(activities=[ProfilerActivity.CPU]) as profiled, record_function("steps"):
         take(steps)
     parts = dict.fromkeys(PARTS, 0.0)
-    for event in profiled.function_events or ():
+    for event in profiled.events() or ():
         parts[_part(event)] += event.self_cpu_time_total / 1000 / steps
     return parts
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 from processes import PATIENCE, started
-from shared_training import STEPS, dying, precise
+from shared_training import STEPS, dying, optim_of, precise
 from tiny_tasks import motion_task, weights
 from torch import nn
 
@@ -24,8 +24,8 @@ from memmlp.networks import checkpoint, layers
 from memmlp.runs.run import Run
 from memmlp.training.loop import check_shares, train
 
-NAMES = ("streams", "joint", "avatar_poser", "agrol_diffusion", "vqvae")
-"""Tasks with all that could differ: states, blends, passes, codes that restart, dropout, noise."""
+NAMES = ("streams", "joint", "avatar_poser", "agrol_diffusion", "muon", "schedule_free", "vqvae")
+"""Tasks with all that could differ: states, blends, passes, codes that restart, dropout, noise, averages."""
 PROGRAM = Path(__file__).parent.with_name("shared_training.py")
 
 
@@ -43,7 +43,7 @@ def train_alone(name: str, folder: Path, die: bool = False) -> Run:
     run.folder.mkdir(parents=True, exist_ok=True)
     if die:
         task.step = dying(task.step, kill)
-    train(task, STEPS, run, 0, name)
+    train(task, optim_of(name), run, 0, name)
     return run
 
 

@@ -73,10 +73,14 @@ def train(
     each first had the validation error (stream mode) that today's ends with, in steps and in seconds of the
     processor without validations, and the ratio of the seconds with an interval over seeds.
     """
+    import os
     import shlex
 
     own = tuple(shlex.split(recipe))
     if profile:
+        os.environ.setdefault(
+            "KINETO_LOG_LEVEL", "99"
+        )  # before torch is there, whose profiler talks on stderr
         for arm, words in zip(ARMS, ((), own), strict=True):
             if words or arm == ARMS[0]:
                 show_profile(arm, (*BASE, *overrides, *words), profile)
@@ -128,10 +132,13 @@ def built(words: Sequence[str]) -> Experiment:
     from memmlp.common.errors import InputError
     from memmlp.config.build import build_experiment
     from memmlp.config.compose import composed
+    from memmlp.training.network import NetworkTraining
 
     experiment = build_experiment(composed(words))
     if experiment.device.type != "cpu":
         raise InputError(f"device={experiment.device}: allowed is cpu, whose time is measured")
+    if not isinstance(experiment.training, NetworkTraining):
+        raise InputError("refiner: bench train times a network's training; allowed is refiner=null")
     if threads := experiment.config["threads"]:
         torch.set_num_threads(threads)
     return experiment
@@ -175,13 +182,15 @@ def measured(
 
 def learner(experiment: Experiment, data: Any, error: str = "MPJPE") -> Learner:
     """Return a training of an experiment that can go on piece by piece; its VQ-VAE is found or trained."""
-    from memmlp.pipeline.run_stages import vqvae_run
+    from memmlp.pipeline.run_stages import upstream_run
+    from memmlp.training.network import NetworkTraining
     from memmlp.training.time_to_error import Learner
 
     training = experiment.training
+    assert isinstance(training, NetworkTraining)
     training.optim.check_installed()
-    codes = vqvae_run(experiment, data).weights() if experiment.architecture.uses_codes else None
-    task = training.task(experiment.architecture, data, codes, experiment.device)
+    above = upstream_run(experiment, data)
+    task = training.task(experiment.architecture, data, above.weights() if above else None, experiment.device)
     return Learner(task, training.optim, training.seed, f"rotation {error}")
 
 
