@@ -198,14 +198,15 @@ def raced(
     learners: dict[str, Learner], every: int, description: str
 ) -> tuple[dict[str, Validation | None], float]:
     """Train both in turn; return when each first had the error that today's ends with, and that error."""
-    from memmlp.common.progress import progress
+    import math
+    from collections import deque
+
+    from memmlp.common.progress import progress_bar
     from memmlp.training.time_to_error import first_at, in_turn
 
-    with progress() as bar:
-        total = sum(one.optim.steps for one in learners.values())
-        row = bar.add_task(description, total=total, note="")
-        for steps in in_turn([learners[arm] for arm in reversed(ARMS)], every):  # today's not on a cold start
-            bar.advance(row, steps)
+    pieces = sum(math.ceil(one.optim.steps / every) for one in learners.values())
+    turns = in_turn([learners[arm] for arm in reversed(ARMS)], every)  # today's is not on a cold start
+    deque(progress_bar(turns, description, pieces), maxlen=0)
     target = learners[ARMS[0]].validations[-1].error
     return {arm: first_at(one.validations, target) for arm, one in learners.items()}, target
 
