@@ -50,6 +50,7 @@ CHANGES: dict[str, str] = {
     "loss.lr": "1e-3",
     "optim.steps": "5", "optim.batch": "5", "optim.lr": "1e-2", "optim.final_lr": "1e-6",
     "optim.schedule": "cosine", "optim.drop_at": "0.9", "optim.weight_decay": "0.1",
+    "optim.warmup": "3", "optim.ema": "0.9",
     "optim.clip_norm": "1e-3",
     "optim.precision": "bf16", "optim.compile": "true", "optim.checkpoint_every": "1",
     "optim.validate_every": "1", "optim.log_every": "1",
