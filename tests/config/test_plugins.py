@@ -235,7 +235,12 @@ def test_coordinates_of_ones_own(folder: Path):
     assert type(experiment.architecture.coordinates).__name__ == "Floor"
     assert experiment.config["plugins"] == ["mine"]
     assert experiment.identity("d").id != build_experiment(composed([])).identity("d").id
-    for word, line in (("mine.Gone", "mine.Gone"), ("yaml.Loader", "extends"), ("pathlib.Path", "allowed is"), ("sideways", "allowed is")):
+    for word, line in (
+        ("mine.Gone", "mine.Gone"),
+        ("yaml.Loader", "extends"),
+        ("pathlib.Path", "allowed is"),
+        ("sideways", "allowed is"),
+    ):
         with pytest.raises(InputError, match=line):
             build_experiment(composed([f"frame.coordinates={word}"]))
 
