@@ -25,7 +25,7 @@ def _remember_exporter(module: Any) -> None:
 def _pass_over_other_operators(module: Any) -> None:
     """Of onnxscript's optimiser: a pattern is not looked for at a node of another operator than its own.
 
-    It lists the whole graph first to find that out, for each node: a third of an export. The file is the same.
+    It would list the whole graph for each node, a third of an export. The file is the same.
     """
     matcher = module.SimplePatternMatcher
     if hasattr(matcher.match, "__wrapped__"):
