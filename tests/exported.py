@@ -9,15 +9,19 @@ from pathlib import Path
 import tiny
 
 from memmlp.motion.coordinates import Heading
-from memmlp.networks.memory import CodeMemory, LSTMMemory
+from memmlp.networks.memory import CodeMemory, LSTMMemory, NoMemory
+from memmlp.networks.predictor import RotationOnly
 from memmlp.networks.window_model import WindowModel
 
+LARGEST = ("manikin_s", "manikin_l", "hmd_poser", "avatar_jlm")
 NETWORKS: dict[str, Callable[[], WindowModel]] = {
     "mem_mlp": partial(tiny.model, CodeMemory, coordinates=Heading()),
     "lstm": partial(tiny.model, LSTMMemory, coordinates=Heading()),
+    "no_memory": partial(tiny.model, NoMemory),
+    "rotation_only": partial(tiny.model, NoMemory, RotationOnly),
     "refined": lambda: tiny.refined(tiny.baseline("avatar_poser", Heading())),
     **{name: partial(tiny.baseline, name, Heading()) for name in tiny.BASELINES},
-    **{name: partial(tiny.baseline, name, depth=1) for name in ("manikin_s", "manikin_l")},
+    **{name: partial(tiny.baseline, name, depth=1) for name in LARGEST},
 }
 """By name. Relative to the heading, which makes the larger graph, unless it is the largest anyway."""
 

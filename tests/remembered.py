@@ -1,9 +1,9 @@
-"""What two libraries would work out anew at every call is kept for all tests of a process."""
+"""What libraries would work out anew at every call is kept for all tests of a process."""
 
 from __future__ import annotations
 
-import copy
 import functools
+import pickle
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,9 @@ from typing import Any
 
 def remember() -> None:
     """Do so from now on with what is imported by now; to import it for this would cost more than it saves."""
-    if "torch.onnx._internal.exporter._registration" in sys.modules:
-        _remember_exporter(sys.modules["torch.onnx._internal.exporter._registration"])
-    if "hydra._internal.config_repository" in sys.modules:
-        _remember_configs(sys.modules["hydra._internal.config_repository"].ConfigRepository)
+    for name, patch in PATCHES.items():
+        if name in sys.modules:
+            patch(sys.modules[name])
 
 
 def _remember_exporter(module: Any) -> None:
@@ -23,19 +22,44 @@ def _remember_exporter(module: Any) -> None:
         module.onnxscript_apis.get_torchlib_ops = functools.cache(module.onnxscript_apis.get_torchlib_ops)
 
 
-def _remember_configs(repository: Any) -> None:
+def _pass_over_other_operators(module: Any) -> None:
+    """Of onnxscript's optimiser: a pattern is not looked for at a node of another operator than its own.
+
+    It would list the whole graph for each node, a third of an export. The file is the same.
+    """
+    matcher = module.SimplePatternMatcher
+    if hasattr(matcher.match, "__wrapped__"):
+        return
+
+    @functools.wraps(matcher.match)
+    def match(self: Any, model: Any, graph: Any, node: Any, **options: Any) -> Any:
+        if self.pattern.output_nodes[0].op.matches(node.op_type):
+            return match.__wrapped__(self, model, graph, node, **options)
+        return module._basics.MatchResult().fail("another operator")
+
+    matcher.match = match
+
+
+def _remember_interpolations(module: Any) -> None:
+    """Of OmegaConf: the parts of an interpolation such as ${seed}, which it only reads."""
+    if not hasattr(module.parse, "cache_info"):
+        module.parse = functools.lru_cache(maxsize=1000)(module.parse)
+
+
+def _remember_configs(module: Any) -> None:
     """Of Hydra: what it read of each file for as long as the file is the same, a quarter of a composition."""
+    repository = module.ConfigRepository
     if hasattr(repository.load_config, "__wrapped__"):
         return
-    known: dict[tuple[Any, ...], Any] = {}
+    known: dict[tuple[Any, ...], bytes] = {}
 
     @functools.wraps(repository.load_config)
     def load_config(self: Any, config_path: str) -> Any:
         places = tuple((type(source), source.path) for source in self.sources)
         key = (config_path, places, *(_stamp(place, config_path) for _, place in places))
         if key not in known:
-            known[key] = load_config.__wrapped__(self, config_path)
-        return copy.deepcopy(known[key])  # a composition changes what it loaded
+            known[key] = pickle.dumps(load_config.__wrapped__(self, config_path))
+        return pickle.loads(known[key])  # a copy, since a composition changes what it loaded
 
     repository.load_config = load_config
 
@@ -44,3 +68,11 @@ def _stamp(folder: str, name: str) -> tuple[int, int] | None:
     """When a config's file was written, and its size; None of what is no file."""
     file = Path(folder) / f"{name.removesuffix('.yaml')}.yaml"
     return (file.stat().st_mtime_ns, file.stat().st_size) if file.is_file() else None
+
+
+PATCHES = {
+    "torch.onnx._internal.exporter._registration": _remember_exporter,
+    "onnxscript.rewriter._matcher": _pass_over_other_operators,
+    "omegaconf.base": _remember_interpolations,
+    "hydra._internal.config_repository": _remember_configs,
+}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from shutil import copyfile
 
 import exported
 import numpy as np
@@ -17,14 +18,11 @@ import memmlp as package
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.deploy.deployment import GRAPHS, Deployment
-from memmlp.deploy.export import export
 from memmlp.deploy.parity import streamed
 from memmlp.deploy.quantization import accuracy, compared, quantise
 from memmlp.deploy.session import OnnxStream
-from memmlp.motion.coordinates import Heading
 from memmlp.networks.memory import CodeMemory
 from memmlp.networks.streaming import StreamingGraph, streaming
-from memmlp.networks.window_model import WindowModel
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.lookup import list_runs
 
@@ -33,18 +31,12 @@ pytestmark = pytest.mark.slow
 CLIPS = [tiny.clip(60, seed=seed) for seed in range(3)]
 
 
-def files(folder: Path, model: WindowModel) -> tuple[Path, Path]:
-    """A model's stream in float32 and in int8."""
-    exact, quantised, stream = folder / "fp32.onnx", folder / "int8.onnx", streaming(model)
-    export(stream, exact, "0123456789abcdef")
-    quantise(exact, quantised, stream.ends, CLIPS)
-    return exact, quantised
-
-
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory) -> tuple[Path, Path]:
-    """The two files of the first tiny network."""
-    return files(tmp_path_factory.mktemp("pair"), tiny.model())
+def pair(step_files, tmp_path_factory) -> tuple[Path, Path]:
+    """The first tiny network's stream in float32 and in int8."""
+    exact, quantised = step_files("mem_mlp"), tmp_path_factory.mktemp("pair") / "int8.onnx"
+    quantise(exact, quantised, streaming(exported.NETWORKS["mem_mlp"]()).ends, CLIPS)
+    return exact, quantised
 
 
 def test_auto_is_the_stream_where_there_is_one():
@@ -90,23 +82,23 @@ def test_inner_layers_are_int8_and_the_ends_are_not(step_files, tmp_path, networ
     assert {kinds[name] for name in ends} == {onnx.TensorProto.FLOAT}
 
 
-def test_int8_is_near_and_keeps_the_metadata(tmp_path):
-    exact, quantised = files(tmp_path, tiny.model(coordinates=Heading()))
-    before, after = (streamed(OnnxStream(path), CLIPS[0]) for path in (exact, quantised))
+def test_int8_is_near_and_keeps_the_metadata(pair):
+    exact, quantised = pair
+    before, after = (streamed(OnnxStream(path), CLIPS[0]) for path in pair)
     assert 1e-6 < float((before - after).abs().mean()) < 0.02
-    props = [{p.key: p.value for p in onnx.load(path).metadata_props} for path in (exact, quantised)]
+    props = [{p.key: p.value for p in onnx.load(path).metadata_props} for path in pair]
     assert props[0].items() <= props[1].items()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["fp32.onnx", "int8.onnx"]
+    assert quantised.parent != exact.parent
+    assert [path.name for path in quantised.parent.iterdir()] == ["int8.onnx"]
 
 
-def test_int8_may_stand_for_float32_only_if_it_is_as_good(pair, tmp_path):
-    model = tiny.model()
+def test_int8_may_stand_for_float32_only_if_it_is_as_good(pair, step_files):
+    model = exported.NETWORKS["mem_mlp"]()
     exact, quantised = pair
     cost = compared(exact, quantised, model.normalizer, CLIPS)
     assert cost["growth"] == pytest.approx(cost["int8"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
     assert cost["default"] == (cost["growth"] <= 0.01)
-    other = tmp_path / "other.onnx"  # of two networks the better one may stand for the other alone
-    export(streaming(tiny.model(seed=1)), other, "0")
+    other = step_files("refined")  # of two networks the better one may stand for the other alone
     both = [compared(*pair, model.normalizer, CLIPS) for pair in ((exact, other), (other, exact))]
     assert sorted(cost["default"] for cost in both) == [False, True]
     assert (1 + both[0]["growth"]) * (1 + both[1]["growth"]) == pytest.approx(1)
@@ -116,7 +108,7 @@ def test_int8_may_stand_for_float32_only_if_it_is_as_good(pair, tmp_path):
 def test_accuracy_is_that_of_the_evaluation(pair):
     from memmlp.evaluation import modes as evaluation
 
-    model = tiny.model()
+    model = exported.NETWORKS["mem_mlp"]()
     exact, _ = pair
     found = accuracy(exact, model.normalizer, CLIPS)
     motions = evaluation.stream(model, CLIPS)
@@ -153,6 +145,8 @@ def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
     deployed.int8.write_bytes(b"")
     assert made.verify() == [f"deployments/{deployed.folder.name}/step.int8.onnx"]
 
+    # The float32 file is exported as it is without int8 (tests/pipeline/test_run_stages.py).
+    monkeypatch.setattr("memmlp.deploy.export.export", lambda model, path, run: copyfile(deployed.onnx, path))
     line = ["export", made.id, "--out", "int8.onnx", "--precision", "int8"]
     assert "MPJPE" in memmlp(*line, "--max-growth", "50").out
     Path("int8.onnx").unlink()

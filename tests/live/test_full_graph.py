@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from pathlib import Path
 
+import exported
 import numpy as np
 import onnx
 import pytest
@@ -13,14 +14,12 @@ import torch
 import wearer
 
 from memmlp.common.errors import InputError
-from memmlp.deploy.export import export
 from memmlp.deploy.parity import TOLERANCE
 from memmlp.deploy.session import OnnxStream
 from memmlp.live.full_graph import export_full, full_parity, trackers_of
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.coordinates import Heading
 from memmlp.motion.features import sparse_features
 from memmlp.networks.streaming import streaming
 
@@ -32,27 +31,26 @@ PERSON = wearer.person(np.arange(61) / 60)
 
 @pytest.fixture(scope="module")
 def network():
-    return tiny.model(coordinates=Heading())
+    return exported.NETWORKS["mem_mlp"]()
 
 
 @pytest.fixture(scope="module")
 def folder(network, tmp_path_factory) -> Path:
-    """Export the network's own file, and the whole way in Unity's space."""
+    """Export the whole way in Unity's space."""
     folder = tmp_path_factory.mktemp("full")
-    export(streaming(network), folder / "step.onnx", RUN)
     export_full(streaming(network), folder / "unity.onnx", RUN, "unity")
     return folder
 
 
 @pytest.mark.parametrize("name", SPACES)
-def test_it_is_the_stream(name, network, folder: Path):
+def test_it_is_the_stream(name, network, folder: Path, step_files):
     """It holds in every space, from a fresh start and after a reset."""
     file, space = folder / f"{name}.onnx", SPACES[name]
     if not file.exists():
         export_full(network, file, RUN, name)
     assert full_parity(network, file, PERSON.frames, name) <= TOLERANCE
     positions, rotations = space.positions_out(PERSON.positions), space.rotations_out(PERSON.rotations)
-    poses = wearer.play(Stream(folder / "step.onnx", space=name), positions, rotations)
+    poses = wearer.play(Stream(step_files("mem_mlp"), space=name), positions, rotations)
     full = OnnxStream(file)
     for _ in range(2):
         for index, pose in enumerate(poses):
@@ -63,7 +61,7 @@ def test_it_is_the_stream(name, network, folder: Path):
         full.reset()
 
 
-@pytest.mark.parametrize("name", ["agrol_mlp", "hmd_poser"])
+@pytest.mark.parametrize("name", ["agrol_mlp", "vae_hmd"])
 def test_baselines_have_it_too(name, tmp_path: Path):
     network = tiny.baseline(name, depth=1)
     export_full(network, tmp_path / "full.onnx", RUN, "unity")

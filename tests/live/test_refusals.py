@@ -8,26 +8,19 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-import tiny
 
 from memmlp.common.errors import InputError
-from memmlp.deploy.export import export
 from memmlp.evaluation.ik import LBFGS
 from memmlp.live.stream import Offsets, Stream
-from memmlp.networks.memory import NoMemory
-from memmlp.networks.predictor import RotationOnly
-from memmlp.networks.streaming import streaming
 
 pytestmark = pytest.mark.slow
 
 ONE = ([0, 0, 1.6], np.eye(3))
 
 
-@pytest.fixture(scope="module")
-def file(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("refusals") / "step.onnx"
-    export(streaming(tiny.model(NoMemory)), path, "0123456789abcdef")
-    return path
+@pytest.fixture
+def file(step_files) -> Path:
+    return step_files("no_memory")
 
 
 @pytest.mark.parametrize(
@@ -119,7 +112,6 @@ def test_networks_of_other_programs_are_refused(name, kind, shape, tmp_path):
         Stream(tmp_path / "foreign.onnx")
 
 
-def test_inverse_kinematics_need_a_position_branch(tmp_path):
-    export(tiny.model(NoMemory, RotationOnly), tmp_path / "step.onnx", "0123456789abcdef")
+def test_inverse_kinematics_need_a_position_branch(step_files):
     with pytest.raises(InputError, match="no position branch"):
-        Stream(tmp_path / "step.onnx", ik=LBFGS())
+        Stream(step_files("rotation_only"), ik=LBFGS())

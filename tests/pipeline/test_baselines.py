@@ -13,7 +13,7 @@ NAMES = list(tiny.BASELINES)
 CLIP = tiny.clip(40)
 SHORT = [
     "profile=tiny",
-    "data.synth.minutes=0.2",
+    "data.synth.minutes=0.1",
     "tracking=none",
     "threads=1",
     "optim.steps=2",
@@ -23,8 +23,9 @@ SHORT = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_one_command_trains_evaluates_and_finds_it_again(name, memmlp):
-    """What is exported of each is compared in tests/networks/baselines and tests/live."""
+def test_one_command_trains_evaluates_and_finds_it_again(name, memmlp, monkeypatch):
+    """What is exported of each is compared in tests/deploy and tests/live; a picture is drawn below."""
+    monkeypatch.setattr("memmlp.pipeline.run_stages.picture", lambda model, test, path: None)
     ran = memmlp("train", f"model={name}", *SHORT, "export.graph=off")
     assert ran.code == 0, ran.err
     (run,) = list_runs(Path("outputs"))
@@ -42,5 +43,6 @@ def test_one_command_exports_it(memmlp):
     (run,) = list_runs(Path("outputs"))
     assert run.results["latency"]["onnx_parity"] <= TOLERANCE
     assert run.results["latency"]["macs"] > 0
+    assert run.picture.stat().st_size > 0
     loaded = build_experiment(config_of(run)).architecture.load(run.model)
     assert parity(loaded, run.onnx, CLIP) <= TOLERANCE
