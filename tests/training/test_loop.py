@@ -132,7 +132,7 @@ def trained(**changes) -> torch.Tensor:
     [
         {"batch": 5}, {"lr": 2e-3}, {"final_lr": 5e-4}, {"schedule": "step", "drop_at": 0.5},
         {"weight_decay": 0.5}, {"betas": (0.5, 0.9)}, {"decoupled": False, "weight_decay": 0.5},
-        {"clip_norm": 1e-9}, {"precision": "bf16"},
+        {"clip_norm": 1e-9}, {"precision": "bf16"}, {"warmup": 3}, {"ema": 0.1},
     ],
     ids=str,
 )  # fmt: skip
