@@ -60,7 +60,11 @@ def stances(positions: np.ndarray, side: str, part: str) -> list[np.ndarray]:
 
 
 def poses_of(paths: list[Path]) -> list[bytes]:
-    return [np.load(path)["poses"].tobytes() + np.load(path)["trans"].tobytes() for path in paths]
+    found = []
+    for path in paths:
+        with np.load(path) as file:
+            found.append(file["poses"].tobytes() + file["trans"].tobytes())
+    return found
 
 
 def test_a_seed_gives_the_same_bytes_and_another_gives_others(tmp_path):

@@ -85,7 +85,8 @@ def test_eval_repeats_the_runs_numbers_and_saves_predictions(home):
     for branch, values in again["mean"]["stream"].items():
         assert values == pytest.approx(first.results["stream"][branch], rel=1e-4)
     row = again["clips"][0]
-    arrays = np.load(home / "predictions" / "stream" / f"{row['name']}.npz", allow_pickle=False)
+    with np.load(home / "predictions" / "stream" / f"{row['name']}.npz", allow_pickle=False) as file:
+        arrays = dict(file)
     assert arrays["predicted_positions"].shape == (row["frames"], 22, 3)
     assert arrays["predicted_rotations"].shape == (row["frames"], 22, 3, 3)
     error = 100 * np.linalg.norm(arrays["predicted_positions"] - arrays["true_positions"], axis=-1).mean()
