@@ -143,6 +143,12 @@ def step_files(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path
 
 
 @pytest.fixture
+def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs in this process draw no picture, a third of a tiny evaluation; tests/pipeline looks at some."""
+    monkeypatch.setattr("memmlp.pipeline.run_stages.picture", lambda model, test, path: None)
+
+
+@pytest.fixture
 def home(tiny_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the folder with one finished run, for one test."""
     return Path(shutil.copytree(tiny_home, tmp_path_factory.mktemp("home") / "home"))

@@ -18,6 +18,7 @@ OWN = [f"plugins=[{PACKAGE}]", "experiment=feet"]
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:unclosed file .*DEBUG:ResourceWarning")  # submitit leaves its logs open
 def test_components_of_ones_own_go_through_everything(
     on_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -44,10 +45,10 @@ def test_components_of_ones_own_go_through_everything(
     run(home, "export", made.id, "--out", "step.onnx", "--plugins", PACKAGE)
     assert (home / "step.onnx").exists()
 
-    # swept, shown in a table and a page: one arm is the run that there is
+    # swept in this process, shown in a table and a page: one arm is the run that there is
     sweep = shutil.copy(EXAMPLE / "feet.yaml", home)
     quick = [sweep, *KILLED, "export.graph=off"]
-    shown = run_apart(home, "sweep", *quick, "--workers", "1")
+    shown = run(home, "sweep", *quick, "executor=debug")
     assert "2 of 2 runs done" in shown
     assert len(list_runs(home / "outputs")) == 2
     table = json.loads(run(home, "table", *quick, "--format", "json"))
@@ -55,7 +56,7 @@ def test_components_of_ones_own_go_through_everything(
     run(home, "report", *quick, "--out", "page.html")
     assert "FootSkate" in (home / "page.html").read_text()
 
-    # searched: by its metric, over the weight of its term
+    # searched by workers: by its metric, over the weight of its term
     space = "+search.space.term.weight={low: 0.01, high: 1.0, log: true}"
     search = ["search.objectives=[FootSkate]", space, "search.n_trials=1"]
     tuned = run_apart(home, "tune", *OWN, *TINY, "optim.steps=20", *search, "--workers", "1")

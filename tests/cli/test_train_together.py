@@ -19,20 +19,16 @@ ROOT = Path(__file__).parent.parent.parent
 
 
 @pytest.mark.slow
-def test_two_processes_make_the_run_of_one(tmp_path: Path):
+def test_two_processes_make_the_run_of_one(tiny_home: Path, tmp_path: Path):
     """Its VQ-VAE and its network; the first process alone writes, evaluates and deploys."""
-    alone, together = tmp_path / "alone", tmp_path / "together"
-    alone.mkdir()
-    together.mkdir()
-    run(alone, "train", *TINY)
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-    ran = finished([*TORCHRUN, "-m", "memmlp", "train", *TINY], cwd=together, env=environment)
+    ran = finished([*TORCHRUN, "-m", "memmlp", "train", *TINY], cwd=tmp_path, env=environment)
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert ran.stdout.count("MPJPE") == 1
-    runs = {run.id: run for run in list_runs(together / "outputs")}
-    assert runs.keys() == {run.id for run in list_runs(alone / "outputs")}
-    for one in list_runs(alone / "outputs"):
+    runs = {run.id: run for run in list_runs(tmp_path / "outputs")}
+    assert runs.keys() == {run.id for run in list_runs(tiny_home / "outputs")}
+    for one in list_runs(tiny_home / "outputs"):
         other = runs[one.id]
         assert (one.manifest["processes"], other.manifest["processes"]) == (1, 2)
         assert [m.step for m in one.metrics()] == [m.step for m in other.metrics()]

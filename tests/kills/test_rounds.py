@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from command_line import MAIN, TINY, run, run_apart
+from command_line import MAIN, TINY, run
 from processes import started, until
 
 from memmlp.runs.lookup import list_runs
@@ -24,7 +24,8 @@ WORDS = ["sweep", "trial.yaml", *TINY, *SETTINGS]
 
 
 @pytest.mark.slow
-def test_rounds_go_on_after_a_kill(tmp_path: Path):
+@pytest.mark.filterwarnings("ignore:unclosed file .*DEBUG:ResourceWarning")  # submitit leaves its logs open
+def test_rounds_go_on_after_a_kill(tmp_path: Path, no_picture: None):
     """Of two arms that hardly differ, which three seeds show."""
     hardly = ["memory=none", "optim.weight_decay=1.001e-4"]
     content = {"metrics": ["MPJPE"], "arms": {"one": ["memory=none"], "other": hardly}}
@@ -35,7 +36,7 @@ def test_rounds_go_on_after_a_kill(tmp_path: Path):
             lambda: any(one.done for one in list_runs(tmp_path / "outputs")), "the first run is done", killed
         )
     assert not list(tmp_path.glob("outputs/sweeps/*/rounds.json"))
-    said = run_apart(tmp_path, *WORDS, "--until-decided")
+    said = run(tmp_path, *WORDS, "--until-decided")
     assert "all verdicts are decided" in said
     runs = list_runs(tmp_path / "outputs")
     assert len(runs) == 6

@@ -23,9 +23,8 @@ SHORT = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_one_command_trains_evaluates_and_finds_it_again(name, memmlp, monkeypatch):
+def test_one_command_trains_evaluates_and_finds_it_again(name, memmlp, no_picture):
     """What is exported of each is compared in tests/deploy and tests/live; a picture is drawn below."""
-    monkeypatch.setattr("memmlp.pipeline.run_stages.picture", lambda model, test, path: None)
     ran = memmlp("train", f"model={name}", *SHORT, "export.graph=off")
     assert ran.code == 0, ran.err
     (run,) = list_runs(Path("outputs"))

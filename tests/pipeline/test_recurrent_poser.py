@@ -8,7 +8,7 @@ from memmlp.runs.lookup import list_runs
 
 SHORT = [
     "profile=tiny",
-    "data.synth.minutes=0.2",
+    "data.synth.minutes=0.1",
     "tracking=none",
     "threads=1",
     "optim.steps=2",
@@ -17,7 +17,7 @@ SHORT = [
 
 
 @pytest.mark.slow
-def test_one_command_trains_and_evaluates_it_and_a_mirror_makes_another_run(memmlp):
+def test_one_command_trains_and_evaluates_it_and_a_mirror_makes_another_run(memmlp, no_picture):
     ran = memmlp("train", "model=recurrent_poser", *SHORT)
     assert ran.code == 0, ran.err
     (plain,) = list_runs(Path("outputs"))

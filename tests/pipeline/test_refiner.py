@@ -17,13 +17,13 @@ from memmlp.pipeline.together import run_together
 from memmlp.runs.lookup import list_runs
 
 SHORT = [
-    "profile=tiny", "data.synth.minutes=0.2", "tracking=none", "threads=1", "optim.steps=2",
+    "profile=tiny", "data.synth.minutes=0.1", "tracking=none", "threads=1", "optim.steps=2",
     "export.graph=off", "model=vae_hmd",
 ]  # fmt: skip
 
 
 @pytest.mark.slow
-def test_one_command_trains_the_network_and_then_its_refiner(memmlp):
+def test_one_command_trains_the_network_and_then_its_refiner(memmlp, no_picture):
     assert memmlp("train", *SHORT, "evaluation.modes=[stream]").code == 0
     (bare,) = list_runs(Path("outputs"))
     weights = bare.model.read_bytes()
