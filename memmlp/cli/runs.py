@@ -31,8 +31,10 @@ SHOWN = {
     "ms": "latency.median_ms",
 }
 LEGEND = f"MPJPE [{UNITS['MPJPE']}], Jitter [{UNITS['Jitter']}]: rotation branch. ms: a frame on one core."
-SPARED = ("ms", "age", "kind", "Jitter", "MPJPE\nwindow")  # what a narrow screen has no room for, first
+SPARED = ("ms", "age", "Jitter", "MPJPE\nwindow")  # what a narrow screen has no room for, first
 FOLD = 12  # characters of a value in a line, where it can be broken
+NAME = 36  # characters of a run's name in a line
+LONGEST = 3 * FOLD  # characters of a value that nobody asked for
 
 
 @click.group("runs")
@@ -41,7 +43,7 @@ def runs() -> None:
 
 
 @runs.command("list")
-@click.option("--all", "every", is_flag=True, help=f"List all runs, and not only the newest {NEWEST}.")
+@click.option("--all", "every", is_flag=True, help=f"List all: VQ-VAEs too, and more than {NEWEST}.")
 @click.option(
     "--where", help="List the runs that fulfil a condition, such as 'memory=gru and stream.MPJPE<6.3'."
 )
@@ -51,21 +53,22 @@ def runs() -> None:
 def list_command(
     every: bool, where: str | None, sort: str | None, columns: str | None, outputs: Path
 ) -> None:
-    """List the runs, the newest first.
+    """List the runs, the newest first, without the finished ones of VQ-VAEs.
 
-    Shown are what differs between their configs, the MPJPE of the rotation branch in both modes, Jitter, and
-    the latency of a frame. Keys are those of the config (`memory`, `optim.lr`), results (`stream.MPJPE`,
-    `window.position.Jitter`, `latency.median_ms`), and `id`, `kind`, `status`, `name`, `started`, `tag`,
-    `note`.
+    Shown are their names and data, what differs between their configs, the MPJPE of the rotation branch in
+    both modes, Jitter, and the latency of a frame. Keys are those of the config (`memory`, `optim.lr`),
+    results (`stream.MPJPE`, `window.position.Jitter`, `latency.median_ms`), and `id`, `kind`, `status`,
+    `name`, `data`, `started`, `tag`, `note`.
     """
     from memmlp.runs.lookup import list_runs
     from memmlp.runs.query import parse
 
     query = parse(where) if where else None
-    found = list_runs(outputs)
-    if not found:
+    there = list_runs(outputs)
+    if not there:
         click.echo(f"no runs in {outputs / 'runs'}; memmlp demo makes the first")
         return
+    found = there if every or query else [run for run in there if not is_finished_vqvae(run)]
     limit = len(found) if every or query or sort else NEWEST
     records = {run.id: recorded(run) for run in found[:limit]}
     fits = query.of(list(records.values())) if query else [True] * len(records)
@@ -76,10 +79,17 @@ def list_command(
     hidden = show_runs([{**records[run.id], "age": _age(run)} for run in listed], keys, bool(columns))
     if hidden:
         click.echo(f"they differ in {', '.join(hidden)}, too: --columns shows it")
+    if vqvaes := len(there) - len(found):
+        click.echo(f"{vqvaes} finished VQ-VAE{'s' if vqvaes > 1 else ''}: memmlp runs list --all")
     if len(found) > limit:
         click.echo(f"{len(found) - limit} older ones: memmlp runs list --all")
     elif query:
         click.echo(f"{len(listed)} of {len(found)} runs")
+
+
+def is_finished_vqvae(run: Run) -> bool:
+    """Whether it is a finished run of a VQ-VAE, which has none of the results that are listed."""
+    return run.manifest.get("kind") == "vqvae" and run.done
 
 
 def recorded(run: Run) -> Record:
@@ -118,7 +128,7 @@ def wanted(columns: str | None, records: Mapping[str, Record], listed: Sequence[
             check_key(key, records.values(), "--columns")
         return keys
     networks = [run for run in listed if records[run.id].get("kind") == "memmlp"]
-    data = [str(records[run.id].get("data")) for run in networks]
+    data = [str(records[run.id].get("data_digest")) for run in networks]
     return differing([run.config for run in networks], data) if len(networks) > 1 else []
 
 
@@ -145,7 +155,8 @@ def show_runs(records: Sequence[Record], keys: Sequence[str], asked: bool) -> li
         asked: whether these were asked for, so that they are shown whatever room there is, without results.
     """
     columns = list(_columns(records, keys, {} if asked else SHOWN))
-    spare = [name for name in SPARED if name not in keys] + ([] if asked else list(reversed(keys[1:])))
+    spare = [name for name in SPARED if name not in keys]
+    spare += [] if asked else [*reversed(keys[1:]), "name"]
     while spare and _width(columns) > _console().width:
         columns = [column for column in columns if column.name != spare[0]]
         del spare[0]
@@ -156,24 +167,39 @@ def show_runs(records: Sequence[Record], keys: Sequence[str], asked: bool) -> li
 
 def _columns(records: Sequence[Record], keys: Sequence[str], numbers: Mapping[str, str]) -> Iterator[Column]:
     """Yield all columns, with the values of some keys, and with some numbers under heads of ours."""
-    from memmlp.runs.query import shown
+    from memmlp.runs.query import data_labels
 
     yield Column("run", [one["id"] for one in records])
-    for key in ("kind", "status", "age"):
+    for key in ("status", "age"):
         if key not in keys:
             yield Column(key, [str(one.get(key) or "-") for one in records])
+    labels = data_labels(records)
+    if numbers:  # the columns that nobody asked for
+        yield Column("name", [_folded(str(one.get("name") or "-"), NAME) for one in records])
+        if len(set(labels) - {"-"}) > 1:
+            yield Column("data", labels)
     for key in keys:
-        yield Column(key, [_folded(shown(one[key])) if key in one else "-" for one in records])
+        values = labels if key == "data" else [_value(one, key, whole=not numbers) for one in records]
+        yield Column(key, [_folded(value) for value in values])
     if any(one.get("tag") for one in records):
         yield Column("tags", ["\n".join(one.get("tag", ())) for one in records])
     for name, key in numbers.items():
         yield Column(name, [_cell(one.get(key)) for one in records], number=True)
 
 
+def _value(record: Record, key: str, whole: bool) -> str:
+    """Return a record's value as text, of a long one its beginning unless the whole is wanted."""
+    from memmlp.runs.query import shown
+
+    text = shown(record[key]) if key in record else "-"
+    return text if whole or len(text) <= LONGEST else f"{text[:LONGEST]}…"
+
+
 def _lines(columns: Sequence[Column]) -> Table:
     """Make the table of some columns, whose texts are folded already."""
     table = _table()
-    table.padding, table.caption_justify, table.caption_style = (0, 0), "left", ""
+    table.padding, table.show_edge = (0, 0), False
+    table.caption_justify, table.caption_style = "left", ""
     table.caption = LEGEND if any(column.number for column in columns) else None
     for column in columns:
         table.add_column(_folded(column.name), justify="right" if column.number else "left", no_wrap=True)
@@ -188,11 +214,11 @@ def _width(columns: Sequence[Column]) -> int:
     return console.measure(_lines(columns)).maximum
 
 
-def _folded(text: str) -> str:
-    """Break a text into lines of FOLD characters, between the words of a key and the items of a list."""
+def _folded(text: str, width: int = FOLD) -> str:
+    """Break a text into lines of some characters, between the words of a key and the items of a list."""
     lines = [""]
     for part in re.findall(r"[^.,_/ ]*[.,_/ ]*", text):
-        if lines[-1] and len(lines[-1]) + len(part) > FOLD:
+        if lines[-1] and len(lines[-1]) + len(part.rstrip()) > width:
             lines.append("")
         lines[-1] += part
     return "\n".join(lines)

@@ -26,39 +26,60 @@ ORDER: dict[str, Callable[[Any, Any], bool]] = {
 }  # fmt: skip
 COMPARISONS = ("=", "==", "!=", *ORDER)
 WORDS = ("and", "or", "not")
+SHORT = 8  # digits of a digest that tell data apart
 DEEPEST = 50  # parentheses and "not"s in one another
 
 
 def record(run: Run) -> dict[str, Any]:
     """Return what may be asked of a run, by key.
 
-    These are its id, kind, status, name, started, tag, note and step; the keys of its config, slots also by
-    their name alone (`memory` for `memory.name`); and its results, those of the rotation branch also without
-    the branch (`stream.MPJPE` for `stream.rotation.MPJPE`).
+    These are its id, kind, status, name, started, tag, note and step; its data by name (`data`) and by digest
+    (`data_digest`); the keys of its config, slots also by their name alone (`memory` for `memory.name`); and
+    its results, those of the rotation branch also without the branch (`stream.MPJPE` for
+    `stream.rotation.MPJPE`).
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
     results, flat = flatten(run.results), flatten(config)
     short = {key.replace(".rotation.", "."): value for key, value in results.items()}
     slots = {slot: chosen(config, slot) for slot in SLOTS if slot in config}
-    facts = {name: manifest.get(name) for name in ("kind", "started", "data", "upstream", "user")}
+    facts = {name: manifest.get(name) for name in ("kind", "started", "upstream", "user")}
+    digest = str(manifest.get("data") or "")
+    facts |= {"data": flat.get("data.name") or digest[:SHORT], "data_digest": digest}
     facts |= {"id": run.id, "name": run_name(manifest, flat), "status": run.status}
     facts |= {"tag": notes.tags, "note": notes.note}
     return {**flat, **slots, **short, **results, **facts}
 
 
-def differing(configs: Sequence[Mapping[str, Any]], data: Iterable[str] = ()) -> list[str]:
+def data_labels(records: Sequence[Record]) -> list[str]:
+    """Return for each record the name of its data, with a short digest where two data have that name.
+
+    A record without a name of its data, as a VQ-VAE's, has the name that another one gives to the same data.
+    """
+    digests = [str(one.get("data_digest") or "") for one in records]
+    named = {
+        digest: one["data.name"] for digest, one in zip(digests, records, strict=True) if "data.name" in one
+    }
+    known = [named.get(digest) for digest in digests]
+    several = {name for name in known if len({d for d, own in named.items() if own == name}) > 1}
+    return [
+        " ".join(filter(None, (name, digest[:SHORT] if name is None or name in several else ""))) or "-"
+        for name, digest in zip(known, digests, strict=True)
+    ]
+
+
+def differing(configs: Sequence[Mapping[str, Any]], data: Sequence[str] = ()) -> list[str]:
     """Return the config keys that change a result and differ among these configs.
 
-    Where the option in a slot differs, its name stands for its keys that the others don't have.
+    Where the option in a slot differs, its name stands for its keys that the others don't have. Of the data
+    the keys count in which two data of one name differ; data of several names are told apart by these.
 
     Args:
         configs: the configs.
-        data: the digests of their data; the keys of the data count only where these differ.
+        data: the digests of their data.
     """
     flats = [flatten(config) for config in configs]
     counting = {key for config in configs for key in (*trained_by(config), *_later(config))}
-    if len(set(data)) > 1:
-        counting |= {key for flat in flats for key in flat if key.startswith("data.")}
+    counting |= _of_data(flats, data)
     names = [key for key in dict.fromkeys(key for flat in flats for key in flat) if key in counting]
     different = [key for key in names if len({repr(flat.get(key)) for flat in flats}) > 1]
     changed = {key.removesuffix(".name") for key in different if key.endswith(".name")}
@@ -68,6 +89,19 @@ def differing(configs: Sequence[Mapping[str, Any]], data: Iterable[str] = ()) ->
         if key.endswith(".name")
         or not (key.split(".")[0] in changed and any(key not in flat for flat in flats))
     ]
+
+
+def _of_data(flats: Sequence[Mapping[str, Any]], digests: Sequence[str]) -> set[str]:
+    """The keys of the data that differ between data of one name."""
+    named: dict[Any, dict[str, Mapping[str, Any]]] = {}
+    for flat, digest in zip(flats, digests, strict=False):
+        named.setdefault(flat.get("data.name"), {}).setdefault(digest, flat)
+    return {
+        key
+        for several in named.values()
+        for key in set().union(*several.values())
+        if key.startswith("data.") and len({repr(flat.get(key)) for flat in several.values()}) > 1
+    }
 
 
 def _later(config: Mapping[str, Any]) -> list[str]:
@@ -94,7 +128,7 @@ def check_key(key: str, records: Iterable[Record], option: str) -> None:
         hint = f"did you mean {near[0]}? " if near else ""
         raise InputError(
             f"{option}: no run has the key '{key}'; {hint}allowed are keys of the config (memory, optim.lr), "
-            "results (stream.MPJPE), id, kind, status, name, started, tag and note"
+            "results (stream.MPJPE), id, kind, status, name, data, started, tag and note"
         )
 
 

@@ -46,18 +46,58 @@ def test_list_lines_up(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.Monkey
     ran = memmlp("runs", "list")
     assert lines_up(ran, width)
     rows = {line.split()[0]: line.split() for line in ran.out.splitlines() if line.strip()[:1] in set("abc")}
-    assert rows[A][1:3] == ["memmlp", "done"]
+    assert rows[A][1] == "done"
     assert rows[A][-4:] == ["6.51", "7.00", "-", "1.50"]
-    assert rows[C][2] == "stopped"
+    assert rows[C][1] == "stopped"
     assert rows[C][-4:] == ["-"] * 4
 
 
 def test_list_names_the_older_ones(memmlp: Memmlp, outputs: Path):
     for i in range(25):
         Run.of(outputs, f"{i:016x}").begin("vqvae", {}, data="d", upstream=None)
-    assert memmlp("runs", "list").out.count("vqvae") < 25
+    assert memmlp("runs", "list").out.count("VQ-VAE") < 25
     assert "8 older ones" in memmlp("runs", "list").out
-    assert memmlp("runs", "list", "--all").out.count("vqvae") == 25
+    assert memmlp("runs", "list", "--all").out.count("VQ-VAE") == 25
+
+
+def test_finished_vqvaes_are_counted_and_listed_where_asked_for(memmlp: Memmlp, outputs: Path):
+    run = Run.of(outputs, "d" * 16)
+    run.begin("vqvae", {}, data="d" * 64, upstream=None)
+    assert "VQ-VAE" in memmlp("runs", "list").out
+    run.finish([])
+    said = memmlp("runs", "list").out
+    assert run.id not in said
+    assert "1 finished VQ-VAE: memmlp runs list --all\n" in said
+    assert run.id in memmlp("runs", "list", "--all").out
+    assert run.id in memmlp("runs", "list", "--where", "kind=vqvae").out
+
+
+def test_runs_of_two_data_sets_fit_a_terminal(
+    memmlp: Memmlp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    groups = [f"subject{i}/.*" for i in range(15)]
+    for letter, name, memory in (("a", "synth", "vq"), ("b", "synth", "none"), ("c", "mocap", "vq")):
+        data = {"name": name, "split": {"groups": groups if name == "mocap" else []}}
+        config = {"data": data, "memory": {"name": memory}, "seed": 0}
+        digest = "e" * 64 if name == "mocap" else "f" * 64
+        run = Run.of(tmp_path / "outputs", letter * 16)
+        words = " · ".join(["profile=tiny", f"memory={memory}", "seed 0"])
+        run.begin("memmlp", config, data=digest, upstream=None, name=words)
+    monkeypatch.setenv("COLUMNS", "80")
+    ran = memmlp("runs", "list")
+    assert lines_up(ran, 80)
+    assert heads(ran.out) >= {"run", "name", "data", "memory"}
+    rows = {line[0]: line.split() for line in ran.out.splitlines() if line[:1] in set("abc")}
+    assert rows["b"][2:9] == ["profile=tiny", "·", "memory=none", "·", "seed", "0", "synth"]
+    assert rows["c"][8:10] == ["mocap", "vq"]
+    assert "too: --columns" not in ran.out
+    assert "subject14" in memmlp("runs", "list", "--columns", "data.split.groups").out
+
+
+def test_a_long_value_that_nobody_asked_for_is_cut(memmlp: Memmlp, outputs: Path):
+    Run.of(outputs, A).begin("memmlp", {"seed": "x," * 40}, data="d" * 64, upstream=None)
+    assert "…" in memmlp("runs", "list").out
+    assert "…" not in memmlp("runs", "list", "--columns", "seed").out
 
 
 def test_an_empty_list_says_where_it_looked(memmlp: Memmlp):
@@ -117,19 +157,9 @@ def test_list_shows_what_differs_as_far_as_there_is_room(
         seen[width] = memmlp("runs", "list").out
     assert heads(seen["40"]) == {"run", "status", "seed", "MPJPE", "stream"}
     assert "differ in memory.layers, too: --columns shows it" in seen["40"]
-    assert heads(seen["70"]) == {
-        "run",
-        "status",
-        "seed",
-        "memory.",
-        "layers",
-        "MPJPE",
-        "stream",
-        "window",
-        "Jitter",
-    }
+    assert heads(seen["70"]) == {"run", "status", "name", "seed", "memory.", "layers", "MPJPE", "stream"}
     assert "too:" not in seen["70"]
-    assert heads(seen["120"]) == heads(seen["70"]) | {"kind", "age", "ms"}
+    assert heads(seen["120"]) == heads(seen["70"]) | {"window", "Jitter", "age", "ms"}
     assert "MPJPE [cm]" in seen["120"]
 
 

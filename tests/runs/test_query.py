@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.runs.notes import add_tags
-from memmlp.runs.query import differing, parse, record
+from memmlp.runs.query import data_labels, differing, parse, record
 
 ONE = {
     "memory": "gru", "seed": 1, "optim.lr": 1e-3, "memory.layers": [2, 4], "stream.MPJPE": 6.25,
@@ -101,3 +101,27 @@ def test_the_data_differs_where_its_digest_does():
     first, second = ({"data": {"root": root, "weighting": "frames"}} for root in ("here", "/x/here"))
     assert differing([first, second], ["d", "d"]) == []
     assert differing([first, second], ["d", "e"]) == ["data.root"]
+
+
+def test_data_of_several_names_are_told_apart_by_these():
+    data = [{"name": "synth", "seed": 1}, {"name": "mocap", "root": "x"}, {"name": "mocap", "root": "y"}]
+    configs: list[dict[str, Any]] = [{"seed": i, "data": one} for i, one in enumerate(data)]
+    assert differing(configs[:2], "de") == ["seed"]
+    assert differing(configs, "def") == ["seed", "data.root"]
+
+
+def test_data_have_a_digest_only_where_two_have_one_name(tmp_path: Path):
+    def one(digest: str, config: dict[str, Any]) -> dict[str, Any]:
+        run = begun(tmp_path / digest / str(len(config)), config)
+        run.write_manifest({"data": digest})
+        return record(run)
+
+    synth, mocap, other = (
+        one(digit * 64, {"data": {"name": name}})
+        for digit, name in [("a", "synth"), ("b", "mocap"), ("c", "mocap")]
+    )
+    vqvae, unknown = one("a" * 64, {}), one("d" * 64, {})
+    assert data_labels([synth, vqvae, mocap]) == ["synth", "synth", "mocap"]
+    assert data_labels([synth, mocap, other]) == ["synth", "mocap bbbbbbbb", "mocap cccccccc"]
+    assert data_labels([unknown]) == ["dddddddd"]
+    assert parse("data=synth").of([synth, mocap]) == [True, False]
