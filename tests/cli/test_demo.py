@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import pytest
 from command_line import TINY
+
+from memmlp.cli.demo import next_steps, unentered
 
 
 @pytest.mark.slow
@@ -13,3 +18,26 @@ def test_each_stage_has_a_line_without_a_terminal(memmlp):
     stages = [line.partition(":")[0] for line in ran.err.splitlines()]
     assert stages == ["data", "VQ-VAE", "network", "evaluation", "deployment"]
     assert "the demo took" in ran.out
+
+
+def test_what_comes_next_repeats_the_words_of_the_demo():
+    first, imported, own = next_steps(["profile=tiny", "seed=1"]).splitlines()
+    assert first.startswith("next: memmlp train profile=tiny seed=1 memory=none ")
+    assert "memmlp data import" in imported
+    assert own.split() == ["memmlp", "train", "profile=tiny", "data=mocap", "data.root=outputs/data/mine"]
+
+
+def test_an_environment_that_was_not_entered_is_entered_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    folder = tmp_path / ".venv"
+    (folder / "bin").mkdir(parents=True)
+    for name in ("activate", "memmlp"):
+        (folder / "bin" / name).touch(mode=0o755)
+    monkeypatch.setattr(sys, "prefix", str(folder))
+    monkeypatch.setenv("PATH", "")
+    found = unentered()
+    assert found == folder
+    assert next_steps([], found).startswith(f"next: source {folder}/bin/activate\n")
+    monkeypatch.setenv("PATH", str(folder / "bin"))
+    assert unentered() is None
