@@ -238,19 +238,61 @@ def show_command(run: str, config: bool, outputs: Path) -> None:
     from memmlp.tables.measured_run import load
 
     found = find_run(outputs, run)
-    changed = ", ".join(found.verify())
-    facts = {"run": found.id, "folder": found.folder, "status": found.status} | flatten(found.manifest)
-    if changed:
-        facts["changed since"] = changed
-    facts.pop("id", None)
-    _console().print(_pairs(facts))
-    if found.results:
-        _console().print(_pairs(flatten(found.results), title="results"))
+    _console().print(_pairs(_summary(found)))
     if is_trained(found):
         for source, measured in load(found.folder).by_source().items():
             _console().print(_pairs(flatten(measured.means), title=f"results on {source}"))
+    if found.results:
+        _console().print(_pairs(measured_numbers(found.results), title="results"))
+    _console().print(_pairs(_origin(found), title="made by"))
     if config and found.config:
         _console().print(_pairs(flatten(found.config), title="config"))
+
+
+SUMMARY = ("kind", "started", "finished")
+LEFT_OUT = ("id", "name", "what", "data", "upstream", "sources", "attempts", *SUMMARY)
+
+
+def _summary(run: Run) -> dict[str, Any]:
+    """Return what a run is and how it went, in words."""
+    one, manifest = recorded(run), run.manifest
+    facts = {"run": run.id, "name": one.get("name"), "folder": run.folder, "status": run.status}
+    facts |= {key: manifest[key] for key in SUMMARY if key in manifest}
+    facts["data"] = " ".join(dict.fromkeys([str(one.get("data", "-")), str(one.get("data_digest", ""))[:8]]))
+    if above := manifest.get("upstream"):
+        facts["VQ-VAE" if one.get("kind") == "memmlp" else "builds upon"] = above
+    attempts = [f"{one['stage']} from step {one['step']}, {one['started']}" for one in _attempts(manifest)]
+    if attempts:
+        facts["worked on"] = "\n".join(attempts)
+    if changed := run.verify():
+        facts["changed since"] = ", ".join(changed)
+    return facts
+
+
+def _attempts(manifest: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the stages that processes began, of those records that tell all about it."""
+    return [one for one in manifest.get("attempts", []) if {"stage", "step", "started"} <= one.keys()]
+
+
+def _origin(run: Run) -> dict[str, Any]:
+    """Return of what code and on which machine a run was made, the numbers of recipes last."""
+    from memmlp.runs.identity import flatten
+
+    facts = {key: value for key, value in run.manifest.items() if key not in LEFT_OUT}
+    recipes = facts.pop("recipes", {})
+    return flatten(facts | {"recipes": recipes})
+
+
+def measured_numbers(results: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the numbers among results by dotted key, which may hold settings and digests, too."""
+    from memmlp.runs.identity import flatten
+
+    numbers = {key: value for key, value in flatten(results).items() if isinstance(value, int | float)}
+    return {
+        key: value
+        for key, value in numbers.items()
+        if not key.startswith(("latency.settings", "latency.made"))
+    }
 
 
 @runs.command("diff")
@@ -260,20 +302,80 @@ def show_command(run: str, config: bool, outputs: Path) -> None:
 def diff_command(a: str, b: str, outputs: Path) -> None:
     """Show in what two runs differ.
 
-    Their configs and results are compared.
+    Compared are the keys of their configs that change a result, their data, what was measured, and code and
+    machine. The difference is how much more B has than A.
     """
-    from memmlp.runs.lookup import diff, find_run
+    from memmlp.runs.lookup import find_run
 
     first, second = find_run(outputs, a), find_run(outputs, b)
-    differences = diff(first, second)
-    for title, pairs in (("config", differences.config), ("results", differences.results)):
-        if not pairs:
+    for title, rows in (("config", config_rows(first, second)), ("results", result_rows(first, second))):
+        if not rows:
             click.echo(f"{title}: no difference")
             continue
-        table = _table(title, first.id, second.id)
-        for key, values in pairs.items():
-            table.add_row(key, *map(_text, values))
+        table = _table(title, first.id, second.id, *(["B - A", "unit"] if title == "results" else []))
+        table.columns[0].no_wrap = True
+        for row in rows:
+            table.add_row(*row)
         _console().print(table)
+    if rows := origin_rows(first, second):
+        table = _table("made by", first.id, second.id)
+        for row in rows:
+            table.add_row(*row)
+        _console().print(table)
+
+
+ORIGIN = (
+    "device",
+    "gpu",
+    "threads",
+    "processes",
+    "precision",
+    "version",
+    "git",
+    "python",
+    "packages",
+    "recipes",
+)
+
+
+def origin_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
+    """Return a row for all in code and machine that differs, and may change numbers beside the config."""
+    from memmlp.runs.identity import flatten
+
+    a, b = (flatten({key: run.manifest.get(key) for key in ORIGIN}) for run in (first, second))
+    used = {key for key in a | b if not key.startswith("recipes.") or (key in a and key in b)}
+    return [
+        (key, _text(a.get(key)), _text(b.get(key)))
+        for key in a | b
+        if key in used and a.get(key) != b.get(key)
+    ]
+
+
+def config_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
+    """Return a row for each key of the config, or the data, that changes a result and differs."""
+    from memmlp.runs.query import data_labels, differing
+
+    pair = [recorded(run) for run in (first, second)]
+    digests = [str(one.get("data_digest")) for one in pair]
+    keys = differing([run.config for run in (first, second)], digests)
+    rows = [(key, *(_value(one, key, whole=False) for one in pair)) for key in keys]
+    return rows if len(set(digests)) == 1 else [("data", *data_labels(pair)), *rows]
+
+
+def result_rows(first: Run, second: Run) -> list[tuple[str, ...]]:
+    """Return a row for each measured number that differs: its key, both values, B - A, and its unit."""
+    a, b = measured_numbers(first.results), measured_numbers(second.results)
+    keys = [key for key in a | b if a.get(key) != b.get(key)]
+    return [
+        (
+            key,
+            _text(a.get(key)),
+            _text(b.get(key)),
+            f"{b[key] - a[key]:+.4g}" if key in a and key in b else "-",
+            UNITS.get(key.rpartition(".")[2], "ms" if key.endswith("_ms") else ""),
+        )
+        for key in keys
+    ]
 
 
 @runs.command("tag")

@@ -44,11 +44,16 @@ def show_latency(console: Console, measured: Mapping[str, Any]) -> None:
         f"({measured['ratio_to_yardstick']:.2f} x the yardstick)",
         soft_wrap=True,
     )
-    console.print(
-        f"{measured['parameters'] / 1e6:.2f} M parameters "
-        f"({measured['parameters_with_vqvae'] / 1e6:.2f} M with the frozen VQ-VAE), "
-        f"{measured['macs'] / 1e6:.0f} MMAC a frame, ONNX {measured['onnx_bytes'] / 1e6:.1f} MB",
-        soft_wrap=True,
+    console.print(size(measured), soft_wrap=True)
+
+
+def size(measured: Mapping[str, Any]) -> str:
+    """Say how large the network is, and with the frozen VQ-VAE where it has one."""
+    own, whole = measured["parameters"], measured["parameters_with_vqvae"]
+    frozen = f" ({whole / 1e6:.2f} M with the frozen VQ-VAE)" if whole != own else ""
+    return (
+        f"{own / 1e6:.2f} M parameters{frozen}, {measured['macs'] / 1e6:.3g} MMAC a frame, "
+        f"ONNX file {measured['onnx_bytes'] / 1e6:.1f} MB, graph included"
     )
 
 

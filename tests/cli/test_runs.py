@@ -129,8 +129,39 @@ def test_diff(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.MonkeyPatch, wi
     ran = memmlp("runs", "diff", "a", "b")
     assert lines_up(ran, width)
     assert ["seed", "0", "1"] in [line.split() for line in ran.out.splitlines()]
-    assert ["stream.rotation.MPJPE", "6.512", "7.512"] in [line.split() for line in ran.out.splitlines()]
+    assert ["stream.rotation.MPJPE", "6.512", "7.512", "+1", "cm"] in [
+        line.split() for line in ran.out.splitlines()
+    ]
     assert "memory.layers" not in ran.out
+
+
+def test_diff_leaves_out_what_changes_no_result(memmlp: Memmlp, outputs: Path):
+    for name, memory, made in ((A, "vq", "today"), (B, "none", "tomorrow")):
+        slot = {"name": memory, "_target_": f"memmlp.{memory}.CodeMemory"}
+        Run.of(outputs, name).begin(
+            "memmlp", {"memory": slot, "threads": len(memory)}, data="d" * 64, upstream=None
+        )
+        latency = {"median_ms": 1.0, "made": made, "settings": {"steps": len(made)}}
+        write_json(Run.of(outputs, name).results_path, {"latency": latency})
+    said = memmlp("runs", "diff", A, B).out
+    assert ["memory", "vq", "none"] in [line.split() for line in said.splitlines()]
+    assert not re.search("_target_|threads|made|settings", said)
+
+
+def test_diff_tells_of_another_recipe_and_device(memmlp: Memmlp, outputs: Path):
+    Run.of(outputs, A).write_manifest({"recipes": {"features": 1, "memory.vq": 1}, "device": "cpu"})
+    Run.of(outputs, B).write_manifest({"recipes": {"features": 2}, "device": "cuda"})
+    rows = [line.split() for line in memmlp("runs", "diff", A, B).out.splitlines()]
+    assert ["recipes.features", "1", "2"] in rows
+    assert ["device", "cpu", "cuda"] in rows
+    assert not [row for row in rows if row[:1] == ["recipes.memory.vq"]]
+
+
+def test_show_says_the_attempts_and_the_results_before_the_code(memmlp: Memmlp, outputs: Path):
+    said = memmlp("runs", "show", A).out
+    assert "training from step 0" in said
+    assert "[{" not in said
+    assert said.index("MPJPE") < said.index("packages.torch")
 
 
 def test_no_difference(memmlp: Memmlp, outputs: Path):
