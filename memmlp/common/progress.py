@@ -16,6 +16,8 @@ T = TypeVar("T")
 
 EVERY = 30.0  # seconds between two lines about how far the same work is
 
+_STAGE: ContextVar[str] = ContextVar("what the work is part of", default="")
+
 _SAY: ContextVar[Callable[[str], None] | None] = ContextVar("what is told of work", default=None)
 
 
@@ -41,6 +43,16 @@ def tell(line: str) -> None:
         say(line)
 
 
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Name what the work in this context is part of, such as a validation, wherever it is counted."""
+    token = _STAGE.set(name)
+    try:
+        yield
+    finally:
+        _STAGE.reset(token)
+
+
 class Count:
     """How much of some work is done.
 
@@ -49,10 +61,11 @@ class Count:
     Args:
         display: what draws the bar.
         row: the bar's row in it.
+        unit: what is counted, such as frames.
     """
 
-    def __init__(self, display: Progress, row: TaskID):
-        self.display, self.row = display, row
+    def __init__(self, display: Progress, row: TaskID, unit: str = ""):
+        self.display, self.row, self.unit = display, row, unit
         self.said = time.monotonic()
 
     def advance(self) -> None:
@@ -68,9 +81,10 @@ class Count:
 
     @property
     def line(self) -> str:
-        """The work so far in a line, such as "Mem-MLP: 400 of 4000, loss 2.31, 6 min left"."""
+        """The work so far in a line, such as "Mem-MLP: 400 of 4000 steps, loss 2.31, 6 min left"."""
         task = self.display.tasks[0]
         far = f"{task.completed:.0f}" + ("" if task.total is None else f" of {task.total:.0f}")
+        far = f"{far} {self.unit}".rstrip()
         left = "" if task.time_remaining is None else f"{duration(task.time_remaining)} left"
         return f"{task.description}: {', '.join(filter(None, (far, task.fields['note'], left)))}"
 
@@ -81,7 +95,9 @@ def duration(seconds: float) -> str:
 
 
 @contextmanager
-def counting(description: str, total: float | None, done: int = 0, shown: bool = True) -> Iterator[Count]:
+def counting(
+    description: str, total: float | None, done: int = 0, shown: bool = True, unit: str = ""
+) -> Iterator[Count]:
     """Show how far some work is: description, bar, count, elapsed time, time left, and a note, on stderr.
 
     Args:
@@ -89,6 +105,7 @@ def counting(description: str, total: float | None, done: int = 0, shown: bool =
         total: how much there is to do; None if that is not known.
         done: how much of it was done before.
         shown: whether this process shows it.
+        unit: what is counted, such as frames.
     """
     from rich import progress  # here, since the help of all commands comes by without it
     from rich.console import Console
@@ -98,6 +115,7 @@ def counting(description: str, total: float | None, done: int = 0, shown: bool =
         progress.TextColumn("{task.description:<12}"),
         progress.BarColumn(bar_width=24),
         progress.MofNCompleteColumn(),
+        *([progress.TextColumn(unit)] if unit else []),
         progress.TimeElapsedColumn(),
         progress.TextColumn("left"),
         progress.TimeRemainingColumn(),
@@ -105,21 +123,25 @@ def counting(description: str, total: float | None, done: int = 0, shown: bool =
         console=console,
         disable=not (shown and console.is_terminal),
     )
+    label = ", ".join(filter(None, (_STAGE.get(), description)))
     with display:
-        yield Count(display, display.add_task(description, total=total, completed=done, note=""))
+        yield Count(display, display.add_task(label, total=total, completed=done, note=""), unit)
 
 
-def progress_bar(items: Iterable[T], description: str, total: int | None = None) -> Iterator[T]:
+def progress_bar(
+    items: Iterable[T], description: str, total: int | None = None, unit: str = ""
+) -> Iterator[T]:
     """Yield the items while a progress bar counts them.
 
     Args:
         items: what to iterate over.
         description: the bar's label.
         total: the number of items, where `items` does not know its length.
+        unit: what the items are, such as frames.
     """
     if total is None and isinstance(items, Sized):
         total = len(items)
-    with counting(description, total) as count:
+    with counting(description, total, unit=unit) as count:
         for item in items:
             yield item
             count.advance()

@@ -76,7 +76,7 @@ def frame_by_frame(network: Evaluable, clips: Sequence[Tensor], size: int) -> li
     motion = inputs.new_zeros(*inputs.shape[:2], POSITION.stop)
     state = network.initial_state(len(clips))
     active = len(clips)
-    for t in progress_bar(range(lengths[0]), "stream"):
+    for t in progress_bar(range(lengths[0]), "stream", unit="frames"):
         while lengths[active - 1] <= t:  # the clips are sorted by length: the last ones end first
             active -= 1
             state = {name: tensor[:active] for name, tensor in state.items()}
@@ -140,7 +140,9 @@ def evaluate(
         row["source"] = source
     for mode in modes:
         motions = predict(network, clips, mode, batch)
-        for row, clip, motion in zip(progress_bar(rows, "measuring"), clips, motions, strict=True):
+        for row, clip, motion in zip(
+            progress_bar(rows, "measuring", unit="clips"), clips, motions, strict=True
+        ):
             row[mode] = clip_report(network.normalizer, motion, clip, ik, own)
     return {"mean": {mode: _mean([row[mode] for row in rows]) for mode in modes}, "clips": rows}
 

@@ -1,26 +1,13 @@
-"""Finding runs below an outputs folder, and comparing two of them."""
+"""Finding runs below an outputs folder."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
-from memmlp.runs.identity import ID, flatten
+from memmlp.runs.identity import ID
 from memmlp.runs.run import Run
-
-
-class Diff(NamedTuple):
-    """What differs between two runs: by dotted key both values, "-" where a run has none.
-
-    Attributes:
-        config: differences of the configs.
-        results: differences of the results.
-    """
-
-    config: dict[str, tuple[Any, Any]]
-    results: dict[str, tuple[Any, Any]]
 
 
 def list_runs(outputs: Path | str) -> list[Run]:
@@ -68,14 +55,3 @@ def _enumerate(names: Iterable[str], most: int = 8) -> str:
     """Join names with commas; of more than `most` only the first are shown."""
     every = list(names)
     return ", ".join(every[:most]) + (", ..." if len(every) > most else "")
-
-
-def diff(a: Run, b: Run) -> Diff:
-    """Compare the configs and results of two runs."""
-    return Diff(_differences(a.config, b.config), _differences(a.results, b.results))
-
-
-def _differences(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    flat_a, flat_b = flatten(a), flatten(b)
-    pairs = {key: (flat_a.get(key, "-"), flat_b.get(key, "-")) for key in flat_a | flat_b}
-    return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}

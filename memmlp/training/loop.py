@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from memmlp.common import parallel
 from memmlp.common.errors import InputError, TrainingDiverged
-from memmlp.common.progress import Count, counting
+from memmlp.common.progress import Count, counting, stage
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks import checkpoint, layers
 from memmlp.runs.run import Run
@@ -102,7 +102,7 @@ def train(
     average = optim.average(task.module, optimiser)
     start = resume(task, optimiser, average, run)
     parallel.align(task.module)
-    with counting(description, optim.steps, start, shown=parallel.first()) as count:
+    with counting(description, optim.steps, start, shown=parallel.first(), unit="steps") as count:
         for step in range(start, optim.steps):
             seed_step(seed, step)
             result = train_step(task, optim, optimiser, step)
@@ -208,7 +208,7 @@ def record(
 def validated(task: TrainingTask, average: Average) -> dict[str, float]:
     """Return the task's validation of the weights that count."""
     task.module.eval()
-    with average.shown():
+    with average.shown(), stage("validation"):
         return task.validate()
 
 

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from memmlp.common import progress
-from memmlp.common.progress import counting, progress_bar, tell, telling, to_log
+from memmlp.common.progress import counting, progress_bar, stage, tell, telling, to_log
 
 
 @pytest.mark.parametrize(("terminal", "said"), [(True, ""), (False, "data: once\n")])
@@ -50,3 +50,13 @@ def test_work_of_unknown_length_tells_what_is_done(monkeypatch: pytest.MonkeyPat
     with telling(told.append):
         list(progress_bar(iter("ab"), "reading"))
     assert told == ["reading: 1", "reading: 2"]
+
+
+def test_a_line_names_the_unit_and_the_stage(monkeypatch: pytest.MonkeyPatch):
+    told: list[str] = []
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    with telling(told.append):
+        with stage("validation"):
+            list(progress_bar(iter("a"), "stream", unit="frames"))
+        list(progress_bar(iter("a"), "stream", unit="frames"))
+    assert told == ["validation, stream: 1 frames", "stream: 1 frames"]

@@ -8,8 +8,7 @@ import pytest
 from begun_runs import CONFIG, begun
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import write_json
-from memmlp.runs.lookup import diff, find_run, list_runs
+from memmlp.runs.lookup import find_run, list_runs
 from memmlp.runs.run import Run
 
 
@@ -49,12 +48,3 @@ def test_an_ambiguous_beginning_lists_the_runs(tmp_path: Path):
         Run.of(tmp_path, name).begin("memmlp", {}, data="d", upstream=None)
     with pytest.raises(InputError, match=r"2 ids begin so: ab0+, ab1+"):
         find_run(tmp_path, "ab")
-
-
-def test_diff_names_what_differs(tmp_path: Path):
-    a, b = begun(tmp_path), begun(tmp_path, CONFIG | {"seed": 1, "extra": True})
-    write_json(a.results_path, {"stream": {"MPJPE": 1.0, "same": 2}})
-    write_json(b.results_path, {"stream": {"MPJPE": 3.0, "same": 2}})
-    found = diff(a, b)
-    assert found.config == {"seed": (0, 1), "extra": ("-", True)}
-    assert found.results == {"stream.MPJPE": (1.0, 3.0)}

@@ -2,18 +2,21 @@
 
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import tiny
 import torch
 from tiny_tasks import OPTIM, ROLLOUTS, TASKS, motion_task, weights
 
+from memmlp.common import progress
 from memmlp.common.errors import InputError, TrainingDiverged
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.motion.dataset import WindowSampler
 from memmlp.networks import checkpoint
 from memmlp.runs.run import Run
+from memmlp.training import loop
 from memmlp.training.loop import train
 from memmlp.training.network import MotionTask
 from memmlp.training.optim import SCHEDULES
@@ -181,3 +184,12 @@ def test_a_checkpoint_survives_a_torn_write_and_refuses_damage(tmp_path):
     path.write_bytes(path.read_bytes()[:20])
     with pytest.raises(InputError, match="not a checkpoint"):
         checkpoint.read(path)
+
+
+def test_what_is_counted_in_a_validation_says_so(monkeypatch: pytest.MonkeyPatch):
+    told: list[str] = []
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    task = mock.MagicMock(validate=lambda: list(progress.progress_bar(iter("a"), "stream", unit="frames")))
+    with progress.telling(told.append):
+        loop.validated(task, mock.MagicMock())
+    assert told == ["validation, stream: 1 frames"]
