@@ -21,6 +21,7 @@ from memmlp.common.files import write_json
 from memmlp.common.progress import tell
 from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
+from memmlp.motion.preparing.manifest import ClipRecord
 from memmlp.motion.preparing.source import Prepared
 from memmlp.pipeline.devices import described
 from memmlp.pipeline.experiment import Experiment
@@ -47,6 +48,15 @@ class Outcome:
     results: dict[str, Any]
 
 
+def of_tests(clips: Sequence[ClipRecord]) -> str:
+    """Say how many test clips in how many groups there are, and where that is too little to conclude from."""
+    tested = [clip.group for clip in clips if clip.split == "test"]
+    counts = f"test clips: {len(tested)}, in groups: {len(set(tested))}"
+    if len(set(tested)) > 1:
+        return counts
+    return f"{counts}, which decides nothing; data.split.test=0.35 tests on more"
+
+
 def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     """Bring the experiment's run to its end, doing only what is missing.
 
@@ -55,7 +65,8 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
         watch: called after each validation with the step and its values; it may raise to stop the run.
     """
     data = experiment.data.prepare()
-    tell(f"data: {len(data.manifest.clips)} clips, prepared in {data.cache}")
+    clips = data.manifest.clips
+    tell(f"data: {len(clips)} clips ({of_tests(clips)}), prepared in {data.cache}")
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     if not run.done:
         experiment.training.optim.check_installed()

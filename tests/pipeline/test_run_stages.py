@@ -23,6 +23,7 @@ from memmlp.config.compose import composed
 from memmlp.config.packaged import packaged
 from memmlp.live.stream import Stream
 from memmlp.motion.dataset import MotionDataset
+from memmlp.pipeline import run_stages
 from memmlp.pipeline.run_stages import shown, vqvae_run
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.recipes import RECIPES
@@ -249,3 +250,14 @@ def test_a_failure_of_the_work_is_kept_with_the_run_and_an_interruption_is_not(
         raise error
     assert (run.failure is None) == (failure is None)
     assert (failure or "") in (run.failure or "")
+
+
+def test_a_single_group_of_test_clips_is_told_to_decide_nothing():
+    def clips(*groups: str) -> list[Any]:
+        return [SimpleNamespace(split="test", group=group) for group in groups]
+
+    train = [SimpleNamespace(split="train", group="c")]
+    assert run_stages.of_tests([*train, *clips("a", "b", "b")]) == "test clips: 3, in groups: 2"
+    assert "in groups: 1, which decides nothing; data.split.test" in run_stages.of_tests(
+        [*train, *clips("a", "a")]
+    )
