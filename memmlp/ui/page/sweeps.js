@@ -1,7 +1,7 @@
 // Sweeps: how far they are, what they found, and curves by arm.
 
 import { h, replace, link, section, empty, choice, select } from './dom.js';
-import { address, alone, ask, place, remember, runs } from './store.js';
+import { address, alone, ask, nameOf, place, remember, runs } from './store.js';
 import { curvePanel } from './compare.js';
 import { forest } from './charts.js';
 import { AT_WORK, look, state, STATE_WORDS } from './runs.js';
@@ -34,7 +34,7 @@ export async function single(name) {
   let sweep = await ask(`sweeps/${name}`);
   const ids = [...new Set(sweep.cells.map(cell => cell.id))].filter(id => runs.has(id));
   const arm = new Map(sweep.cells.map(cell => [cell.id, cell.arm]));
-  const panel = curvePanel(ids, [['arm', 'arm', id => arm.get(id)], ['run', 'run', id => runs.get(id)?.name ?? id]], { most: 2 });
+  const panel = curvePanel(ids, [['arm', 'arm', id => arm.get(id)], ['run', 'run', id => runs.has(id) ? nameOf(runs.get(id)) : id]], { most: 2 });
   const top = h('div');
   const found = h('div');
   const element = h('div', { class: 'page' }, top, found, section('Curves by arm', panel.element), notes());
