@@ -12,12 +12,13 @@ const NARROW = matchMedia('(max-width: 640px)'); // errors come first where litt
 const KINDS = [['memmlp', 'Networks'], ['vqvae', 'VQ-VAEs'], ['', 'All']];
 export const AT_WORK = ['training', 'evaluating', 'exporting'];
 const STATES = [...AT_WORK, 'done', 'failed', 'lost', 'stopped', 'new'];
-export const STATE_WORDS = { lost: 'lost', new: 'waiting', blocked: 'blocked', stopped: 'stopped' };
+export const STATE_WORDS = { lost: 'lost', new: 'waiting', blocked: 'blocked', stopped: 'stopped', trained: 'trained' };
+const STATE_TITLES = { trained: 'Trained; an evaluation or export that this sweep asks for is missing.' };
 
 // How a status looks: whatever somebody does with a run looks alike.
 export const look = status => (AT_WORK.includes(status) ? 'running' : status);
 
-export function state(status, title) {
+export function state(status, title = STATE_TITLES[status]) {
   return h('span', { class: `state ${look(status)}`, title }, STATE_WORDS[status] ?? status);
 }
 
