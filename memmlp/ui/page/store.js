@@ -95,11 +95,14 @@ export function follow() {
   events.onmessage = refresh;
 }
 
+// The page that is shown where the address names none: of a report its tables and figures.
+const first = document.getElementById('extra')?.innerHTML.trim() ? 'extra' : 'runs';
+
 // The address: #/room/name?key=value
 export function place() {
   const [path, query = ''] = location.hash.replace(/^#\/?/, '').split('?');
   const [room = '', ...rest] = path.split('/').map(part => decodeURIComponent(part));
-  return { room: room || 'runs', name: rest.join('/'), query: new URLSearchParams(query) };
+  return { room: room || first, name: rest.join('/'), query: new URLSearchParams(query) };
 }
 
 export function address(room, name = '', query = {}) {
