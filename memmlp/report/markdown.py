@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from jinja2 import Environment, StrictUndefined, TemplateError
@@ -89,12 +89,20 @@ def origin_words(kept: Kept) -> str:
     """Say where the runs come from, and which command makes them again."""
     parts = [f"{len(kept.every)} runs"]
     for attribute, what in ORIGIN.items():
-        values = sorted({str(getattr(run.origin, attribute)) for run in kept.every} - {UNKNOWN})
-        parts += [f"{what} {escaped(' and '.join(values))}"] if values else []
+        values = {str(getattr(run.origin, attribute)) for run in kept.every}
+        # A run that other code went on with has several commits; each of all is named once.
+        values = {one for words in values for one in words.split(", ")} if attribute == "code" else values
+        parts += [f"{what} {escaped(_listed(sorted(values - {UNKNOWN})))}"] if values - {UNKNOWN} else []
     parts += sorted({escaped(run.origin.partial) for run in kept.every if run.origin.partial})
     recipes = _recipes(kept.every)
     parts += [f"recipes {recipes}"] if recipes else []
     return f"`{kept.command}`: {', '.join(parts)}."
+
+
+def _listed(words: Sequence[str]) -> str:
+    """Return words as a list: `a`, `a and b`, `a, b and c`."""
+    *rest, last = words
+    return f"{', '.join(rest)} and {last}" if rest else last
 
 
 def _recipes(runs: Iterable[Measured]) -> str:

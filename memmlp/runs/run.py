@@ -169,7 +169,8 @@ class Run:
     def state(self, complete: bool) -> str:
         """Return how far work on the run is, given whether that work is complete.
 
-        One of: done, running (a process is at it), lost (its process died), failed, stopped, new.
+        One of: done, running (a process is at it), lost (its process died), failed, trained (an evaluation or
+        a deployment that is wanted was not made yet), stopped, new.
         """
         if complete:
             return "done"
@@ -177,6 +178,8 @@ class Run:
             return "running" if held else "lost"
         if self.failure:
             return "failed"
+        if self.done:
+            return "trained"
         return "stopped" if self.manifest_path.exists() else "new"
 
     @property

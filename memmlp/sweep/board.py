@@ -17,8 +17,14 @@ from memmlp.runs.metrics_log import Metrics
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask
 
-COLOURS = {"done": "green", "running": "cyan", "failed": "red", "blocked": "red", "lost": "yellow"}
-WORDS = {"new": "waiting", "stopped": "waiting, begun", "lost": "lost, to be taken over"}
+COLOURS = {
+    "done": "green", "running": "cyan", "failed": "red", "blocked": "red", "lost": "yellow",
+    "trained": "yellow",
+}  # fmt: skip
+WORDS = {
+    "new": "waiting", "trained": "trained, to be evaluated or exported", "stopped": "waiting, begun",
+    "lost": "lost, to be taken over",
+}  # fmt: skip
 
 
 class Screen:

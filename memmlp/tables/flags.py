@@ -39,6 +39,7 @@ def flags(
         older: names the run of an earlier recipe that there is in place of a missing one.
     """
     every = [(arm.label, run) for arm in sweep.runnable() for run in runs[arm.label].values()]
+    yield from _other_data(sweep)
     yield from _missing(sweep, runs, command, state)
     yield from _older(sweep, runs, older)
     yield from _branches(sweep, asked, runs, command)
@@ -58,6 +59,16 @@ def flags(
     if set(sweep.metrics) - set(COSTS):
         yield from _replicates(sweep, runs)
         yield from _body(sweep, every)
+
+
+def _other_data(sweep: Sweep) -> Iterable[str]:
+    """Flag a table of the paper with data of its own, a protocol on AMASS, that is shown for others."""
+    own, chosen = (
+        next((word for word in reversed(words) if word.startswith("data=")), None)
+        for words in (sweep.base, sweep.extra)
+    )
+    if sweep.table and own and chosen and own != chosen:
+        yield f"a table of {own}, shown with {chosen}: its errors do not compare with the paper's"
 
 
 def _missing(sweep: Sweep, runs: Mapping[str, Runs], command: str, state: Say) -> Iterable[str]:

@@ -53,6 +53,7 @@ def facts(folder: Path) -> dict[str, Any]:
         "seconds": _seconds(manifest.get("seconds")),
         "code": _code(manifest),
         "data": _word(manifest.get("data"))[:8],
+        "data_name": _word(shown.get("data.name")),
         "device": _word(manifest.get("gpu")) or _word(manifest.get("device")),
         "host": _word(manifest.get("host")),
         "upstream": _word(manifest.get("upstream")),

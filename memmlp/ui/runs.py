@@ -64,6 +64,8 @@ class Rows:
             "paths": list(filter(is_data_path, keys)),
             "metrics": metrics,
             "units": units(metrics),
+            "sets": sets(runs.values()),
+            "shared": shared(runs.values()),
             "rows": rows,
             "removed": gone,
         }
@@ -129,6 +131,23 @@ def measured(runs: Any) -> list[str]:
     return list(dict.fromkeys(metric for run in runs for metric in run["metrics"]))
 
 
+def sets(runs: Iterable[Mapping[str, Any]]) -> dict[str, str]:
+    """Return, by short digest, the name and short digest of the data of runs: `mocap 78bb7c86`.
+
+    A VQ-VAE's config does not name its data; a network's on the same data does.
+    """
+    named = {run["data"]: run["data_name"] for run in runs if run["data"] and run["data_name"]}
+    return {data: f"{name} {data}" for data, name in named.items()}
+
+
+def shared(runs: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Return the names that runs of different data share, so that the name alone tells them not apart."""
+    found: dict[str, set[str]] = {}
+    for run in runs:
+        found.setdefault(run["name"], set()).add(run["data"])
+    return sorted(name for name, data in found.items() if len(data) > 1)
+
+
 def units(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
     """Return, by the last word of their names, the unit of metrics, and what is better of each.
 
@@ -170,6 +189,7 @@ def page(
         "places": where,
         "config": config,
         "paths": list(filter(is_data_path, config)),
+        "partners": partners(known, run_id, control),
         "control": control
         and {
             "id": control,
@@ -202,6 +222,35 @@ def control_of(plans: Sequence[Plan], run_id: str, known: Mapping[str, Any]) -> 
             if entry.label == first and entry.seed in seeds and entry.id != run_id and entry.id in known:
                 return entry.id
     return None
+
+
+def partners(known: Mapping[str, Mapping[str, Any]], run_id: str, control: str | None = None) -> list[str]:
+    """Return the finished networks on a run's own data, the one to see beside it first.
+
+    That is its control, then those of its seed whose configs differ in the fewest groups and keys. What
+    changes no result is no difference. The errors of other data do not compare: its runs are none of these.
+    """
+    own = known[run_id]
+    near = {
+        other["id"]: differences(own["config"], other["config"])
+        for other in known.values()
+        if other["id"] != run_id
+        and (other["kind"], other["status"]) == ("memmlp", "done")
+        and other["data"] == own["data"]
+    }
+
+    def far(other: str) -> tuple[bool, bool, int, int, str]:
+        keys = near[other]
+        return other != control, "seed" in keys, len({key.split(".")[0] for key in keys}), len(keys), other
+
+    return sorted(near, key=far)
+
+
+def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """Return the keys of two configs that differ, without those that change no result."""
+    keys = [key for key in {**one, **other} if one.get(key) != other.get(key)]
+    neutral = {*minor(keys), *filter(is_data_path, keys)}
+    return [key for key in keys if key not in neutral]
 
 
 def clips(run: Run) -> list[dict[str, Any]]:

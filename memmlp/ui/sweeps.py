@@ -80,15 +80,16 @@ class Sweeps:
     def progress(self, plan: Plan) -> dict[str, Any]:
         """Return how far a sweep is."""
         states = self.states(plan)
-        counts = Counter(states.values())
+        counts = {kind: Counter(states[task.key] for task in tasks) for kind, tasks in _kinds(plan).items()}
         sweep = self._kept(plan.name)
         return {
             "name": plan.name,
             "title": caption_of(sweep) if sweep else plan.name,
             "arms": len({entry.label for entry in plan.entries}),
             "seeds": len({entry.seed for entry in plan.entries}),
-            "tasks": len(plan.tasks),
-            "counts": dict(counts),
+            "tasks": len(_kinds(plan)["networks"]),
+            "counts": dict(counts["networks"]),
+            "vqvaes": dict(counts["VQ-VAEs"]),
             "share": self._share(plan, states),
             "left": self._time_left(plan, states),
         }
@@ -264,6 +265,14 @@ def table_words(table: Any) -> dict[str, Any]:
         "better": {m: better(m) for m in table.metrics},
         "legend": legend(table),
     }
+
+
+def _kinds(plan: Plan) -> dict[str, list[RunTask]]:
+    """Return a plan's tasks: the networks, which are its arms and seeds, and the VQ-VAEs that these need."""
+    found: dict[str, list[RunTask]] = {"networks": [], "VQ-VAEs": []}
+    for task in plan.tasks:
+        found["VQ-VAEs" if task.kind == "vqvae" else "networks"].append(task)
+    return found
 
 
 def caption_of(sweep: Sweep) -> str:

@@ -15,7 +15,7 @@ from memmlp.cli.results import sources
 from memmlp.common.errors import InputError
 from memmlp.report.claims import NEVER, WORDS, claims
 from memmlp.report.kept_results import Kept, dumps, load_kept, overrides_of, save, without_paths
-from memmlp.report.markdown import KeptTable, Words, pages
+from memmlp.report.markdown import KeptTable, Words, origin_words, pages
 from memmlp.statistics import Verdict, holm, paired_effects
 from memmlp.sweep.spec import Sweep, load_sweep
 from memmlp.tables.build_table import collect
@@ -168,6 +168,13 @@ def test_a_template_takes_numbers_and_verdicts_from_the_table(sweep: Sweep, kept
     assert text.count("holds; paper +0.09") == 2
     assert "never" not in text
     assert "### Table 14: Placement of memory blocks in the backbone" in text
+
+
+def test_each_commit_is_named_once(kept: Kept):
+    runs = kept.runs["2"]
+    for seed, code in zip(runs, ("e2f8fc0", "92ecce3, e2f8fc0", "e2f8fc0, 92ecce3"), strict=False):
+        runs[seed] = replace(runs[seed], origin=replace(runs[seed].origin, code=code))
+    assert ", commit 0123456, 92ecce3 and e2f8fc0, torch" in origin_words(kept)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, runs_of, table_of
+from fake_runs import CLIPS, ORIGIN, fake_run, fake_sweep, nothing, runs_of, table_of
 from fake_table import cell, printed
 
 from memmlp.report.kept_results import Kept, dumps, load_kept
@@ -19,6 +19,16 @@ from memmlp.tables.build_table import collect
 from memmlp.tables.formats import FORMATS
 from memmlp.tables.measured_run import load
 from memmlp.tables.table import Table
+
+
+def test_a_protocol_on_amass_with_other_data_is_flagged(sweep: Sweep):
+    runs = runs_of(sweep, nothing)
+    protocol = replace(sweep, table=1, base=("data=amass_s1",))
+    other = replace(protocol, extra=("data=mocap", "data.root=mine"))
+    flag = "a table of data=amass_s1, shown with data=mocap: its errors do not compare with the paper's"
+    assert flag in collect(other, runs).flags
+    alike = (protocol, replace(protocol, extra=("data=amass_s1",)), replace(other, base=()))
+    assert not any("a table of" in word for one in alike for word in collect(one, runs).flags)
 
 
 def test_missing_runs_are_shown_with_the_command(sweep: Sweep, tmp_path: Path):

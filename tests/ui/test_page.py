@@ -265,6 +265,7 @@ def test_a_file_without_a_server(browser: Browser, home: Path, tmp_path: Path):
     assert EVIL not in text
     file = tmp_path / "report.html"
     file.write_text(text)
+    go(browser, file.as_uri(), "", "document.querySelector('main h1').textContent == 'Extra'")
     go(browser, file.as_uri(), "runs", f"{NAMES}.length == 6")
     best = min(
         (run_of(home, "gru", seed) for seed in range(3)),

@@ -7,17 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from fake_runs import fake_run
 from ui.conftest import begun, run_of
 
 from memmlp.cli.rounds import look
 from memmlp.runs.run import Run
 from memmlp.sweep.kept import keep, kept
-from memmlp.sweep.plan import Plan
+from memmlp.sweep.plan import Plan, RunTask
 from memmlp.tables.build_table import collect, finished
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import load
 from memmlp.tables.rounds import Rounds, begin
-from memmlp.tables.runs_of_plan import finder
+from memmlp.tables.runs_of_plan import finder, states
 from memmlp.ui.index import Index
 from memmlp.ui.sweeps import NOT_KEPT, OTHERS, ROUNDS, Sweeps
 
@@ -60,6 +61,25 @@ def test_progress_and_time_left(outputs: Path, monkeypatch: pytest.MonkeyPatch):
     assert found["left"] is not None
     (cell,) = [cell for cell in sweeps.page("mine")["cells"] if cell["state"] == "training"]
     assert (cell["arm"], cell["seed"], cell["step"], cell["steps"]) == ("gru", 2, 1000, 2000)
+
+
+def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_no_arm(outputs: Path):
+    path = outputs / "sweeps" / "mine" / "plan.json"
+    plan = Plan.load(path)
+    upstream = fake_run(outputs, "vqvae")
+    first = plan.entries[0]
+    tasks = tuple(
+        replace(task, stages=("stream-absent",)) if task.id == first.id else task for task in plan.tasks
+    )
+    vqvae = RunTask(upstream.id, "vqvae", {"vqvae": {"steps": 20}})
+    entries = (replace(first, stages=("stream-absent",)), *plan.entries[1:])
+    replace(plan, entries=entries, tasks=(vqvae, *tasks)).save(path)
+    sweeps = sweeps_of(outputs)
+    found = sweeps.progress(sweeps.known()[0])
+    assert (found["counts"], found["vqvaes"], found["tasks"]) == ({"trained": 1, "done": 5}, {"done": 1}, 6)
+    say = states(Plan.load(path))
+    arm = next(arm for arm in kept(path.parent).runnable() if arm.label == first.label)
+    assert say(arm, first.seed) == "trained, an evaluation or export is missing"
 
 
 def test_no_time_is_left_where_only_the_evaluation_is(outputs: Path):

@@ -1,7 +1,7 @@
 // Curves of several runs overlaid, by run or by group with bands; where they differ and what was measured.
 
 import { h, replace, link, section, select, empty, choice } from './dom.js';
-import { about, address, curvesOf, place, remember, runs } from './store.js';
+import { about, address, curvesOf, nameOf, place, remember, runs } from './store.js';
 import { colourOf, curves } from './charts.js';
 import { differing } from './runs.js';
 import { bestOf, metricNumber, metricText, word } from './format.js';
@@ -89,7 +89,7 @@ export async function page() {
   return { title: `${ids.length} runs`, element, update };
 }
 
-const unique = (run, list) => (list.filter(other => other.name === run.name).length > 1 ? `${run.name} (${run.id.slice(0, 6)})` : run.name);
+const unique = (run, list) => (list.filter(other => nameOf(other) === nameOf(run)).length > 1 ? `${nameOf(run)} (${run.id.slice(0, 6)})` : nameOf(run));
 
 function differences(list, keys, names) {
   if (list.length < 2) return null;

@@ -12,7 +12,7 @@ const ROOMS = { runs: runs.page, run: run.page, compare: compare.page, sweeps: s
 const PAGES = [['runs', 'Runs'], ['sweeps', 'Sweeps'], ['searches', 'Searches']];
 const PARENT = { run: 'runs', compare: 'runs', sweep: 'sweeps', search: 'searches' };
 const template = document.getElementById('extra');
-if (template?.innerHTML.trim()) PAGES.push(['extra', 'Tables and figures']);
+if (template?.innerHTML.trim()) PAGES.unshift(['extra', 'Tables and figures']);
 
 let current = null;
 let shown = null;

@@ -2,7 +2,7 @@
 
 import { Stage } from './stage.js';
 import { h, replace } from './dom.js';
-import { ask, alone } from './store.js';
+import { ask, alone, nameOf } from './store.js';
 import { course } from './charts.js';
 import { number } from './format.js';
 
@@ -46,7 +46,7 @@ export class Replay {
       if (same) this.begin(asked, run, mine, other, theirs, { clip, mode });
       else {
         this.begin(asked, run, mine, null, null, { clip, mode });
-        this.remark(`${other.name}: ${theirs.reason ?? 'its clip is another motion'}`);
+        this.remark(`${nameOf(other)}: ${theirs.reason ?? 'its clip is another motion'}`);
       }
     } catch (error) {
       if (asked === this.asked) replace(this.place, h('div', { class: 'empty' }, h('p', { class: 'lead' }, 'This clip cannot be replayed.'), h('p', {}, error.message)));
@@ -108,8 +108,8 @@ export class Replay {
 
   layout() {
     const { mine, theirs } = this.data;
-    const stages = [['Truth', null], [this.run.name, mine], ...(theirs ? [[this.other.name, theirs]] : [])];
-    const waiting = this.other && !theirs ? h('div', { class: 'view' }, h('div', { class: 'view-stage' }, h('p', { class: 'wait', role: 'status' }, 'computing …')), h('p', { class: 'view-name' }, h('span', {}, this.other.name))) : null;
+    const stages = [['Truth', null], [nameOf(this.run), mine], ...(theirs ? [[nameOf(this.other), theirs]] : [])];
+    const waiting = this.other && !theirs ? h('div', { class: 'view' }, h('div', { class: 'view-stage' }, h('p', { class: 'wait', role: 'status' }, 'computing …')), h('p', { class: 'view-name' }, h('span', {}, nameOf(this.other)))) : null;
     const panels = stages.map(([name, data]) => {
       const canvas = h('canvas', { 'aria-label': `${name} in 3D` });
       const error = h('b', { class: 'n' });
@@ -124,14 +124,14 @@ export class Replay {
     const whole = h('button', { type: 'button', class: 'small', 'aria-pressed': 'false', onclick: () => { this.loop = null; this.mark(); } }, mine.joints.length < mine.frames ? `${Math.round(mine.joints.length / mine.fps)} s around it` : 'Whole clip');
     this.pieces = [...worst, whole];
     const speeds = h('select', { 'aria-label': 'Speed', onchange: event => { this.speed = Number(event.target.value); } }, [0.1, 0.25, 0.5, 1].map(speed => h('option', { value: speed, selected: speed === this.speed }, `${speed}×`)));
-    const chart = course([mine, ...(theirs ? [theirs] : [])].map((one, i) => ({ errors: one.errors, name: i ? this.other.name : this.run.name })), {
+    const chart = course([mine, ...(theirs ? [theirs] : [])].map((one, i) => ({ errors: one.errors, name: i ? nameOf(this.other) : nameOf(this.run) })), {
       fps: mine.fps, label: 'error [cm] by second', at: () => this.time, go: time => this.go(time), marks: mine.worst, colours: ['var(--series0)', 'var(--series1)'],
     });
     this.chart = chart;
     const ramp = h('div', { class: 'scale' }, h('span', {}, '0'), h('i', { style: `background:linear-gradient(to right, ${body.heat.join(', ')})` }), h('span', {}, `${this.top}+ cm`));
     const element = h('div', { class: 'replay', tabindex: 0, role: 'group', 'aria-label': 'Replay; space plays, arrows step a frame', onkeydown: event => this.key(event) },
       h('div', { class: `views of${waiting ? 3 : panels.length}` }, panels.map(panel => panel.element), waiting), h('div', { class: 'transport' }, this.play, this.slider, this.clock, speeds), h('div', { class: 'pieces' }, this.pieces, ramp),
-      h('div', { class: 'keys' }, h('span', { class: 'key still' }, h('i', { style: 'background:var(--series0)' }), this.run.name), theirs ? h('span', { class: 'key still' }, h('i', { style: 'background:var(--series1)' }), this.other.name) : null), chart);
+      h('div', { class: 'keys' }, h('span', { class: 'key still' }, h('i', { style: 'background:var(--series0)' }), nameOf(this.run)), theirs ? h('span', { class: 'key still' }, h('i', { style: 'background:var(--series1)' }), nameOf(this.other)) : null), chart);
     replace(this.place, element);
     try {
       this.views = panels.map(panel => ({ ...panel, stage: new Stage(panel.canvas, { limbs: body.limbs, heat: body.heat, top: this.top }) }));

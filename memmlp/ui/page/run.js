@@ -1,7 +1,7 @@
 // The page of a run: what it is, its curves, results, worst seconds, config against the control's, files.
 
 import { h, replace, link, section, select, empty, choice, code } from './dom.js';
-import { address, alone, ask, place, remember, runs } from './store.js';
+import { address, alone, ask, dataName, nameOf, place, remember, runs } from './store.js';
 import { ago, ARROWS, better, bytes, date, duration, metricNumber, metricWords, number, signed, word } from './format.js';
 import { curvePanel } from './compare.js';
 import { status, tags } from './runs.js';
@@ -12,7 +12,7 @@ export async function page(id) {
   let run = await ask(`run/${id}`);
   const closing = [];
   const top = h('div');
-  const panel = curvePanel([id], [['run', 'run', () => run.name]], { most: 2 });
+  const panel = curvePanel([id], [['run', 'run', () => nameOf(run)]], { most: 2 });
   const rest = h('div');
   const replay = run.clips.length ? await replaySection(run, closing) : null;
   const element = h('div', { class: 'page' }, top, replay?.element, section('Curves', panel.element), rest);
@@ -33,13 +33,13 @@ export async function page(id) {
   draw();
   await panel.update();
   if (place().query.get('part') === 'replay') requestAnimationFrame(() => replay?.element.scrollIntoView());
-  return { title: run.name, element, update, close: () => closing.forEach(close => close()) };
+  return { title: nameOf(run), element, update, close: () => closing.forEach(close => close()) };
 }
 
 function head(run) {
   return [
     h('p', { class: 'trail' }, link('#/runs', 'Runs'), run.places.map(at => [' / ', at.sweep ? [link(address('sweep', at.sweep), at.sweep), ` · ${at.arm}, seed ${at.seed}`] : [link(address('search', at.search), at.search), ` · trial ${at.trial}`]])),
-    h('div', { class: 'bar title' }, h('h1', {}, run.name), status(run), tags(run)),
+    h('div', { class: 'bar title' }, h('h1', {}, nameOf(run)), status(run), tags(run)),
     run.note ? h('p', { class: 'remark' }, run.note) : null,
   ];
 }
@@ -47,9 +47,9 @@ function head(run) {
 function facts(run) {
   const pairs = [
     ['id', code(run.id)], ['started', h('span', { title: ago(run.started) }, date(run.started))], ['took', duration(run.seconds)],
-    ['data', code(run.data || '–')], ['device', run.device || '–'], ['code', code(run.code || '–')],
+    ['data', code(dataName(run.data) || '–')], ['device', run.device || '–'], ['code', code(run.code || '–')],
     run.upstream ? ['VQ-VAE', link(address('run', run.upstream), run.upstream.slice(0, 8))] : null,
-    run.control ? ['control', [link(address('run', run.control.id), run.control.name), ' · ', link(address('compare', '', { runs: `${run.id},${run.control.id}` }), 'compare')]] : null,
+    run.control ? ['control', [link(address('run', run.control.id), nameOf(run.control)), ' · ', link(address('compare', '', { runs: `${run.id},${run.control.id}` }), 'compare')]] : null,
   ];
   return h('dl', { class: 'facts' }, pairs.filter(Boolean).map(([key, value]) => h('div', {}, h('dt', {}, key), h('dd', {}, value))));
 }
@@ -84,12 +84,14 @@ function results(run) {
 async function replaySection(run, closing) {
   const { Replay } = await import('./replay.js');
   const others = [...runs.values()].filter(other => other.id !== run.id && other.status === 'done' && other.kind === 'memmlp');
-  const near = others.sort((a, b) => Number(b.id === run.control?.id) - Number(a.id === run.control?.id) || shared(b, run) - shared(a, run)).slice(0, 40);
+  const partners = new Map(run.partners.map((other, i) => [other, i]));
+  const rank = other => partners.get(other.id) ?? Infinity;
+  const near = others.sort((a, b) => (rank(a) === rank(b) ? 0 : rank(a) - rank(b))).slice(0, 40);
   const frame = h('div', { class: 'replay-frame' });
   const tools = h('div', { class: 'tools' });
   const replay = new Replay(frame);
   closing.push(() => replay.close());
-  const set = { clip: place().query.get('clip') ?? worst(run)?.name, mode: place().query.get('mode') ?? (run.clips.some(clip => clip.stream) ? 'stream' : 'window'), other: place().query.get('other') ?? near[0]?.id ?? '' };
+  const set = { clip: place().query.get('clip') ?? worst(run)?.name, mode: place().query.get('mode') ?? (run.clips.some(clip => clip.stream) ? 'stream' : 'window'), other: place().query.get('other') ?? near.find(other => partners.has(other.id))?.id ?? '' };
 
   function draw() {
     const modes = ['stream', 'window'].filter(mode => run.clips.some(clip => clip[mode]));
@@ -97,7 +99,7 @@ async function replaySection(run, closing) {
     replace(tools,
       select('Clip, worst first', names.map(clip => [clip.name, `${clip.name} (${number(error(clip, set.mode), 1)} cm)`]), set.clip, clip => choose({ clip })),
       modes.length > 1 ? choice('Mode', modes.map(mode => [mode, mode]), set.mode, mode => choose({ mode })) : null,
-      near.length ? select('Beside', [['', 'no other run'], ...near.map(other => [other.id, `${other.name} (${other.id.slice(0, 6)})`])], set.other, other => choose({ other })) : null);
+      near.length ? select('Beside', [['', 'no other run'], ...near.map(other => [other.id, `${nameOf(other)} (${other.id.slice(0, 6)})`])], set.other, other => choose({ other })) : null);
   }
   function choose(changes, keep = false) {
     Object.assign(set, changes);
@@ -111,7 +113,6 @@ async function replaySection(run, closing) {
   return { element, choose };
 }
 
-const shared = (other, run) => other.places.filter(place => run.places.some(mine => mine.sweep === place.sweep)).length + (other.config.seed === run.config.seed ? 0.5 : 0);
 const error = (clip, mode) => clip[mode]?.rotation?.MPJPE ?? -1;
 const worst = run => [...run.clips].sort((a, b) => error(b, 'stream') - error(a, 'stream') || error(b, 'window') - error(a, 'window'))[0];
 
@@ -149,7 +150,7 @@ function config(run) {
     const differs = key => other && !alike.includes(key) && JSON.stringify(run.config[key] ?? null) !== JSON.stringify(other[key] ?? null);
     const shown = keys.filter(key => (all || differs(key)) && `${key}=${run.config[key]}`.toLowerCase().includes(words.toLowerCase()));
     const rows = shown.map(key => h('tr', { class: differs(key) ? 'differs' : null }, h('th', { scope: 'row' }, key), h('td', {}, word(run.config[key])), other ? h('td', { class: 'faint' }, word(other[key])) : null));
-    replace(list, shown.length ? h('div', { class: 'scroll short' }, h('table', { class: 'grid config' }, h('thead', {}, h('tr', {}, h('th', { scope: 'col' }, 'key'), h('th', { scope: 'col' }, 'this run'), other ? h('th', { scope: 'col' }, run.control.name) : null)), h('tbody', {}, rows)))
+    replace(list, shown.length ? h('div', { class: 'scroll short' }, h('table', { class: 'grid config' }, h('thead', {}, h('tr', {}, h('th', { scope: 'col' }, 'key'), h('th', { scope: 'col' }, 'this run'), other ? h('th', { scope: 'col' }, nameOf(run.control)) : null)), h('tbody', {}, rows)))
       : h('p', { class: 'faint' }, words ? 'No key fits.' : 'No key differs.'));
   }
   function tools() {
@@ -158,7 +159,7 @@ function config(run) {
   }
   tools();
   draw();
-  return Object.keys(run.config).length ? section(other ? `Config against ${run.control.name}` : 'Config', element) : null;
+  return Object.keys(run.config).length ? section(other ? `Config against ${nameOf(run.control)}` : 'Config', element) : null;
 }
 
 function latency(run) {

@@ -1,7 +1,7 @@
 // The table of runs: filter, sort, the columns in which they differ, tags and notes.
 
 import { h, replace, link, empty, code, say } from './dom.js';
-import { about, address, place, remember, runs } from './store.js';
+import { about, address, dataName, nameOf, place, remember, runs } from './store.js';
 import { parse, matches } from './filter.js';
 import { ago, bestOf, better, date, duration, DASH, metricNumber, metricText, metricWords, number, shortKeys, word } from './format.js';
 
@@ -12,12 +12,13 @@ const NARROW = matchMedia('(max-width: 640px)'); // errors come first where litt
 const KINDS = [['memmlp', 'Networks'], ['vqvae', 'VQ-VAEs'], ['', 'All']];
 export const AT_WORK = ['training', 'evaluating', 'exporting'];
 const STATES = [...AT_WORK, 'done', 'failed', 'lost', 'stopped', 'new'];
-export const STATE_WORDS = { lost: 'lost', new: 'waiting', blocked: 'blocked', stopped: 'stopped' };
+export const STATE_WORDS = { lost: 'lost', new: 'waiting', blocked: 'blocked', stopped: 'stopped', trained: 'trained' };
+const STATE_TITLES = { trained: 'Trained; an evaluation or export that this sweep asks for is missing.' };
 
 // How a status looks: whatever somebody does with a run looks alike.
 export const look = status => (AT_WORK.includes(status) ? 'running' : status);
 
-export function state(status, title) {
+export function state(status, title = STATE_TITLES[status]) {
   return h('span', { class: `state ${look(status)}`, title }, STATE_WORDS[status] ?? status);
 }
 
@@ -132,10 +133,10 @@ export function page() {
     ui.sets = [...new Set(list.filter(run => run.status === 'done').map(run => run.data))];
     if (ui.sets.length > 1) {
       const chosen = data => { remember({ filter: `${place().query.get('filter') ?? ''} data=${data}`.trim() }); draw(); };
-      replace(best, `Of ${ui.sets.length} data sets, whose errors do not compare: `, ui.sets.slice(0, 5).map(data => h('button', { type: 'button', class: 'small', onclick: () => chosen(data) }, data || 'unknown', ' ', h('small', {}, number(list.filter(run => run.data === data).length)))));
+      replace(best, `Of ${ui.sets.length} data sets, whose errors do not compare: `, ui.sets.slice(0, 5).map(data => h('button', { type: 'button', class: 'small', onclick: () => chosen(data) }, dataName(data) || 'unknown', ' ', h('small', {}, number(list.filter(run => run.data === data).length)))));
       return;
     }
-    if (first) replace(best, 'Best of these by ', metricText(metric), ': ', link(address('run', first.id), first.name), ' ', h('b', {}, metricNumber(metric, first.metrics[metric])), ' · ', link(address('run', first.id, { part: 'replay' }), 'its worst second'));
+    if (first) replace(best, 'Best of these by ', metricText(metric), ': ', link(address('run', first.id), nameOf(first)), ' ', h('b', {}, metricNumber(metric, first.metrics[metric])), ' · ', link(address('run', first.id, { part: 'replay' }), 'its worst second'));
   }
 
   function head(sort) {
@@ -175,7 +176,7 @@ export function page() {
   }
 
   function line(run, known) {
-    const pick = h('input', { type: 'checkbox', checked: chosen.has(run.id), 'data-run': run.id, 'aria-label': `Choose ${run.name}, ${run.id}`, onchange: event => {
+    const pick = h('input', { type: 'checkbox', checked: chosen.has(run.id), 'data-run': run.id, 'aria-label': `Choose ${nameOf(run)}, ${run.id}`, onchange: event => {
       event.target.checked ? chosen.add(run.id) : chosen.delete(run.id);
       selection();
     } });
@@ -186,7 +187,7 @@ export function page() {
     };
     return h('tr', { class: chosen.has(run.id) ? 'chosen' : null },
       h('td', { class: 'pick' }, pick),
-      h('th', { scope: 'row' }, link(address('run', run.id), run.name), h('span', { class: 'id' }, run.id.slice(0, 8)), tags(run), run.note && h('span', { class: 'note', title: run.note }, run.note)),
+      h('th', { scope: 'row' }, link(address('run', run.id), nameOf(run)), h('span', { class: 'id' }, run.id.slice(0, 8)), tags(run), run.note && h('span', { class: 'note', title: run.note }, run.note)),
       h('td', {}, status(run)), ui.columns.map(cell),
       h('td', { class: 'n faint', title: date(run.started) }, ago(run.started)), h('td', { class: 'n faint' }, duration(run.seconds)));
   }

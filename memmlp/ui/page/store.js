@@ -5,7 +5,7 @@ const answers = embedded ? JSON.parse(embedded.textContent) : null;
 export const alone = answers !== null; // the page is a file without a server
 
 export const runs = new Map();
-export const about = { keys: [], minor: [], paths: [], metrics: [], units: {}, outputs: '', generation: 0, heads: '' };
+export const about = { keys: [], minor: [], paths: [], metrics: [], units: {}, sets: {}, shared: [], outputs: '', generation: 0, heads: '' };
 const listeners = new Set();
 let state = alone ? 'file' : 'connecting';
 
@@ -44,12 +44,18 @@ export async function load() {
   for (const row of rows) runs.set(row.id, readable(row));
 }
 
+// A run's data by name and short digest; its digest alone where no config names it.
+export const dataName = data => about.sets[data] ?? data;
+
+// A run's name, with its data where runs of other data have the same name.
+export const nameOf = run => (about.shared.includes(run.name) ? `${run.name} · ${dataName(run.data) || 'unknown data'}` : run.name);
+
 // A row with its config and metrics by name, and the text in which words are looked for.
 function readable(row) {
   const config = Object.fromEntries(about.keys.map((key, i) => [key, row.config[i]]));
   const metrics = Object.fromEntries(about.metrics.map((key, i) => [key, row.metrics[i]]));
   const words = [
-    row.id, row.name, row.status, row.kind, row.device, row.note, row.failure, ...row.tags,
+    row.id, row.name, row.status, row.kind, row.device, row.note, row.failure, dataName(row.data), ...row.tags,
     ...row.places.flatMap(place => Object.values(place).map(String)), ...about.keys.map((key, i) => `${key}=${row.config[i]}`),
   ];
   // What runs are compared by: of paths of data the data's digest, as one folder has many spellings.
@@ -89,11 +95,14 @@ export function follow() {
   events.onmessage = refresh;
 }
 
+// The page that is shown where the address names none: of a report its tables and figures.
+const first = document.getElementById('extra')?.innerHTML.trim() ? 'extra' : 'runs';
+
 // The address: #/room/name?key=value
 export function place() {
   const [path, query = ''] = location.hash.replace(/^#\/?/, '').split('?');
   const [room = '', ...rest] = path.split('/').map(part => decodeURIComponent(part));
-  return { room: room || 'runs', name: rest.join('/'), query: new URLSearchParams(query) };
+  return { room: room || first, name: rest.join('/'), query: new URLSearchParams(query) };
 }
 
 export function address(room, name = '', query = {}) {

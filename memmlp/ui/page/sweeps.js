@@ -1,13 +1,13 @@
 // Sweeps: how far they are, what they found, and curves by arm.
 
 import { h, replace, link, section, empty, choice, select } from './dom.js';
-import { address, alone, ask, place, remember, runs } from './store.js';
+import { address, alone, ask, nameOf, place, remember, runs } from './store.js';
 import { curvePanel } from './compare.js';
 import { forest } from './charts.js';
 import { AT_WORK, look, state, STATE_WORDS } from './runs.js';
 import { DASH, duration, metricNumber, metricText, number, signed } from './format.js';
 
-const ORDER = ['done', ...AT_WORK, 'lost', 'stopped', 'new', 'failed', 'blocked'];
+const ORDER = ['done', ...AT_WORK, 'trained', 'lost', 'stopped', 'new', 'failed', 'blocked'];
 
 export async function page() {
   const element = h('div', { class: 'page' });
@@ -25,7 +25,10 @@ export async function page() {
 
 function progress(sweep) {
   const parts = ORDER.filter(name => sweep.counts[name]).map(name => h('i', { class: look(name), style: `flex-grow:${sweep.counts[name]}` }));
-  const words = ORDER.filter(name => sweep.counts[name]).map(name => `${sweep.counts[name]} ${STATE_WORDS[name] ?? name}`).join(', ');
+  const told = counts => ORDER.filter(name => counts[name]).map(name => `${counts[name]} ${STATE_WORDS[name] ?? name}`).join(', ');
+  const above = told(sweep.vqvaes);
+  const missing = sweep.counts.trained ? ' (trained: an evaluation or export is missing)' : '';
+  const words = `${told(sweep.counts)}${missing}${above ? `; VQ-VAEs: ${above}` : ''}`;
   const left = sweep.left === null ? '' : ` · about ${duration(sweep.left)} of training left`;
   return h('span', { class: 'sweep-progress' }, h('span', { class: 'segments', role: 'img', 'aria-label': words }, parts), h('span', { class: 'n' }, `${Math.floor(100 * sweep.share)} %`), h('small', { class: 'faint' }, `${words}${left}`));
 }
@@ -34,7 +37,7 @@ export async function single(name) {
   let sweep = await ask(`sweeps/${name}`);
   const ids = [...new Set(sweep.cells.map(cell => cell.id))].filter(id => runs.has(id));
   const arm = new Map(sweep.cells.map(cell => [cell.id, cell.arm]));
-  const panel = curvePanel(ids, [['arm', 'arm', id => arm.get(id)], ['run', 'run', id => runs.get(id)?.name ?? id]], { most: 2 });
+  const panel = curvePanel(ids, [['arm', 'arm', id => arm.get(id)], ['run', 'run', id => runs.has(id) ? nameOf(runs.get(id)) : id]], { most: 2 });
   const top = h('div');
   const found = h('div');
   const element = h('div', { class: 'page' }, top, found, section('Curves by arm', panel.element), notes());
@@ -65,7 +68,7 @@ function board(sweep) {
   const words = cell => {
     if (!cell) return h('td', { class: 'n faint' }, DASH);
     const share = cell.state === 'training' && cell.steps ? Math.min(cell.step / cell.steps, 1) : null;
-    const text = cell.state === 'done' ? (typeof cell.value === 'number' ? h('b', {}, metricNumber(sweep.metric, cell.value)) : 'done') : share === null ? state(cell.state, cell.failure) : [h('progress', { value: share, max: 1, 'aria-label': 'trained' }), ` ${Math.floor(100 * share)} %`];
+    const text = cell.state === 'done' ? (typeof cell.value === 'number' ? h('b', {}, metricNumber(sweep.metric, cell.value)) : 'done') : share === null ? state(cell.state, cell.failure || undefined) : [h('progress', { value: share, max: 1, 'aria-label': 'trained' }), ` ${Math.floor(100 * share)} %`];
     return h('td', { class: `n cell ${look(cell.state)}` }, runs.has(cell.id) ? link(address('run', cell.id), text) : text);
   };
   const failed = sweep.cells.filter(cell => cell.failure).map(cell => h('p', { class: 'warning' }, h('b', {}, `${cell.arm}, seed ${cell.seed}: `), cell.failure));
