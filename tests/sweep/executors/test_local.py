@@ -77,5 +77,9 @@ def test_each_worker_sees_its_own_gpus_and_a_new_one_those_of_the_dead(tmp_path:
 def variable(worker) -> str:
     """What the system has for a worker's process."""
     environment = Path(f"/proc/{worker.job._process.pid}/environ")
-    entries = until(lambda: environment.read_bytes().split(b"\0"), "the process has its environment")
-    return dict(entry.decode().split("=", 1) for entry in entries if entry)["CUDA_VISIBLE_DEVICES"]
+    name = b"CUDA_VISIBLE_DEVICES="
+
+    def entries() -> list[bytes]:  # the parent's, until the process is another program
+        return [entry for entry in environment.read_bytes().split(b"\0") if entry.startswith(name)]
+
+    return until(entries, "the process has its environment")[0].removeprefix(name).decode()
