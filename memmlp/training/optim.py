@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import torch
 from torch import nn
@@ -116,8 +117,11 @@ class Muon(Optim):
         matrices, rest = _split(groups)
         parts: list[torch.optim.Optimizer] = []
         if matrices:
-            scaled = {"momentum": self.momentum, "adjust_lr_fn": "match_rms_adamw"}
-            parts.append(torch.optim.Muon(matrices, self.lr, self.weight_decay, **scaled))  # type: ignore
+            parts.append(
+                torch.optim.Muon(
+                    matrices, self.lr, self.weight_decay, self.momentum, adjust_lr_fn="match_rms_adamw"
+                )
+            )
         if rest:
             lr = self.rest_lr or self.lr
             parts.append(torch.optim.AdamW(rest, lr, weight_decay=self.weight_decay, betas=self.betas))
@@ -138,12 +142,10 @@ class ScheduleFree(Optim):
 
     def check_installed(self) -> None:
         """Raise InputError where the package is not there."""
-        try:
-            import schedulefree  # noqa: F401
-        except ImportError:
+        if find_spec("schedulefree") is None:
             raise InputError(
                 "optim=schedule_free: needs the package schedulefree; pip install 'memmlp[schedulefree]'"
-            ) from None
+            )
 
     def build(self, groups: list[dict]) -> torch.optim.Optimizer:
         """Make the optimiser, ready to train; a group's own `lr` and `weight_decay` take precedence."""

@@ -1,0 +1,20 @@
+"""`memmlp runs`: list, show, compare, tag, clean up and move run folders."""
+
+from __future__ import annotations
+
+import click
+
+from memmlp.cli.runs.compare import diff
+from memmlp.cli.runs.listing import list_runs
+from memmlp.cli.runs.notes import note, tag
+from memmlp.cli.runs.show import show
+from memmlp.cli.runs.storage import export, gc, import_
+
+
+@click.group("runs")
+def runs() -> None:
+    """List, show, compare, tag, clean up and move runs."""
+
+
+for command in (list_runs, show, diff, tag, note, gc, export, import_):
+    runs.add_command(command)

@@ -1,0 +1,194 @@
+"""`memmlp runs list`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from memmlp.cli.options import outputs_option
+from memmlp.cli.runs.texts import age, console, number_text, plain_table, recorded, value_text
+from memmlp.evaluation.units import UNITS
+
+if TYPE_CHECKING:
+    from memmlp.runs.query import Record
+    from memmlp.runs.run import Run
+
+NEWEST = 20
+SHOWN = {
+    # the column's head -> the key of its number
+    "MPJPE\nstream": "stream.rotation.MPJPE",
+    "MPJPE\nwindow": "window.rotation.MPJPE",
+    "Jitter": "stream.rotation.Jitter",
+    "ms": "latency.median_ms",
+}
+LEGEND = f"MPJPE [{UNITS['MPJPE']}], Jitter [{UNITS['Jitter']}]: rotation branch. ms: a frame on one core."
+SPARED = ("ms", "age", "Jitter", "MPJPE\nwindow")  # what a narrow screen has no room for, first
+FOLD = 12  # characters of a value in a line, where it can be broken
+NAME = 36  # characters of a run's name in a line
+
+
+@click.command("list")
+@click.option("--all", "every", is_flag=True, help=f"List all: VQ-VAEs too, and more than {NEWEST}.")
+@click.option(
+    "--where", help="List the runs that fulfil a condition, such as 'memory=gru and stream.MPJPE<6.3'."
+)
+@click.option("--sort", help="Sort by a key, such as stream.MPJPE; -KEY begins with the largest.")
+@click.option("--columns", help="Show these keys, separated by commas.  [default: config keys that differ]")
+@outputs_option
+def list_runs(every: bool, where: str | None, sort: str | None, columns: str | None, outputs: Path) -> None:
+    """List the runs, the newest first, without the finished ones of VQ-VAEs.
+
+    Shown are their names and data, what differs between their configs, the MPJPE of the rotation branch in
+    both modes, Jitter, and the latency of a frame. Keys are those of the config (`memory`, `optim.lr`),
+    results (`stream.MPJPE`, `window.position.Jitter`, `latency.median_ms`), and `id`, `kind`, `status`,
+    `name`, `data`, `started`, `tag`, `note`.
+    """
+    from memmlp.runs import lookup
+    from memmlp.runs.query import parse
+
+    query = parse(where) if where else None
+    there = lookup.list_runs(outputs)
+    if not there:
+        click.echo(f"no runs in {outputs / 'runs'}; memmlp demo makes the first")
+        return
+    found = there if every or query else [run for run in there if not is_finished_vqvae(run)]
+    limit = len(found) if every or query or sort else NEWEST
+    records = {run.id: recorded(run) for run in found[:limit]}
+    fits = query.of(list(records.values())) if query else [True] * len(records)
+    listed = [run for run, fit in zip(found[:limit], fits, strict=True) if fit]
+    if sort:
+        listed = sorted_by(listed, records, sort)
+    keys = wanted(columns, records, listed)
+    hidden = show_runs([{**records[run.id], "age": age(run)} for run in listed], keys, bool(columns))
+    if hidden:
+        click.echo(f"they differ in {', '.join(hidden)}, too: --columns shows it")
+    if vqvaes := len(there) - len(found):
+        click.echo(f"{vqvaes} finished VQ-VAE{'s' if vqvaes > 1 else ''}: memmlp runs list --all")
+    if len(found) > limit:
+        click.echo(f"{len(found) - limit} older ones: memmlp runs list --all")
+    elif query:
+        click.echo(f"{len(listed)} of {len(found)} runs")
+
+
+def is_finished_vqvae(run: Run) -> bool:
+    """Whether it is a finished run of a VQ-VAE, which has none of the results that are listed."""
+    return run.manifest.get("kind") == "vqvae" and run.done
+
+
+def sorted_by(listed: Sequence[Run], records: Mapping[str, Record], sort: str) -> list[Run]:
+    """Return the runs sorted by a key; those that have no such value come last."""
+    from memmlp.runs.query import check_key
+
+    key, down = sort.removeprefix("-"), sort.startswith("-")
+    check_key(key, records.values(), "--sort")
+    known = [run for run in listed if records[run.id].get(key) not in (None, "", ())]
+    values = [records[run.id][key] for run in known]
+    numbers = all(isinstance(value, int | float) for value in values)
+    ranked = sorted(
+        known, key=lambda run: records[run.id][key] if numbers else str(records[run.id][key]), reverse=down
+    )
+    return [*ranked, *(run for run in listed if run not in known)]
+
+
+def wanted(columns: str | None, records: Mapping[str, Record], listed: Sequence[Run]) -> list[str]:
+    """Return the keys to show: those asked for, or those of the config that differ among finished runs."""
+    from memmlp.runs.query import check_key, differing
+
+    if columns is not None:
+        keys = [key.strip() for key in columns.split(",") if key.strip()]
+        for key in keys:
+            check_key(key, records.values(), "--columns")
+        return keys
+    networks = [run for run in listed if records[run.id].get("kind") == "memmlp"]
+    data = [str(records[run.id].get("data_digest")) for run in networks]
+    return differing([run.config for run in networks], data) if len(networks) > 1 else []
+
+
+class Column(NamedTuple):
+    """A column of the list.
+
+    Attributes:
+        name: its head, or the key that it shows.
+        cells: its text for each run.
+        number: whether these are numbers.
+    """
+
+    name: str
+    cells: list[str]
+    number: bool = False
+
+
+def show_runs(records: Sequence[Record], keys: Sequence[str], asked: bool) -> list[str]:
+    """Print the runs as a table, and return the keys for which there was no room.
+
+    Args:
+        records: what may be asked of each run, and its `age`.
+        keys: the keys whose values are shown.
+        asked: whether these were asked for, so that they are shown whatever room there is, without results.
+    """
+    columns = list(_columns(records, keys, {} if asked else SHOWN))
+    spare = [name for name in SPARED if name not in keys]
+    spare += [] if asked else [*reversed(keys[1:]), "name"]
+    while spare and _width(columns) > console().width:
+        columns = [column for column in columns if column.name != spare[0]]
+        del spare[0]
+    width = max(console().width, _width(columns))
+    Console(highlight=False, markup=False, width=width).print(_lines(columns))
+    return [key for key in keys if key not in {column.name for column in columns}]
+
+
+def _columns(records: Sequence[Record], keys: Sequence[str], numbers: Mapping[str, str]) -> Iterator[Column]:
+    """Yield all columns, with the values of some keys, and with some numbers under heads of ours."""
+    from memmlp.runs.query import data_labels
+
+    yield Column("run", [one["id"] for one in records])
+    for key in ("status", "age"):
+        if key not in keys:
+            yield Column(key, [str(one.get(key) or "-") for one in records])
+    labels = data_labels(records)
+    if numbers:  # the columns that nobody asked for
+        yield Column("name", [_folded(str(one.get("name") or "-"), NAME) for one in records])
+        if len(set(labels) - {"-"}) > 1:
+            yield Column("data", labels)
+    for key in keys:
+        values = labels if key == "data" else [value_text(one, key, whole=not numbers) for one in records]
+        yield Column(key, [_folded(value) for value in values])
+    if any(one.get("tag") for one in records):
+        yield Column("tags", ["\n".join(one.get("tag", ())) for one in records])
+    for name, key in numbers.items():
+        yield Column(name, [number_text(one.get(key)) for one in records], number=True)
+
+
+def _lines(columns: Sequence[Column]) -> Table:
+    """Make the table of some columns, whose texts are folded already."""
+    table = plain_table()
+    table.padding, table.show_edge = (0, 0), False
+    table.caption_justify, table.caption_style = "left", ""
+    table.caption = LEGEND if any(column.number for column in columns) else None
+    for column in columns:
+        table.add_column(_folded(column.name), justify="right" if column.number else "left", no_wrap=True)
+    for cells in zip(*(column.cells for column in columns), strict=True):
+        table.add_row(*cells)
+    return table
+
+
+def _width(columns: Sequence[Column]) -> int:
+    """Return how wide the table of some columns is."""
+    console = Console(width=10_000)
+    return console.measure(_lines(columns)).maximum
+
+
+def _folded(text: str, width: int = FOLD) -> str:
+    """Break a text into lines of some characters, between the words of a key and the items of a list."""
+    lines = [""]
+    for part in re.findall(r"[^.,_/ ]*[.,_/ ]*", text):
+        if lines[-1] and len(lines[-1]) + len(part.rstrip()) > width:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(lines)

@@ -1,0 +1,98 @@
+"""What the commands of runs have in common: a run's record, tables, and values as text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from memmlp.common.errors import InputError
+
+if TYPE_CHECKING:
+    from memmlp.runs.query import Record
+    from memmlp.runs.run import Run
+
+LONGEST = 36  # characters of a value that nobody asked for
+
+
+def recorded(run: Run) -> Record:
+    """Return what may be asked of a run; of one with a damaged file, its id and status alone."""
+    from memmlp.runs.query import record
+
+    try:
+        return record(run)
+    except InputError as error:
+        click.echo(f"memmlp: warning: {error}", err=True)
+        return {"id": run.id, "status": "damaged"}
+
+
+def value_text(record: Record, key: str, whole: bool) -> str:
+    """Return a record's value as text, of a long one its beginning unless the whole is wanted."""
+    from memmlp.runs.query import shown
+
+    text = shown(record[key]) if key in record else "-"
+    return text if whole or len(text) <= LONGEST else f"{text[:LONGEST]}…"
+
+
+def measured_numbers(results: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the numbers among results by dotted key, which may hold settings and digests, too."""
+    from memmlp.runs.identity import flatten
+
+    numbers = {key: value for key, value in flatten(results).items() if isinstance(value, int | float)}
+    return {
+        key: value
+        for key, value in numbers.items()
+        if not key.startswith(("latency.settings", "latency.made"))
+    }
+
+
+def console() -> Console:
+    """Make a console that takes texts as they are."""
+    return Console(highlight=False, markup=False)
+
+
+def plain_table(*columns: str, title: str | None = None) -> Table:
+    """Make a table without a border; long values fold, and no word is cut."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=title, title_justify="left")
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    return table
+
+
+def pairs(facts: Mapping[str, Any], title: str | None = None) -> Table:
+    """Make a table of keys and values."""
+    table = plain_table("", "", title=title)
+    table.show_header = False
+    for key, value in facts.items():
+        table.add_row(key, text_of(value))
+    return table
+
+
+def text_of(value: Any) -> str:
+    """Return a value in few characters."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return "-" if value is None else str(value)
+
+
+def number_text(value: Any) -> str:
+    """Return a number as text; "-" where there is none."""
+    return f"{value:.2f}" if isinstance(value, int | float) else "-"
+
+
+def age(run: Run) -> str:
+    """Return the time since the run started, in its largest whole unit."""
+    try:
+        started = datetime.fromisoformat(run.manifest.get("started", ""))
+        seconds = (datetime.now(UTC) - started).total_seconds()
+    except (TypeError, ValueError):
+        return "-"
+    for unit, size in (("d", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= size:
+            return f"{int(seconds // size)} {unit}"
+    return f"{int(max(seconds, 0))} s"
