@@ -136,7 +136,7 @@ def _of_npm() -> str | None:
     try:
         command = [npm, "config", "get", "registry"]
         said = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False).stdout
-    except (OSError, ValueError, HTTPException) as error:  # a ValueError: an address that is none
+    except (OSError, subprocess.TimeoutExpired):
         return None
     return said.strip() if said.startswith("http") else None
 
@@ -159,10 +159,7 @@ def _download(package: Package, host: str) -> bytes:
     try:
         with urllib.request.urlopen(package.url(host), timeout=SECONDS) as answer:
             content = answer.read(LARGEST)
-    except (
-        OSError,
-        ValueError,
-    ) as error:  # urllib's errors are among them, and so is an address that is none
+    except (OSError, ValueError, HTTPException) as error:  # a ValueError: an address that is none
         reason = error.reason if isinstance(error, URLError) else why_unreadable(error)
         raise InputError(
             f"{package}: cannot be fetched from the npm registry ({reason}); {_way(package)}"
