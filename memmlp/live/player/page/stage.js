@@ -118,7 +118,7 @@ class Body {
 }
 
 // A round limb: one surface of revolution, with a half circle at each end and a line between.
-class Limb {
+export class Limb {
   constructor({ start, end, radii, tip }, material, slim) {
     Object.assign(this, { start, end, tip });
     this.profile = outline(...radii.map(radius => slim * radius));
@@ -132,6 +132,11 @@ class Limb {
   }
 
   pose(joints, paint) {
+    this.place(joints);
+    this.colour(paint);
+  }
+
+  place(joints) {
     const at = joint => new THREE.Vector3().fromArray(joints, 3 * joint);
     let [from, to] = [at(this.start), at(this.end)];
     const along = to.clone().sub(from).normalize();
@@ -139,7 +144,6 @@ class Limb {
     this.mesh.position.copy(from);
     this.mesh.quaternion.setFromUnitVectors(UP, along);
     this.stretch(from.distanceTo(to));
-    this.colour(paint);
   }
 
   // Make the line between the ends as long as the limb; the round ends keep their form.
