@@ -20,13 +20,13 @@ class Drawn(NamedTuple):
 
     Attributes:
         offset: where it begins among all of the graph's, bytes.
-        count: how many numbers it has.
+        size: how many numbers it has.
         kind: their type: float32, float16 or int8.
         scale: their standard deviation about 0, which is that of the weights they stand for.
     """
 
     offset: int
-    count: int
+    size: int
     kind: str
     scale: float
 

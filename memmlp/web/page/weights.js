@@ -3,13 +3,13 @@
 const BYTES = { float32: 4, float16: 2, int8: 1 };
 const ROOT3 = Math.sqrt(3); // a uniform number between -1 and 1 has the standard deviation 1 / sqrt(3)
 
-// parts: [{ offset, count, kind, scale }]; returns the bytes of all of them, or null for none.
+// parts: [{ offset, size, kind, scale }]; returns the bytes of all of them, or null for none.
 export function drawn(parts) {
   if (!parts.length) return null;
   const last = parts.at(-1);
-  const bytes = new ArrayBuffer(last.offset + BYTES[last.kind] * last.count);
+  const bytes = new ArrayBuffer(last.offset + BYTES[last.kind] * last.size);
   const random = uniform(1);
-  for (const { offset, count, kind, scale } of parts) fill[kind](bytes, offset, count, () => ROOT3 * scale * random());
+  for (const { offset, size, kind, scale } of parts) fill[kind](bytes, offset, size, () => ROOT3 * scale * random());
   return new Uint8Array(bytes);
 }
 
