@@ -46,7 +46,9 @@ def atomic_write(path: Path, content: bytes | str) -> None:
 
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
-    """Open a file that is there whole or not at all, even if the machine stops: temporary file, fsync, rename.
+    """Open a file to write that is there whole or not at all, even if the machine stops.
+
+    It is a temporary file, which is synced and renamed at the end.
 
     Raises:
         LeaseLost: if this process held the file's folder and has lost it (memmlp.common.fences).

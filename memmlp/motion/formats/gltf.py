@@ -117,7 +117,8 @@ def _animation(buffer: Buffer, clip: Clip, rest: np.ndarray) -> dict[str, Any]:
 
 def _curves(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the joints' quaternions xyzw (N, 22, 4) and the root's positions (N, 3), metres, float32."""
-    quaternions, roots = [], []
+    quaternions: list[np.ndarray] = []
+    roots: list[np.ndarray] = []
     for part in clip.parts():
         rotations, root = y_up_motion(part, rest)
         before = quaternions[-1][-1] if quaternions else None
@@ -189,8 +190,8 @@ def capsule(joint: int, radii: tuple[float, float], start: np.ndarray, end: np.n
     height = np.concatenate([cap - np.pi / 2, cap])  # latitudes of the rings: start's half sphere, then end's
     normals = np.cos(height)[:, None, None] * ring + np.sin(height)[:, None, None] * along
     centres = np.repeat([start, end], CAP, axis=0)[:, None]
-    radii = np.repeat(radii, CAP)[:, None, None]
-    positions = centres + radii * normals
+    around = np.repeat(radii, CAP)[:, None, None]
+    positions = centres + around * normals
     joints = np.full(normals.shape[0] * AROUND, joint)
     return Mesh(positions.reshape(-1, 3), normals.reshape(-1, 3), joints, _tube(2 * CAP))
 

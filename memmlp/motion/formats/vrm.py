@@ -1,7 +1,7 @@
 """Writes a mannequin as a VRM 1.0 avatar, which anybody may use for anything (CC0).
 
-It is a glTF file with the extension VRMC_vrm (vrm-consortium/vrm-specification, VRMC_vrm-1.0): the 22 joints as
-humanoid bones, in T-pose on the floor, facing +Z. A visor tells where it looks.
+It is a glTF file with the extension VRMC_vrm (vrm-consortium/vrm-specification, VRMC_vrm-1.0): the 22 joints
+as humanoid bones, in T-pose on the floor, facing +Z. A visor tells where it looks.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from memmlp.motion.formats.gltf import (
 from memmlp.motion.formats.humanoid import VRM
 
 COLOURS = ((0.30, 0.42, 0.56, 1.0), (0.012, 0.016, 0.022, 1.0))  # of body and visor, linear RGB and opacity
-VISOR = (0.026, 0.060, 0.055, 0.078)  # metres: radius, half of the width, above and before the head's joint
+VISOR = (0.030, 0.048, 0.058, 0.088)  # metres: radius, half of the width, above and before the head's joint
 
 META = {
     "name": "memmlp mannequin",
@@ -40,7 +40,7 @@ META = {
     "allowExcessivelySexualUsage": True,
     "commercialUsage": "corporation",
     "allowPoliticalOrReligiousUsage": True,
-    "allowAntisocialOrHateUsage": False,
+    "allowAntisocialOrHateUsage": True,
     "creditNotation": "unnecessary",
     "allowRedistribution": True,
     "modification": "allowModificationRedistribution",
@@ -68,7 +68,7 @@ def write_vrm(path: Path, rest: np.ndarray) -> None:
                     "primitives": [primitive(buffer, part, index) for index, part in enumerate(parts)],
                 }
             ],
-            "materials": [_material(name, *look) for name, *look in LOOKS],
+            "materials": [_material(*look) for look in LOOKS],
         },
         buffer,
     )
