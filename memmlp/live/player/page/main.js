@@ -116,7 +116,7 @@ function tell(frame) {
   for (const item of $('trackers').children) item.classList.toggle('held', frame.held.includes(item.dataset.name));
   for (const row of document.querySelectorAll('#latency [data-key]')) {
     const timing = history.timing(row.dataset.key);
-    row.querySelectorAll('td').forEach((cell, i) => { cell.textContent = timing ? timing[i].toFixed(2) : '–'; });
+    row.querySelectorAll('td').forEach((cell, i) => { cell.textContent = timing ? timing[i].toFixed(timing[i] < 10 ? 2 : 0) : '–'; });
   }
   const share = (history.timing('whole')[1] * greeting.fps) / 1000;
   $('share').style.width = `${Math.min(100 * share, 100)}%`;
