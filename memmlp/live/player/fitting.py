@@ -25,7 +25,7 @@ from memmlp.motion.body import ROOT
 
 COUNTDOWN = 5.0  # seconds
 LONGEST = 60.0  # seconds of a countdown
-FAR = 0.35  # metres from a T-pose's joint, beyond which a device is not worn there
+FAR = 0.25  # metres from a T-pose's joint, beyond which a device is not worn there
 ACTIONS = ("calibrate", "touch_floor", "height", "floor", "forget", "cancel")
 
 Tell = Callable[[str, Mapping[str, Any]], None]
