@@ -117,14 +117,15 @@ def _animation(buffer: Buffer, clip: Clip, rest: np.ndarray) -> dict[str, Any]:
 
 def _curves(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the joints' quaternions xyzw (N, 22, 4) and the root's positions (N, 3), metres, float32."""
-    quaternions: list[np.ndarray] = []
-    roots: list[np.ndarray] = []
+    quaternions = np.empty((len(clip), N_JOINTS, 4), "<f4")
+    roots = np.empty((len(clip), 3), "<f4")
+    end = 0
     for part in clip.parts():
         rotations, root = y_up_motion(part, rest)
-        before = quaternions[-1][-1] if quaternions else None
-        quaternions.append(continuous_quaternions(rotations, before).astype("<f4"))
-        roots.append(root.astype("<f4"))
-    return np.concatenate(quaternions), np.concatenate(roots)
+        before = quaternions[end - 1] if end else None
+        here = slice(end, end := end + len(part))
+        quaternions[here], roots[here] = continuous_quaternions(rotations, before), root
+    return quaternions, roots
 
 
 def continuous_quaternions(rotations: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
