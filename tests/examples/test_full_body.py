@@ -29,7 +29,7 @@ sys.modules.update(torch=None, memmlp=None)  # neither can be imported
 sys.argv.pop(0)
 runpy.run_path(sys.argv[0], run_name="__main__")
 """
-DIST = ("dist/ort.wasm.bundle.min.mjs", "dist/ort-wasm-simd-threaded.wasm")
+FILES = ("ort.wasm.bundle.min.mjs", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm")
 HEADERS = [Path(folder) / "onnxruntime" for folder in ("/usr/include", "/usr/local/include")]
 Command = list[str]
 
@@ -44,7 +44,7 @@ def node(folder: Path) -> Command:
     if shutil.which("node") is None:
         pytest.skip("node is not installed")
     try:
-        files = npm.read(npm.ONNXRUNTIME_WEB, ["package.json", *DIST])
+        files = npm.read(npm.ONNXRUNTIME_WEB, ["package.json", *(f"dist/{name}" for name in FILES)])
     except InputError as error:
         pytest.skip(str(error))
     for name, content in files.items():

@@ -4,7 +4,7 @@
     blender --background --python animate.py -- motion.npz --out body.blend --check
 
 The first line runs the network (`memmlp export RUN --scope full --space amass --out body.onnx`) in any Python
-with NumPy and ONNX Runtime; the second needs Blender alone. With `pip install bpy` it is `python animate.py ...`.
+with NumPy and ONNX Runtime; the second needs Blender alone (with `pip install bpy`: `python animate.py ...`).
 `--check` plays all frames, and fails where a bone is more than a millimetre from its joint.
 """
 
@@ -128,7 +128,7 @@ def save(path: Path) -> None:
     import bpy
 
     if path.suffix == ".glb":
-        bpy.ops.export_scene.gltf(filepath=str(path.resolve()), export_animations=True)
+        bpy.ops.export_scene.gltf(filepath=str(path.resolve()), export_anim_slide_to_zero=True)
     else:
         bpy.ops.wm.save_as_mainfile(filepath=str(path.resolve()))
 
