@@ -17,17 +17,18 @@ from memmlp.common.progress import tell
 from memmlp.deploy.export import export
 from memmlp.deploy.quantization import quantise
 from memmlp.live.full_graph import export_full
+from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES
-from memmlp.motion.body import FPS, TRACKED
+from memmlp.live.wearer import stature
+from memmlp.motion.body import FPS, JOINTS, PARENTS, TRACKED
 from memmlp.networks.streaming import StreamingGraph, has_stream, streaming
 from memmlp.networks.window_model import WindowModel
 from memmlp.web.weights import without_weights
 
 SPACE = SPACES["openxr"]  # of everything on the site
-CHIN, EYES = 0.870, 0.936
-"""Heights over a person's own: of the chin, which SMPL's head joint is at, and of the eyes (Drillis and Contini
-1966, in Winter, Biomechanics and Motor Control of Human Movement, fig. 4.1)."""
-SOLE = 0.03  # metres from the lowest joint to the floor
+EYES = 0.936
+"""The height of the eyes over that of the person (Drillis and Contini 1966, in Winter, Biomechanics and Motor
+Control of Human Movement, fig. 4.1), by which a headset tells how tall its wearer is."""
 
 Entry = dict[str, Any]
 
@@ -149,9 +150,12 @@ def body_of(rest: np.ndarray) -> Entry:
         rest: joints in the rest pose (22, 3), metres, SMPL's body frame.
 
     Returns:
-        Head and wrists in the T-pose and the lowest joint's height, in the site's frame of reference, and
-        about how tall such a person is, metres.
+        Head and wrists in the T-pose and the lowest joint's height, in the site's frame of reference, and the
+        body's height, metres; and EYES.
     """
-    floor = float(rest[:, 1].min())
-    height = (float(rest[TRACKED[0], 1]) - floor + SOLE) / CHIN
-    return {"rest": (rest[list(TRACKED)] * SPACE.body).tolist(), "floor": floor, "height": height, "eyes": EYES}
+    return {
+        "rest": (rest[list(TRACKED)] * SPACE.body).tolist(),
+        "floor": float(rest[:, 1].min()),
+        "height": stature(BodyTree(JOINTS, PARENTS, rest)),
+        "eyes": EYES,
+    }

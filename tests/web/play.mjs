@@ -10,7 +10,8 @@ Object.assign(ort.env.wasm, { numThreads: 1, wasmBinary: readFileSync(wasm) });
 const session = await Session.open(ort, new Uint8Array(readFileSync(model)));
 const { body, parts } = JSON.parse(readFileSync(job));
 const answers = [];
-for (const { calibrate, scale, samples } of parts) {
+for (const { calibrate, height, samples } of parts) {
+  const scale = height ? body.height / height : 1;
   const stream = new Stream({ fps: 60, body, scale, run: frame => session.pose(frame) });
   if (calibrate) stream.calibrate(...calibrate);
   const poses = [];

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 
 HERE, SPACE = Path(__file__).parent, SPACES["openxr"]
 TOLERANCE = 1e-4  # metres, and of rotation matrices
-SCALE = 1.05
+HEIGHT = 1.6  # metres, of another person than the network's
 
 
 def samples(times: np.ndarray, lost: dict[int, tuple[int, ...]] | None = None) -> list[dict[str, Any]]:
@@ -73,24 +73,20 @@ PARTS: dict[str, dict[str, Any]] = {
     "lost hands": {"samples": samples(np.arange(144) / 72, {**dict.fromkeys(range(30, 70), (1,)), **dict.fromkeys(range(60, 100), (1, 2))})},
     "lost head": {"samples": samples(np.arange(100) / 60, {**dict.fromkeys(range(12), (0, 2)), **dict.fromkeys(range(50, 80), (0,))})},
     "gaps": {"samples": samples(gaps())},
-    "calibrated": {"samples": samples(np.arange(90) / 90), "calibrate": t_pose(), "scale": SCALE},
+    "calibrated": {"samples": samples(np.arange(90) / 90), "calibrate": t_pose(), "height": HEIGHT},
 }  # fmt: skip
 
 
 def in_python(step: Path, part: dict[str, Any]) -> tuple[Stream, list[Pose]]:
-    """The same by Python's Stream; a scale is one of what goes in and comes out."""
-    stream, scale = Stream(step, space="openxr"), part.get("scale", 1)
+    """The same by Python's Stream."""
+    stream = Stream(step, space="openxr", height=part.get("height"))
 
     def given(trackers: list[dict[str, Any] | None]) -> list[Any]:
-        return [t and (scale * np.array(t["position"]), np.array(t["rotation"])) for t in trackers]
+        return [t and (np.array(t["position"]), np.array(t["rotation"])) for t in trackers]
 
     if "calibrate" in part:
         stream.calibrate(*given(part["calibrate"]))
-    poses = [stream.step(*given(one["trackers"]), time=one["time"]) for one in part["samples"]]
-    return stream, [
-        pose._replace(positions=pose.positions / scale, position_branch=pose.position_branch / scale)
-        for pose in poses
-    ]
+    return stream, [stream.step(*given(one["trackers"]), time=one["time"]) for one in part["samples"]]
 
 
 @pytest.fixture(scope="module")

@@ -160,9 +160,9 @@ class Play {
     this.pause.textContent = this.history.paused ? 'Play' : 'Pause';
     this.time.textContent = `${frame.time.toFixed(2)} s`;
     this.mean.textContent = frame.mean.toFixed(1);
-    const timing = this.history.timing();
-    this.middle.textContent = timing.median.toFixed(1);
-    this.p95.textContent = timing.p95.toFixed(1);
+    const [middle, p95] = this.history.timing('ms');
+    this.middle.textContent = middle.toFixed(1);
+    this.p95.textContent = p95.toFixed(1);
     this.frames.textContent = frame.number + 1;
     this.lost.textContent = this.dropped;
   }

@@ -19,7 +19,7 @@ export class Stream {
   // run: takes { positions (9 numbers), rotations (27), fresh } of a frame and resolves to { positions (66),
   //      rotations (198), joints (66) } as the full graph gives them; `fresh` says that the past is to be forgotten.
   // offsets: { positions, rotations } of the joints on the devices, as `calibrate` finds them; null for none.
-  // scale: the height of the network's body over the person's.
+  // scale: the height of the network's body over the person's, as memmlp.live.wearer has it; the floor is at height 0.
   constructor({ fps, body, run, offsets = null, scale = 1 }) {
     Object.assign(this, { body, run, offsets, scale });
     this.trackers = new TrackerFrames(body, fps);
@@ -51,14 +51,14 @@ export class Stream {
     const devices = [head, left, right].map(read);
     const missing = TRACKERS.filter((_, i) => devices[i].lost);
     if (missing.length) throw new Error(`no pose of ${missing.join(', ')}; all three are needed`);
-    const world = devices.map(device => device.position.map(x => this.scale * x));
+    const world = devices.map(device => times(device.position, this.scale));
     const across = minus(world[1], world[2]);
     if (Math.hypot(across[0], across[2]) < APART) throw new Error('the hands are not apart; stand in T-pose, the arms to the sides');
     const pose = tPose(this.body, world[0], Math.atan2(across[2], -across[0]));
     const away = [0, 1, 2].map(axis => mean(world.map((place, i) => place[axis] - pose.positions[i][axis])));
     this.offsets = {
       positions: devices.map((device, i) =>
-        rotate(inverse(device.rotation), minus(plus(pose.positions[i], away), world[i]))),
+        rotate(inverse(device.rotation), minus(times(plus(pose.positions[i], away), 1 / this.scale), device.position))),
       rotations: devices.map((device, i) => multiply(inverse(device.rotation), pose.rotations[i])),
     };
     this.reset();
@@ -67,14 +67,13 @@ export class Stream {
 
   // The joints on the devices, in metres of the network's body.
   joints(devices) {
-    const positions = devices.map(device => device.position.map(x => this.scale * x));
     const rotations = devices.map(device => device.rotation);
-    const lost = devices.map(device => device.lost);
-    if (!this.offsets) return { positions, rotations, lost };
+    const positions = devices.map(device => device.position);
+    const on = this.offsets;
     return {
-      positions: positions.map((place, i) => plus(place, rotate(rotations[i], this.offsets.positions[i]))),
-      rotations: rotations.map((rotation, i) => multiply(rotation, this.offsets.rotations[i])),
-      lost,
+      positions: positions.map((place, i) => times(on ? plus(place, rotate(rotations[i], on.positions[i])) : place, this.scale)),
+      rotations: rotations.map((rotation, i) => (on ? multiply(rotation, on.rotations[i]) : rotation)),
+      lost: devices.map(device => device.lost),
     };
   }
 
@@ -99,6 +98,7 @@ export class Stream {
 // The heading of a head, radians to the left of -Z.
 export const heading = tracker => headingOf(tracker.rotation);
 
+const times = (vector, factor) => vector.map(x => factor * x);
 const mean = numbers => numbers.reduce((a, b) => a + b, 0) / numbers.length;
 
 // A tracker with a unit quaternion; one that is null, far away, or has NaN or a quaternion of zeros is lost.

@@ -171,7 +171,7 @@ class Wear {
       worn.calibrated = true;
       this.stand(trackers[0]);
       mirror.tell(`Calibrated, ${worn.tall.toFixed(2)} m tall.`, 'Pull a trigger or pinch to do it again.');
-      worn.tape?.push({ calibrated: worn.stream.offsets, scale: worn.stream.scale });
+      worn.tape?.push({ calibrated: worn.stream.offsets, height: worn.tall });
     } catch (error) {
       mirror.tell('Not calibrated:', error.message, INVITE[0]);
     }

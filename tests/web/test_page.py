@@ -1,0 +1,184 @@
+"""The site in a browser with a headset in software: worn, played, timed and copied, all of it without the server."""
+
+from __future__ import annotations
+
+import functools
+import json
+import threading
+from collections.abc import Iterator
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from chromium import Browser
+from web.conftest import PERSON, Made, package_files
+
+from memmlp.common.npm import IWER
+from memmlp.live.stream import Offsets, Stream
+from memmlp.tables.browser_rows import read
+
+pytestmark = pytest.mark.slow
+
+HEADSET = Path(__file__).with_name("headset.js")
+SITE = "document.documentElement.dataset"
+TOLERANCE = 1e-4  # metres
+
+
+class Server(ThreadingHTTPServer):
+    """Any static server, which counts what it is asked for in vain."""
+
+    def __init__(self, folder: Path):
+        self.missing: list[str] = []
+        outer = self
+
+        class Handler(SimpleHTTPRequestHandler):
+            def log_request(self, code: Any = "-", size: Any = "-") -> None:
+                if int(code) >= 400:
+                    outer.missing.append(self.path)
+
+        super().__init__(("127.0.0.1", 0), functools.partial(Handler, directory=folder))
+        self.url = f"http://127.0.0.1:{self.server_port}/"
+        self.thread = threading.Thread(target=self.serve_forever)
+        self.thread.start()
+
+    def stop(self) -> None:
+        """End it."""
+        self.shutdown()
+        self.server_close()
+        self.thread.join()
+
+
+@pytest.fixture(scope="module")
+def browser(site: Made, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """The site in a browser with a headset, after the server is gone."""
+    (script,) = package_files(IWER, "build/iwer.min.js")
+    with Browser(tmp_path_factory.mktemp("profile"), 360, 280) as running:
+        running.before(script.decode() + HEADSET.read_text())
+        running.before("navigator.clipboard.writeText = async text => { window.copied = text; }")
+        server = Server(site.folder)
+        try:
+            running.open(server.url)
+            running.wait(f"{SITE}.offline == 'ready' && {SITE}.wear == 'ready'")
+            running.wait("navigator.serviceWorker.controller !== null")
+        finally:
+            server.stop()
+        assert server.missing == []
+        yield running
+        assert not running.errors
+
+
+def go(browser: Browser, page: str, until: str) -> None:
+    """Load a page anew, from what the browser keeps, and wait for something."""
+    origin = browser.value("location.origin")
+    browser.open("about:blank")
+    browser.open(f"{origin}/#/{page}")
+    browser.wait(until)
+
+
+def joints() -> list[list[dict[str, Any]]]:
+    """The person's head and wrists, frame by frame, as the site's clip has them."""
+    from memmlp.web.clips import NUMBERS, packed
+
+    numbers = np.frombuffer(packed("", PERSON.frames.numpy(), 4.0).content, "<f4").reshape(-1, NUMBERS)
+    return [
+        [{"position": row[3 * i : 3 * i + 3].tolist(), "rotation": row[9 + 4 * i : 13 + 4 * i].tolist()} for i in range(3)]
+        for row in numbers
+    ]  # fmt: skip
+
+
+def t_pose(site: Made) -> list[dict[str, Any]]:
+    """Head and wrists of who stands in T-pose."""
+    body = json.loads((site.folder / "site.json").read_text())["networks"][0]["body"]
+    rest = np.array(body["rest"])
+    return [{"position": place, "rotation": [0, 0, 0, 1]} for place in (rest - [0, body["floor"], 0]).tolist()]
+
+
+def worn(browser: Browser, site: Made) -> dict[str, Any]:
+    """Enter VR, calibrate in T-pose, move as the clip does, leave, and save the recording."""
+    go(browser, "wear", f"{SITE}.wear == 'ready'")
+    browser.value("document.querySelector('#record').click()")
+    browser.value("document.querySelector('#immersive-vr').click()")
+    browser.wait("window.headset.session && Number(document.querySelector('#frames').textContent) > 0")
+    browser.resolved("headset.learn()")
+    browser.resolved("import('./headset.js').then(module => { window.offsets = module.usualOffsets('controllers'); })")
+    browser.value(f"window.tPose = {json.dumps(t_pose(site))}; headset.pull()")
+    browser.resolved("headset.play(Array(210).fill(tPose), offsets)")
+    browser.resolved(f"headset.play({json.dumps(joints())}, offsets)")
+    browser.resolved("headset.session.end()")
+    browser.value("document.querySelector('#save').click()")
+    return json.loads(browser.wait("headset.saved"))
+
+
+@pytest.fixture(scope="module")
+def recording(browser: Browser, site: Made) -> dict[str, Any]:
+    """The recording of a wearer."""
+    return worn(browser, site)
+
+
+def test_the_wearer_s_body_is_python_s(recording: dict[str, Any], site: Made):
+    """The samples that the page recorded, through Python's Stream: the same joints to 1e-4 m."""
+    stream, apart = Stream(site.step, space="openxr"), []
+    calibrated = [sample for sample in recording["samples"] if "calibrated" in sample]
+    assert len(calibrated) == 1
+    begun = recording["samples"].index(calibrated[0])
+    offsets = Offsets(*(calibrated[0]["calibrated"][key] for key in ("positions", "rotations")))
+    stream = Stream(site.step, space="openxr", height=calibrated[0]["height"])
+    found = stream.calibrate(*given(recording["samples"][begun - 1]["trackers"]))
+    np.testing.assert_allclose(found.positions, offsets.positions, atol=1e-3)  # a sample beside it
+    stream.offsets = matrices(offsets)
+    for sample in recording["samples"][begun + 1 :]:
+        pose = stream.step(*given(sample["trackers"]), time=sample["time"])
+        if sample["pose"]:
+            made = np.array(sample["pose"]["positions"]).reshape(-1, 3)
+            apart.append(np.linalg.norm(made - pose.positions, axis=1).max())
+        assert list(pose.held) == sample["held"]
+    assert len(apart) > 20
+    assert max(apart) <= TOLERANCE
+
+
+def given(trackers: list[dict[str, Any] | None]) -> list[Any]:
+    """Trackers as Python's Stream takes them."""
+    return [t and (t["position"], t["rotation"]) for t in trackers]
+
+
+def matrices(offsets: Offsets) -> Offsets:
+    """Offsets with matrices in place of the page's quaternions."""
+    from memmlp.live.rotations import quaternion_to_matrix
+
+    return Offsets(np.array(offsets.positions), quaternion_to_matrix(np.array(offsets.rotations)))
+
+
+def test_a_clip_is_played(browser: Browser):
+    go(browser, "play", f"Number({SITE}.shown) > 20")
+    browser.value("document.querySelector('#pause').click()")
+    browser.wait("document.querySelector('#pause').textContent == 'Play'")
+    assert 0 < float(browser.value("document.querySelector('#mean').textContent")) < 200
+
+
+def test_the_bench_s_rows_go_into_table_17(browser: Browser, tmp_path: Path):
+    go(browser, "bench", f"{SITE}.bench == 'ready'")
+    browser.value("document.querySelector('#device').value = 'Test headset'")
+    browser.value("document.querySelector('#start').click()")
+    browser.wait(f"{SITE}.bench == 'done'")
+    browser.value("document.querySelector('#copy').click()")
+    file = tmp_path / "rows.json"
+    file.write_text(browser.wait("window.copied"))
+    measured = read(file)
+    assert measured.about["device"] == "Test headset"
+    kinds = [(row["network"], row["graph"], row["precision"]) for row in measured.rows]
+    assert kinds == [
+        ("AvatarPoser", "naive", "fp32"), ("tiny", "naive", "fp32"), ("tiny", "streaming", "fp32"),
+        ("tiny", "streaming", "int8"),
+    ]  # fmt: skip
+    assert measured.rows[0]["ratio_to_avatar_poser"] == 1
+    assert {row["steps"] for row in measured.rows} == {500}
+    assert [row["whole_median_ms"] is not None for row in measured.rows] == [True, True, True, False]
+
+
+def test_no_page_is_wider_than_a_phone(browser: Browser):
+    browser.size(390, 844)
+    for page in ("wear", "play", "bench"):
+        go(browser, page, "document.querySelector('.page > *') !== null")
+        assert browser.value("document.documentElement.scrollWidth") <= 390
