@@ -11,6 +11,7 @@ import pytest
 from chromium import Browser
 from processes import PATIENCE
 
+from memmlp.live.player.fitting import Fitting
 from memmlp.live.player.play import greeting, play
 from memmlp.live.player.server import Hub, Server
 from memmlp.live.player.sources import ClipSource, TrackedClip
@@ -85,6 +86,42 @@ def test_it_says_what_it_waits_for_and_when_the_command_has_ended(browser: Brows
         server.hub.publish({"dropped": 0, "malformed": 3})
         browser.wait("document.querySelector('#status').textContent.endsWith('3 packets malformed')")
     browser.wait("document.querySelector('#status').textContent == 'not connected'")
+
+
+class Worn(ClipSource):
+    """A clip that counts as somebody's devices."""
+
+    worn = True
+
+
+def test_the_wearer_fits_the_stream_from_the_page(browser: Browser, network: Path, clip: TrackedClip):
+    stopped, source, stream = threading.Event(), Worn(clip, 60), Stream(network)
+    hub = Hub(greeting(source, "tiny"))
+    fitting = Fitting(stream, "amass", None, hub.tell)
+    with Server(hub, 0, ask=fitting.ask) as server:
+        parts = (stream, source, hub.publish, stopped, None, fitting)
+        loop = threading.Thread(target=play, args=parts, daemon=True)
+        loop.start()
+        browser.open(server.url)
+        browser.wait("document.querySelector('#height').value == '172'")
+        for name, value in (("height", 186), ("floor", 5)):
+            change = f"i.value = {value}; i.dispatchEvent(new Event('change'))"
+            browser.value(f"(i => {{ {change} }})(document.querySelector('#{name}'))")
+        browser.wait("document.querySelector('#said').textContent.includes('5 cm')")
+        assert (stream.wearer.height, stream.wearer.floor) == (1.86, 0.05)
+        browser.click("#calibrate")
+        browser.wait("!document.querySelector('#countdown').hidden")
+        assert browser.value("document.querySelector('#what').textContent") == "Stand in a T-pose"
+        assert 1 <= int(browser.value("document.querySelector('#seconds').textContent")) <= 5
+        browser.click("#cancel")
+        browser.wait("document.querySelector('#countdown').hidden")
+        fitting.ask({"action": "calibrate", "value": 0})  # nobody in the clip stands in a T-pose
+        browser.wait("document.querySelector('#said').classList.contains('failed')")
+        whole = "Number(document.querySelector('#latency [data-key=whole] td').textContent)"
+        assert browser.wait(whole) > 0
+        stopped.set()
+        loop.join(PATIENCE)
+    assert browser.errors == []
 
 
 def test_it_fits_a_phone_in_the_dark(tmp_path: Path, url: str):

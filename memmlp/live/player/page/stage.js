@@ -54,12 +54,23 @@ export class Stage {
     this.grey = colour('--truth');
   }
 
+  // Show a VRM avatar in place of the round limbs, as long as `dressed` is true.
+  wear(avatar) {
+    this.avatar = avatar;
+    this.dressed = true;
+    this.scene.add(avatar.scene);
+  }
+
   show(frame) {
     const { joints, truth, errors } = frame;
     const known = errors !== null;
-    this.prediction.pose(joints, known ? this.heat.bind(null, errors) : () => this.grey);
-    this.truth.group.visible = known;
-    if (known) this.truth.pose(truth, () => this.grey);
+    const dressed = Boolean(this.avatar && this.dressed);
+    if (this.avatar) this.avatar.scene.visible = dressed;
+    this.prediction.group.visible = !dressed;
+    this.truth.group.visible = known && !dressed;
+    if (dressed) this.avatar.pose(frame.turns, joints);
+    else this.prediction.pose(joints, known ? this.heat.bind(null, errors) : () => this.grey);
+    if (known && !dressed) this.truth.pose(truth, () => this.grey);
     this.follow(truth ?? joints, frame.restarted);
   }
 
