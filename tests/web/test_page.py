@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 import threading
-from collections.abc import Iterator
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -50,23 +49,25 @@ class Server(ThreadingHTTPServer):
         self.thread.join()
 
 
-@pytest.fixture(scope="module")
-def browser(site: Made, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """The site in a browser with a headset, after the server is gone."""
+def test_it_is_worn_played_timed_and_copied_without_the_server(site: Made, tmp_path: Path):
+    """In one browser, whose start and first load take seconds."""
     (script,) = package_files(IWER, "build/iwer.min.js")
-    with Browser(tmp_path_factory.mktemp("profile"), 360, 280) as running:
-        running.before(script.decode() + HEADSET.read_text())
-        running.before("navigator.clipboard.writeText = async text => { window.copied = text; }")
+    with Browser(tmp_path / "profile", 360, 280) as browser:
+        browser.before(script.decode() + HEADSET.read_text())
+        browser.before("navigator.clipboard.writeText = async text => { window.copied = text; }")
         server = Server(site.folder)
         try:
-            running.open(server.url)
-            running.wait(f"{SITE}.offline == 'ready' && {SITE}.wear == 'ready'")
-            running.wait("navigator.serviceWorker.controller !== null")
+            browser.open(server.url)
+            browser.wait(f"{SITE}.offline == 'ready' && {SITE}.wear == 'ready'")
+            browser.wait("navigator.serviceWorker.controller !== null")
         finally:
             server.stop()
         assert server.missing == []
-        yield running
-        assert not running.errors
+        check_wearer(worn(browser, site), site)
+        check_play(browser)
+        check_bench(browser, tmp_path / "rows.json")
+        check_phone(browser)
+        assert browser.errors == []
 
 
 def go(browser: Browser, page: str, until: str) -> None:
@@ -111,20 +112,13 @@ def worn(browser: Browser, site: Made) -> dict[str, Any]:
     return json.loads(browser.wait("headset.saved"))
 
 
-@pytest.fixture(scope="module")
-def recording(browser: Browser, site: Made) -> dict[str, Any]:
-    """The recording of a wearer."""
-    return worn(browser, site)
-
-
-def test_the_wearer_s_body_is_python_s(recording: dict[str, Any], site: Made):
+def check_wearer(recording: dict[str, Any], site: Made) -> None:
     """The samples that the page recorded, through Python's Stream: the same joints to 1e-4 m."""
-    stream, apart = Stream(site.step, space="openxr"), []
     calibrated = [sample for sample in recording["samples"] if "calibrated" in sample]
     assert len(calibrated) == 1
     begun = recording["samples"].index(calibrated[0])
     offsets = Offsets(*(calibrated[0]["calibrated"][key] for key in ("positions", "rotations")))
-    stream = Stream(site.step, space="openxr", height=calibrated[0]["height"])
+    stream, apart = Stream(site.step, space="openxr", height=calibrated[0]["height"]), []
     found = stream.calibrate(*given(recording["samples"][begun - 1]["trackers"]))
     np.testing.assert_allclose(found.positions, offsets.positions, atol=1e-3)  # a sample beside it
     stream.offsets = matrices(offsets)
@@ -150,20 +144,21 @@ def matrices(offsets: Offsets) -> Offsets:
     return Offsets(np.array(offsets.positions), quaternion_to_matrix(np.array(offsets.rotations)))
 
 
-def test_a_clip_is_played(browser: Browser):
+def check_play(browser: Browser) -> None:
+    """A clip is played, and its error shown."""
     go(browser, "play", f"Number({SITE}.shown) > 20")
     browser.value("document.querySelector('#pause').click()")
     browser.wait("document.querySelector('#pause').textContent == 'Play'")
     assert 0 < float(browser.value("document.querySelector('#mean').textContent")) < 200
 
 
-def test_the_bench_s_rows_go_into_table_17(browser: Browser, tmp_path: Path):
+def check_bench(browser: Browser, file: Path) -> None:
+    """The bench's rows are such as Table 17 takes."""
     go(browser, "bench", f"{SITE}.bench == 'ready'")
     browser.value("document.querySelector('#device').value = 'Test headset'")
     browser.value("document.querySelector('#start').click()")
     browser.wait(f"{SITE}.bench == 'done'")
     browser.value("document.querySelector('#copy').click()")
-    file = tmp_path / "rows.json"
     file.write_text(browser.wait("window.copied"))
     measured = read(file)
     assert measured.about["device"] == "Test headset"
@@ -177,7 +172,8 @@ def test_the_bench_s_rows_go_into_table_17(browser: Browser, tmp_path: Path):
     assert [row["whole_median_ms"] is not None for row in measured.rows] == [True, True, True, False]
 
 
-def test_no_page_is_wider_than_a_phone(browser: Browser):
+def check_phone(browser: Browser) -> None:
+    """No page is wider than a phone."""
     browser.size(390, 844)
     for page in ("wear", "play", "bench"):
         go(browser, page, "document.querySelector('.page > *') !== null")

@@ -26,10 +26,11 @@ export class Stream {
     this.reset();
   }
 
-  // Begin anew: the next sample is the first.
+  // Begin anew: the next sample is the first. Its frame still waits for those that are being worked on.
   reset() {
     this.trackers.reset();
-    this.newest = Promise.resolve(null);
+    const forget = () => null;
+    this.newest = (this.newest ?? Promise.resolve()).then(forget, forget);
   }
 
   // Take in one sample, { position, rotation } of each tracker or null where it is lost, at a time in seconds of any

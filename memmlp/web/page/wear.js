@@ -191,12 +191,15 @@ class Wear {
     if (worn.waiting >= AWAITED) return worn.skipped++;
     worn.waiting++;
     const start = performance.now();
+    const noted = { time, trackers, pose: null, held: null };
+    worn.tape?.push(noted);
     worn.stream.step(...trackers, time).then(pose => {
       worn.waiting--;
       if (pose.fresh) worn.times.push(performance.now() - start);
       if (worn.times.length > TIMED) worn.times.shift();
       if (pose.positions) this.mirror.show(pose.positions);
-      worn.tape?.push({ time, trackers, pose: pose.fresh ? { time: pose.time, positions: [...pose.positions] } : null, held: pose.held });
+      noted.held = pose.held;
+      if (pose.fresh && worn.tape) noted.pose = { time: pose.time, positions: [...pose.positions] };
     }, error => {
       worn.waiting--;
       this.mirror.tell('The network stopped:', error.message);
