@@ -82,9 +82,7 @@ class Browser:
 
     def resolved(self, expression: str) -> Any:
         """What a promise on the page resolves to."""
-        result = self.call(
-            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
-        )
+        result = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 

@@ -84,7 +84,9 @@ def read(path: Path) -> Measured:
     _check(path, "", found, FILE)
     for index, row in enumerate(rows):
         _check(path, f"rows[{index}].", row, ROW)
-    return Measured({key: _shown(found[key]) for key in FILE}, tuple({k: _shown(r[k]) for k in ROW} for r in rows))
+    return Measured(
+        {key: _shown(found[key]) for key in FILE}, tuple({k: _shown(r[k]) for k in ROW} for r in rows)
+    )
 
 
 _ALLOWED = "allowed is what the bench of a site of memmlp web copies or saves"

@@ -100,7 +100,9 @@ def check_place(out: Path) -> None:
     if out.exists() and not out.is_dir():
         raise InputError(f"--out {out}: a file; allowed is a new folder, or a site that is to be replaced")
     if out.is_dir() and any(out.iterdir()) and "packages" not in read_json(out / ABOUT):
-        raise InputError(f"--out {out}: has something else in it; allowed is a new folder, or an earlier site")
+        raise InputError(
+            f"--out {out}: has something else in it; allowed is a new folder, or an earlier site"
+        )
     if not out.absolute().parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}")
 

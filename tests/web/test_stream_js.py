@@ -28,7 +28,9 @@ def samples(times: np.ndarray, lost: dict[int, tuple[int, ...]] | None = None) -
     """A person's trackers at times, some of them lost, as the page takes them."""
     person = wearer.person(times - times[0])
     positions = SPACE.positions_out(person.positions)
-    rotations = matrix_to_quaternion(SPACE.rotations_out(person.rotations).reshape(-1, 3, 3)).reshape(-1, 3, 4)
+    rotations = matrix_to_quaternion(SPACE.rotations_out(person.rotations).reshape(-1, 3, 3)).reshape(
+        -1, 3, 4
+    )
     made = []
     for index, time in enumerate(times):
         gone = (lost or {}).get(index, ())
@@ -42,7 +44,11 @@ def samples(times: np.ndarray, lost: dict[int, tuple[int, ...]] | None = None) -
 
 def jittered(seconds: float, hz: float) -> np.ndarray:
     """Times of a device whose clock is no good, among them one twice and one set back a little."""
-    times = 100 + np.arange(0, seconds, 1 / hz) + np.random.default_rng(0).uniform(-2e-3, 2e-3, round(seconds * hz))
+    times = (
+        100
+        + np.arange(0, seconds, 1 / hz)
+        + np.random.default_rng(0).uniform(-2e-3, 2e-3, round(seconds * hz))
+    )
     times[20], times[30] = times[19], times[29] - 0.1
     return times
 
@@ -103,7 +109,15 @@ def answers(site: Made, node: str, tmp_path_factory: pytest.TempPathFactory) -> 
         (page / Path(name).name).write_bytes((site.folder / name).read_bytes())
     job = folder / "job.json"
     job.write_text(json.dumps({"body": entry["body"], "parts": list(PARTS.values())}))
-    command = [node, HERE / "play.mjs", page, page / "wasm.js", folder / "ort.wasm", folder / "model.onnx", job]
+    command = [
+        node,
+        HERE / "play.mjs",
+        page,
+        page / "wasm.js",
+        folder / "ort.wasm",
+        folder / "model.onnx",
+        job,
+    ]
     finished([str(word) for word in command])
     return dict(zip(PARTS, json.loads(Path(f"{job}.answer").read_text()), strict=True))
 
@@ -114,17 +128,25 @@ def test_it_is_python_s_stream(name: str, site: Made, answers: dict[str, Any]):
     stream, expected = in_python(site.step, PARTS[name])
     found = answers[name]["poses"]
     for key in ("held", "fresh", "restarted"):
-        told = [list(value) if key == "held" else value for value in (getattr(pose, key) for pose in expected)]
+        told = [
+            list(value) if key == "held" else value for value in (getattr(pose, key) for pose in expected)
+        ]
         assert [pose[key] for pose in found] == told
     np.testing.assert_allclose([p["time"] for p in found], [p.time for p in expected], atol=1e-9)
-    for theirs, ours in (("positions", "positions"), ("rotations", "rotations"), ("joints", "position_branch")):
+    for theirs, ours in (
+        ("positions", "positions"),
+        ("rotations", "rotations"),
+        ("joints", "position_branch"),
+    ):
         made = np.array([pose[theirs] for pose in found])
         wanted = np.array([getattr(pose, ours).ravel() for pose in expected])
         np.testing.assert_allclose(made, wanted, atol=TOLERANCE)
     if stream.offsets is not None:
         offsets = answers[name]["offsets"]
         np.testing.assert_allclose(offsets["positions"], stream.offsets.positions, atol=1e-9)
-        turns = np.abs((np.array(offsets["rotations"]) * matrix_to_quaternion(stream.offsets.rotations)).sum(1))
+        turns = np.abs(
+            (np.array(offsets["rotations"]) * matrix_to_quaternion(stream.offsets.rotations)).sum(1)
+        )
         np.testing.assert_allclose(turns, 1, atol=1e-9)
 
 

@@ -33,7 +33,6 @@ export class Mirror {
     this.scene.add(this.own, this.image, this.place);
     this.visible(false);
     this.stand([0, 1.5, 0], 0);
-    this.renderer.setAnimationLoop(() => this.draw());
   }
 
   room() {
@@ -100,20 +99,8 @@ export class Mirror {
 
   visible(is) { this.own.visible = this.image.visible = is; }
 
-  draw() {
-    const { renderer } = this;
-    if (!renderer.xr.isPresenting) {
-      const { clientWidth: width, clientHeight: height } = renderer.domElement.parentElement;
-      if (this.width !== width || this.height !== height) {
-        Object.assign(this, { width, height });
-        renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
-        renderer.setSize(width, height, false);
-        this.camera.aspect = width / Math.max(height, 1);
-        this.camera.updateProjectionMatrix();
-      }
-    }
-    renderer.render(this.scene, this.camera);
-  }
+  // Draw the scene for a session; canvas and camera are the session's then.
+  draw() { this.renderer.render(this.scene, this.camera); }
 
   dispose() {
     this.renderer.setAnimationLoop(null);

@@ -22,7 +22,7 @@ export function wear(page, site) {
 
 class Wear {
   constructor(page, site) {
-    Object.assign(this, { page, site, network: site.networks[0], heard: null });
+    Object.assign(this, { page, site, network: site.networks[0], worn: null });
     this.canvas = h('canvas', { 'aria-label': 'What is seen in the mirror' });
     this.trouble = h('p', { class: 'trouble' }, 'Loading the network.');
     this.height = h('input', { type: 'number', id: 'height', min: 100, max: 230, placeholder: 'by headset' });
@@ -33,7 +33,6 @@ class Wear {
     this.layout();
     try {
       this.mirror = new Mirror(this.canvas, site);
-      window.dispatchEvent(new Event('mirror'));
     } catch (error) {
       this.trouble.textContent = `This browser draws no WebGL: ${error.message}`;
       return;
@@ -79,7 +78,7 @@ class Wear {
       : can.some(Boolean) ? '' : 'No headset is found. Open this page in a headset’s browser.';
     document.getElementById('support').textContent = why;
     this.trouble.hidden = true;
-    this.seen.hidden = Boolean(why);
+    this.seen.hidden = this.worn === null;
     document.documentElement.dataset.wear = 'ready';
   }
 
@@ -101,6 +100,7 @@ class Wear {
       tape: this.record.checked ? [] : null,
       stream: new Stream({ fps, body, offsets: usualOffsets(null), run: frame => this.remote.call('pose', ['wear', frame]) }),
     };
+    this.seen.hidden = false;
     this.scaled(null);
     this.mirror.through(mode === 'immersive-ar');
     this.mirror.tell(...INVITE);
@@ -225,12 +225,15 @@ class Wear {
     this.worn = null;
     this.mirror.visible(false);
     this.mirror.through(false);
-    this.mirror.renderer.setAnimationLoop(() => this.mirror.draw());
+    this.mirror.renderer.setAnimationLoop(null);
+    this.seen.hidden = true;
   }
 
-  // The recording: samples as the headset gave them, in OpenXR's axes, and the poses that were made of them.
+  // The recording: samples as the headset gave them, in OpenXR's axes, and the poses that were made of them; without
+  // the last ones, which still waited for the network.
   saved() {
-    const content = JSON.stringify({ format: 'memmlp web recording 1', run: this.network.run, joints: this.site.joints, samples: this.tape });
+    const samples = this.tape.filter(({ held, calibrated }) => held || calibrated);
+    const content = JSON.stringify({ format: 'memmlp web recording 1', run: this.network.run, joints: this.site.joints, samples });
     const address = URL.createObjectURL(new Blob([content], { type: 'application/json' }));
     h('a', { href: address, download: 'recording.json' }).click();
     setTimeout(() => URL.revokeObjectURL(address), 10000);
