@@ -158,10 +158,11 @@ def _costs(row: Mapping[str, Any]) -> dict[str, float | None]:
 def _told(measured: Measured) -> list[str]:
     """Say how the rows were measured, and how long a whole pose takes."""
     about, first = measured.about, measured.rows[0]
+    clock = f"a clock of {about['clock_ms']:.2g} ms"
+    how = f"{first['threads']} thread, the median of {first['steps']} steps, {clock}"
     lines = [
-        f"{measured.name}: onnxruntime-web {about['onnxruntime_web']}, {first['threads']} thread, the median of "
-        f"{first['steps']} steps, a clock of {about['clock_ms']:.2g} ms, {about['date'][:10]}; differences "
-        "are from AvatarPoser as published, there on the same backend"
+        f"{measured.name}: onnxruntime-web {about['onnxruntime_web']}, {how}, {about['date'][:10]}; "
+        "differences are from AvatarPoser as published, there on the same backend"
     ]
     whole = [
         f"{row['network']}, {GRAPHS.get(row['graph'], row['graph'])}, {row['precision']}, {row['backend']} "

@@ -15,7 +15,7 @@ from memmlp.live.spaces import SPACES
 from memmlp.motion.body import FPS
 
 NUMBERS = 9 + 12 + 66
-"""Of a frame: positions and quaternions (xyzw) of head and wrists, and true joints; metres, axes of openxr."""
+"""Of a frame: positions and quaternions (xyzw) of head and wrists, true joints; metres, axes of openxr."""
 
 
 class SiteClip(NamedTuple):

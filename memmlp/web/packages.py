@@ -1,4 +1,4 @@
-"""The files of npm packages that a site has: onnxruntime-web and three.js, of the versions that are pinned."""
+"""The files of npm packages that a site has: onnxruntime-web and three.js, of pinned versions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WEBGPU = {
     "dist/ort.webgpu.bundle.min.mjs": "ort/webgpu.js",
     "dist/ort-wasm-simd-threaded.asyncify.wasm": "ort/webgpu.wasm.gz",
 }
-"""Where a package's files lie on the site: modules end in .js, which every server knows; .gz is compressed."""
+"""Where files lie on the site: modules end in .js, which every server knows; .gz are compressed."""
 
 
 def write_packages(folder: Path, webgpu: bool) -> dict[str, str]:

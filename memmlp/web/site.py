@@ -1,4 +1,4 @@
-"""A site as a folder of static files: the page, its packages, networks and clips, and what it works offline by."""
+"""A site as a folder of static files: the page, packages, networks, clips, and a service worker."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import onnx
 from torch import Tensor
 
 from memmlp import __version__
@@ -124,7 +123,7 @@ def _copy(folder: Path) -> None:
 
 
 def _policy(page: Path) -> str:
-    """Return the Content-Security-Policy: nothing of any other host; scripts are files, and the import map."""
+    """Return the Content-Security-Policy: no other host; scripts are files, and the import map."""
     inline = re.search(r'<script type="importmap">(.*?)</script>', page.read_text("utf-8"), re.DOTALL)
     assert inline is not None
     digest = base64.b64encode(hashlib.sha256(inline[1].encode()).digest()).decode()

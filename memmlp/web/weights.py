@@ -1,4 +1,4 @@
-"""ONNX files without their weights, which the page draws at random: they do not matter for the time of a step."""
+"""ONNX files without weights, which the page draws at random: they do not matter for a step's time."""
 
 from __future__ import annotations
 

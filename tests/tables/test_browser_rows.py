@@ -20,8 +20,8 @@ ROW = {
     "ratio_to_yardstick": 0.8, "whole_median_ms": 21.0, "whole_p95_ms": 26.0,
 }  # fmt: skip
 OURS = ROW | {
-    "network": "mine", "graph": "streaming", "precision": "int8", "median_ms": 5.0, "ratio_to_avatar_poser": 0.25,
-    "ratio_to_yardstick": 0.2, "whole_median_ms": None, "whole_p95_ms": None,
+    "network": "mine", "graph": "streaming", "precision": "int8", "median_ms": 5.0,
+    "ratio_to_avatar_poser": 0.25, "ratio_to_yardstick": 0.2, "whole_median_ms": None, "whole_p95_ms": None,
 }  # fmt: skip
 FILE = {
     "format": "memmlp web bench 1", "date": "2026-01-02T03:04:05+00:00", "device": "Quest 9", "clock_ms": 0.1,
@@ -92,7 +92,7 @@ def test_what_is_no_such_file_is_one_line(content: Any, told: str, tmp_path: Pat
 
 
 def test_no_file_and_no_text(tmp_path: Path):
-    with pytest.raises(InputError, match="none.json: no such file"):
+    with pytest.raises(InputError, match=r"none\.json: no such file"):
         read(tmp_path / "none.json")
     (tmp_path / "rows.json").write_bytes(b"\xff\xfe")
     with pytest.raises(InputError, match=r"rows\.json"):
@@ -106,5 +106,5 @@ def test_words_of_a_file_do_not_reach_a_terminal_as_commands(tmp_path: Path):
 
 def test_other_tables_take_none(tmp_path: Path):
     table = without_runs(find_sweep("5", ()), ("stream",), "nothing measured")
-    with pytest.raises(InputError, match="--add: .* is not Table 17"):
+    with pytest.raises(InputError, match=r"--add: .* is not Table 17"):
         with_rows(table, read(written(tmp_path, FILE)))

@@ -1,4 +1,4 @@
-"""The site in a browser with a headset in software: worn, played, timed and copied, all of it without the server."""
+"""The site in a browser with a headset in software: worn, played, timed, copied, and all offline."""
 
 from __future__ import annotations
 
@@ -86,7 +86,10 @@ def joints() -> list[list[dict[str, Any]]]:
 
     numbers = np.frombuffer(packed("", PERSON.frames.numpy(), 4.0).content, "<f4").reshape(-1, NUMBERS)
     return [
-        [{"position": row[3 * i : 3 * i + 3].tolist(), "rotation": row[9 + 4 * i : 13 + 4 * i].tolist()} for i in range(3)]
+        [
+            {"position": row[3 * i :][:3].tolist(), "rotation": row[9 + 4 * i :][:4].tolist()}
+            for i in range(3)
+        ]
         for row in numbers
     ]  # fmt: skip
 

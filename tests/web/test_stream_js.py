@@ -71,13 +71,18 @@ def gaps() -> np.ndarray:
     return times
 
 
+def gone(first: int, end: int, *which: int) -> dict[int, tuple[int, ...]]:
+    """Trackers that are lost from a sample to another."""
+    return dict.fromkeys(range(first, end), which)
+
+
 PARTS: dict[str, dict[str, Any]] = {
     "60 Hz": {"samples": samples(np.arange(120) / 60)},
     "72 Hz": {"samples": samples(np.arange(144) / 72)},
     "50 Hz, jittered": {"samples": samples(jittered(1.6, 50.0))},
     "22 Hz": {"samples": samples(np.arange(40) / 22)},
-    "lost hands": {"samples": samples(np.arange(144) / 72, {**dict.fromkeys(range(30, 70), (1,)), **dict.fromkeys(range(60, 100), (1, 2))})},
-    "lost head": {"samples": samples(np.arange(100) / 60, {**dict.fromkeys(range(12), (0, 2)), **dict.fromkeys(range(50, 80), (0,))})},
+    "lost hands": {"samples": samples(np.arange(144) / 72, {**gone(30, 70, 1), **gone(60, 100, 1, 2)})},
+    "lost head": {"samples": samples(np.arange(100) / 60, {**gone(0, 12, 0, 2), **gone(50, 80, 0)})},
     "gaps": {"samples": samples(gaps())},
     "calibrated": {"samples": samples(np.arange(90) / 90), "calibrate": t_pose(), "height": HEIGHT},
 }  # fmt: skip
