@@ -162,7 +162,8 @@ class FromRecurrence(Recall):
 
     def feature(self, past: Recurred) -> Tensor:
         """Return the features (1, blocks, k) of the frame that enters."""
-        return past.features[:, self.layers, -1]
+        newest = past.features[:, :, -1]
+        return newest.index_select(1, torch.tensor(self.layers, device=newest.device))
 
     def before(self, first: Tensor) -> Tensor:
         """Return zeros, since the layers have seen nothing before the first frame."""

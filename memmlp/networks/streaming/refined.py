@@ -6,7 +6,7 @@ from torch import Tensor
 
 from memmlp.networks.memory import State
 from memmlp.networks.refiner import HIDDEN, Refined
-from memmlp.networks.streaming.ring import Ring, StreamingGraph
+from memmlp.networks.streaming.graph import StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
 
@@ -34,8 +34,8 @@ class RefinedStream(StreamingGraph):
         """Return what the network's graph carries, and the hidden states (1, depth, width): zeros."""
         return {**self.graph.windows(), HIDDEN: self.model.initial_state(1)[HIDDEN]}
 
-    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
-        motion, kept = self.graph.step(sparse, state, ring)
+        motion, kept = self.graph.step(sparse, state, fresh)
         refined, hidden = self.model.refined(motion[None], sparse[None], state[HIDDEN])
         return refined[0], {**kept, HIDDEN: hidden}
