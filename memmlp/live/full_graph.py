@@ -116,7 +116,7 @@ class FullStep(nn.Module):
         transforms = torch.cat([torch.cat([local, self.offsets], -1), bottom], -2)
         transforms = torch.cat([transforms, torch.eye(4).expand(1, 1, 4, 4)], 1)
         for ancestor in self.ancestors:
-            transforms = transforms[:, ancestor] @ transforms
+            transforms = transforms.index_select(1, ancestor) @ transforms
         return transforms[:, :N_JOINTS, :3, 3]
 
 

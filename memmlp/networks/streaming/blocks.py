@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from memmlp.networks.cells import gru_step
 from memmlp.networks.layers import MLPBlock, PlainFusion, ResidualFusion
 from memmlp.networks.memory import MemoryBlock
 from memmlp.networks.predictor import Branch
@@ -116,6 +117,26 @@ def part(layer: nn.Linear, inputs: slice, bias: Tensor | None) -> nn.Linear:
     if bias is not None:
         made.bias = nn.Parameter(bias)
     return made
+
+
+class FrameGRU(nn.Module):
+    """GRU layers for one frame, in plain layers: not every runtime has a GRU.
+
+    Args:
+        gru: the layers, batch first.
+    """
+
+    def __init__(self, gru: nn.GRU):
+        super().__init__()
+        self.gru = gru
+
+    def forward(self, x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Map an input (B, 1, n) and states (layers, B, d) to the output (B, 1, d) and the new states."""
+        h, after = x[:, 0], []
+        for weights, state in zip(self.gru.all_weights, hidden.unbind(), strict=True):
+            h = gru_step(weights, h, state)
+            after.append(h)
+        return h[:, None], torch.stack(after)
 
 
 class StreamedBranch(nn.Module):

@@ -100,7 +100,13 @@ def _apply(matrices: Tensor, offsets: Tensor, x: Tensor, origin: Tensor) -> Tens
 class MemMLPStream(StreamingGraph):
     """Mem-MLP's streaming graph."""
 
-    ends = ("coordinates", "stem", "predictor.rotation.linear", "predictor.position.linear")
+    ends = (
+        "coordinates",
+        "stem",
+        "recall.memory.recurrences",
+        "predictor.rotation.linear",
+        "predictor.position.linear",
+    )
 
     @classmethod
     def fits(cls, model: WindowModel) -> bool:

@@ -20,7 +20,7 @@ from memmlp.networks.memory import (
     RecurrentMemory,
     VQMemory,
 )
-from memmlp.networks.streaming.blocks import SharedBlock
+from memmlp.networks.streaming.blocks import FrameGRU, SharedBlock
 from memmlp.networks.vqvae import VQVAE
 
 Pieces = Sequence[Tensor]
@@ -157,8 +157,12 @@ class FromRecurrence(Recall):
     """For recurrent memories, whose features before the first frame are zeros."""
 
     def gather(self, features: Sequence[Any]) -> None:
-        """Note the index of each block's recurrent layer."""
+        """Note the index of each block's recurrent layer, and write GRUs out."""
         self.layers = [feature.index for feature in features]
+        assert isinstance(self.memory, RecurrentMemory)
+        for recurrence in self.memory.recurrences:
+            if isinstance(recurrence.layer, nn.GRU):
+                recurrence.layer = FrameGRU(recurrence.layer)
 
     def feature(self, past: Recurred) -> Tensor:
         """Return the features (1, blocks, k) of the frame that enters."""
