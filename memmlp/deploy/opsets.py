@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 import onnx
-from onnx import GraphProto, ModelProto, NodeProto, helper, numpy_helper, version_converter
+from onnx import ModelProto, NodeProto, helper, version_converter
 
 from memmlp.common.errors import InputError
+from memmlp.deploy.constants import Constants
 
 NATIVE = 18
 """The opset that torch's exporter writes."""
@@ -58,31 +59,6 @@ def _lowered(model: ModelProto, opset: int) -> ModelProto:
     return made
 
 
-class Constants:
-    """The constants of a graph, to which new ones can be added."""
-
-    def __init__(self, graph: GraphProto):
-        self.graph = graph
-        self.known = {tensor.name: tensor for tensor in graph.initializer}
-
-    def value(self, name: str) -> np.ndarray:
-        """Return the value of a constant."""
-        return numpy_helper.to_array(self.known[name])
-
-    def add(self, name: str, value: np.ndarray) -> str:
-        """Add a constant, and return its name."""
-        self.graph.initializer.append(numpy_helper.from_array(value, name))
-        return name
-
-    def sweep(self) -> None:
-        """Take out the constants that no node uses any more."""
-        used = {name for node in self.graph.node for name in node.input}
-        used |= {output.name for output in self.graph.output}
-        kept = [tensor for tensor in self.graph.initializer if tensor.name in used]
-        del self.graph.initializer[:]
-        self.graph.initializer.extend(kept)
-
-
 Rewriting = Callable[[NodeProto, Constants], Iterator[NodeProto]]
 
 
@@ -114,9 +90,7 @@ def _reduced(node: NodeProto, constants: Constants) -> Iterator[NodeProto]:
     """Before opset 18 the axes of a reduction are an attribute."""
     keep = _attributes(node).get("keepdims", 1)
     axes = constants.value(node.input[1]).tolist()
-    yield helper.make_node(
-        node.op_type, node.input[:1], node.output, node.name, axes=axes, keepdims=keep
-    )
+    yield helper.make_node(node.op_type, node.input[:1], node.output, node.name, axes=axes, keepdims=keep)
 
 
 def _split(node: NodeProto, constants: Constants) -> Iterator[NodeProto]:

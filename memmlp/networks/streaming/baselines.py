@@ -117,8 +117,7 @@ class EgoPoserStream(StreamingGraph):
         place = places(local)
         entering = {"embedded": self.model.embedding(torch.cat([local, place], -1)), "places": place}
         window = {
-            name: torch.cat([filled(state[name], frame, fresh), frame])
-            for name, frame in entering.items()
+            name: torch.cat([filled(state[name], frame, fresh), frame]) for name, frame in entering.items()
         }
         slow, fast = self.model.views(window["embedded"])
         first = F.linear(window["places"][:1], self.model.embedding.weight[:, SPARSE_DIM:])

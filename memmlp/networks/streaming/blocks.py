@@ -1,4 +1,4 @@
-"""MLP blocks of streaming graphs, on windows without a batch axis; the last ones make the newest frame alone."""
+"""MLP blocks of streaming graphs, on windows without a batch axis."""
 
 from __future__ import annotations
 

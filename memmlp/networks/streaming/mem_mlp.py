@@ -20,8 +20,8 @@ from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import State
 from memmlp.networks.predictor import Branch
 from memmlp.networks.streaming.blocks import Converter
-from memmlp.networks.streaming.recall import recall
 from memmlp.networks.streaming.graph import StreamingGraph, filled, slid
+from memmlp.networks.streaming.recall import recall
 from memmlp.networks.window_model import WindowModel
 
 Way = Callable[[Tensor, Tensor], Tensor]
