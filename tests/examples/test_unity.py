@@ -25,7 +25,7 @@ from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
 from memmlp.live.trackers import GAP
-from memmlp.motion.body import builtin_rest_joints
+from memmlp.motion.body import PARENTS, builtin_rest_joints
 
 pytestmark = pytest.mark.slow
 
@@ -52,6 +52,7 @@ class Player:
 
     Attributes:
         taken: the trackers' positions (3, 3) of each frame that the network was given.
+        turned: how each bone turned since the T-pose (N, 22, 3, 3), in the world.
     """
 
     def __init__(self, program: Path, network: Path, folder: Path):
@@ -74,7 +75,9 @@ class Player:
                     process.stdin.write(made.astype(np.float32).tobytes())
                 process.stdin.flush()
             assert process.wait(60) == 0
-        return np.loadtxt(out, delimiter=",").reshape(-1, 22, 3)
+        bones = np.loadtxt(out, delimiter=",").reshape(-1, 22, 7)
+        self.turned = quaternion_to_matrix(bones[..., 3:])
+        return bones[..., :3]
 
     def _inputs(self, stream: IO[bytes]) -> dict[str, np.ndarray]:
         """The inputs of the next step that the program asks for; none at its end."""
@@ -127,6 +130,10 @@ def test_bones_are_where_the_stream_has_the_joints(play: Player, played: Callabl
     bones = play(rows(trackers("unity")))
     assert wearer.fastest(bones) > 10
     np.testing.assert_allclose(bones, played("unity").joints, atol=1e-4)
+    turns = np.stack([pose.rotations for pose in played("unity").poses])
+    for joint, parent in enumerate(PARENTS[1:], 1):
+        turns[:, joint] = turns[:, parent] @ turns[:, joint]
+    np.testing.assert_allclose(play.turned, turns, atol=1e-4)
 
 
 def test_other_rates_and_gaps(play: Player, stream: Stream):
