@@ -88,4 +88,4 @@ def until(condition: Callable[[], T], what: str, process: subprocess.Popen | Non
             return value
         assert not ended, f"the process ended with {process.returncode} before {what}"
         assert time.monotonic() < end, f"not within {PATIENCE:.0f} s: {what}"
-        time.sleep(0.01)
+        time.sleep(0.03)
