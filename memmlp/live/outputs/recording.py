@@ -150,4 +150,6 @@ def _spool(path: Path) -> IO[bytes]:
         path.parent.mkdir(parents=True, exist_ok=True)
         return tempfile.TemporaryFile(dir=path.parent)
     except OSError as error:
-        raise InputError(f"--record {path}: cannot be written ({error.strerror}); allowed: a file to write") from None
+        raise InputError(
+            f"--record {path}: cannot be written ({error.strerror}); allowed: a file to write"
+        ) from None

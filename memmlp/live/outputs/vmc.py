@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from memmlp.motion.formats.humanoid import UNITY
 from memmlp.live.outputs.osc import Bundle, Message, Receiver
 from memmlp.live.outputs.output import BodyFrame
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES
 from memmlp.motion.body import N_JOINTS, PARENTS, ROOT
+from memmlp.motion.formats.humanoid import UNITY
 
 PORT = 39539
 SPACE = SPACES["unity"]

@@ -1,9 +1,9 @@
 """VRChat's OSC trackers: up to eight, where its own full-body tracking expects devices, and the head.
 
-By VRChat's documentation (docs.vrchat.com/docs/osc-trackers): `/tracking/trackers/1/position` and so on, three
-floats each; metres of the real world and Euler angles in degrees, applied in the order Z, X, Y, in Unity's
-frame of reference. Which tracker is which VRChat finds out when the wearer calibrates in its T-pose. It shifts
-all of them so that the head is at its avatar's head bone, and turns them to the head's heading.
+By VRChat's documentation (docs.vrchat.com/docs/osc-trackers): `/tracking/trackers/1/position` and so on,
+three floats each; metres of the real world and Euler angles in degrees, applied in the order Z, X, Y, in
+Unity's frame of reference. Which tracker is which VRChat finds out when the wearer calibrates in its T-pose.
+It shifts all of them so that the head is at its avatar's head bone, and turns them to the head's heading.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class VRChat:
 
 
 def trackers(frame: BodyFrame) -> np.ndarray:
-    """Return position, metres, and Euler angles, degrees, of the trackers and the head (9, 2, 3), of Unity."""
+    """Return position (metres) and Euler angles (degrees) of trackers and head (9, 2, 3), of Unity."""
     positions = SPACE.positions_out(frame.positions[AT])
     angles = euler_degrees(SPACE.rotations_out(global_rotations(frame.local)[TURNS_WITH]))
     return np.stack([positions, angles], 1)

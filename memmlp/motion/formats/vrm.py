@@ -1,7 +1,7 @@
 """Writes a mannequin as a VRM 1.0 avatar, which anybody may use for anything (CC0).
 
 It is a glTF file with the extension VRMC_vrm (vrm-consortium/vrm-specification, VRMC_vrm-1.0): the 22 joints
-as humanoid bones, in T-pose on the floor, facing +Z. A visor tells where it looks.
+as humanoid bones, in T-pose on the floor, facing +Z. Two eyes tell where it looks.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from memmlp.motion.formats.gltf import (
 )
 from memmlp.motion.formats.humanoid import VRM
 
-COLOURS = ((0.30, 0.42, 0.56, 1.0), (0.012, 0.016, 0.022, 1.0))  # of body and visor, linear RGB and opacity
-VISOR = (0.030, 0.048, 0.058, 0.088)  # metres: radius, half of the width, above and before the head's joint
+COLOURS = ((0.30, 0.42, 0.56, 1.0), (0.012, 0.016, 0.022, 1.0))  # of body and eyes, linear RGB and opacity
+EYES = (0.016, 0.036, 0.055, 0.100)  # metres: radius; to either side, above and before the head's joint
 
 META = {
     "name": "memmlp mannequin",
@@ -51,7 +51,7 @@ def write_vrm(path: Path, rest: np.ndarray) -> None:
     """Write a mannequin with these rest joints (22, 3), metres, as a .vrm file, atomically."""
     buffer = Buffer()
     bind = rest - [0, rest[:, 1].min(), 0]
-    parts = (mannequin(bind), visor(bind))
+    parts = (mannequin(bind), eyes(bind))
     write_glb(
         path,
         {
@@ -74,7 +74,7 @@ def write_vrm(path: Path, rest: np.ndarray) -> None:
     )
 
 
-LOOKS = (("body", COLOURS[0], 0.7), ("visor", COLOURS[1], 0.25))
+LOOKS = (("body", COLOURS[0], 0.7), ("eyes", COLOURS[1], 0.25))
 
 
 def _material(name: str, colour: tuple[float, ...], roughness: float) -> dict[str, Any]:
@@ -87,9 +87,9 @@ def _humanoid() -> dict[str, Any]:
     return {"humanBones": {bone: {"node": joint} for joint, bone in enumerate(VRM)}}
 
 
-def visor(bind: np.ndarray) -> Mesh:
-    """Return the visor of a bind pose (22, 3), metres: a rounded bar in front of the face."""
-    radius, half, above, before = VISOR
-    middle = bind[HEAD] + [0, above, before]
-    side = np.array([half, 0, 0])
-    return merged([capsule(HEAD, (radius, radius), middle - side, middle + side)])
+def eyes(bind: np.ndarray) -> Mesh:
+    """Return the eyes of a bind pose (22, 3), metres: two upright ovals on the face."""
+    radius, half, above, before = EYES
+    middles = [bind[HEAD] + [side * half, above, before] for side in (-1, 1)]
+    up = np.array([0, radius / 2, 0])
+    return merged([capsule(HEAD, (radius, radius), middle - up, middle + up) for middle in middles])

@@ -34,9 +34,9 @@ MILLIMETRE = 1e-3
 
 
 class Minute(NamedTuple):
-    """Joints (3600, 22, 3), metres, of the wearer above the floor: in OpenXR's axes, and as received of Unity.
+    """Joints (3600, 22, 3), metres, of the wearer above the floor, and the files of the recording.
 
-    And the files of the recording.
+    The joints are those of the poses, in OpenXR's axes, and as they were received, in Unity's.
     """
 
     poses: np.ndarray
@@ -52,7 +52,9 @@ def minute(tmp_path_factory: pytest.TempPathFactory, step_files: Callable[[str],
     stream = Stream(step_files("no_memory"), space="openxr", height=HEIGHT, floor=FLOOR)
     marionette = Marionette()
     files = {kind: folder / f"minute.{kind}" for kind in ("npz", "bvh", "glb")}
-    recording = Recording(list(files.values()), stream.network.skeleton.rest, stream.network.fps, lambda _: None)
+    recording = Recording(
+        list(files.values()), stream.network.skeleton.rest, stream.network.fps, lambda _: None
+    )
     outputs = Outputs([VMC(Receiver("127.0.0.1", marionette.port, "--vmc")), recording], pytest.fail)
     positions = space.positions_out(person.positions * SIZE + [0, 0, FLOOR])
     rotations = space.rotations_out(person.rotations)

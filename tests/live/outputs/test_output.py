@@ -72,7 +72,7 @@ def test_one_that_fails_is_told_once_and_costs_the_others_nothing():
 @pytest.mark.parametrize("name", SPACES)
 def test_a_frame_is_the_same_in_every_space_and_format(name: str):
     space = SPACES[name]
-    there = pose(space.pose_out(TURNS), space.positions_out(WHERE + [0, 0, 0.25]))
+    there = pose(space.pose_out(TURNS), space.positions_out(WHERE + np.array([0, 0, 0.25])))
     quaternions = there._replace(rotations=matrix_to_quaternion(there.rotations))
     for each in (there, quaternions):
         frame = body_frame(stream(name), each)

@@ -128,4 +128,6 @@ def test_a_disk_that_was_full_for_a_while_costs_those_frames_only(recording, tmp
     made.frames = full.file
     made.close()
     clip = read_clip(tmp_path / "a.npz", "a")
-    np.testing.assert_allclose(clip.trans[:, 0], np.arange(3) / 60, atol=1e-6)  # the one that was lost is filled
+    np.testing.assert_allclose(
+        clip.trans[:, 0], np.arange(3) / 60, atol=1e-6
+    )  # the one that was lost is filled

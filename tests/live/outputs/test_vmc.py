@@ -18,7 +18,9 @@ REST = builtin_rest_joints()
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # of a person in AMASS' world who looks along -Y
 
 
-def frame(local: np.ndarray | None = None, root: tuple[float, ...] = (0, 0, 0.98), time: float = 5.0) -> BodyFrame:
+def frame(
+    local: np.ndarray | None = None, root: tuple[float, ...] = (0, 0, 0.98), time: float = 5.0
+) -> BodyFrame:
     """A frame of a body, whose joints but the root are not needed; upright in T-pose by default."""
     turns = np.tile(np.eye(3), (22, 1, 1)) if local is None else local.copy()
     turns[0] = UPRIGHT @ turns[0]
@@ -56,7 +58,9 @@ def test_a_t_pose_is_the_identity_and_stands_on_the_floor(vmc: VMC, marionette: 
     assert np.array(list(turns.values())) == pytest.approx(np.tile([0, 0, 0, 1.0], (21, 1)), abs=1e-6)
     at = marionette.positions()
     assert at["Head"] == pytest.approx([0, 0.98 + 0.59, -0.01], abs=1e-6)
-    assert at["LeftHand"][0] == pytest.approx(0.71)  # whose left is Unity's +X, since the person looks along -Z
+    assert at["LeftHand"][0] == pytest.approx(
+        0.71
+    )  # whose left is Unity's +X, since the person looks along -Z
     assert at["LeftToes"] == pytest.approx([0.115, 0, -0.095], abs=1e-6)
 
 

@@ -55,7 +55,17 @@ def test_where_the_trackers_are_and_how_they_turn():
     """A thigh that is lifted turns the knee's tracker; the shank does not."""
     lifted, bent = (Rotation.from_euler("x", angle, degrees=True).as_matrix() for angle in (-60, 80))
     found = trackers(standing(left_hip=lifted, left_knee=bent))
-    names = "pelvis spine3 left_ankle right_ankle left_knee right_knee left_elbow right_elbow head".split()
+    names = [
+        "pelvis",
+        "spine3",
+        "left_ankle",
+        "right_ankle",
+        "left_knee",
+        "right_knee",
+        "left_elbow",
+        "right_elbow",
+        "head",
+    ]
     index = np.array([JOINTS.index(name) for name in names], float)
     np.testing.assert_allclose(found[:, 0], index[:, None] * [1, 100, 10])  # Unity's y is AMASS' z
     angles = {name: angle for name, angle in zip(names, found[:, 1], strict=True)}

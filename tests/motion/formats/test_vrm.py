@@ -63,8 +63,8 @@ def test_it_stands_in_t_pose_on_the_floor_and_looks_along_z(glb: Glb):
     joints = np.stack([glb.matrices(None)[name][:3, 3] for name in JOINTS])
     np.testing.assert_allclose(joints, REST - [0, REST[:, 1].min(), 0], atol=1e-6)
     assert joints[JOINTS.index("left_wrist"), 0] > 0.5
-    visor = glb.json["meshes"][0]["primitives"][1]["attributes"]["POSITION"]
-    assert glb.array(visor)[:, 2].min() > joints[JOINTS.index("head"), 2]
+    eyes = glb.json["meshes"][0]["primitives"][1]["attributes"]["POSITION"]
+    assert glb.array(eyes)[:, 2].min() > joints[JOINTS.index("head"), 2]
     assert all(node.get("rotation", [0, 0, 0, 1]) == [0, 0, 0, 1] for node in glb.json["nodes"])
 
 

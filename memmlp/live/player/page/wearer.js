@@ -56,7 +56,7 @@ export class Wearer {
 }
 
 function kept({ file, calibrated }) {
-  if (file) return `Kept in ${file}.`;
+  if (file) return `Changes are kept in ${file}.`;
   return calibrated ? 'Not kept; --calibration FILE keeps it.' : '';
 }
 
