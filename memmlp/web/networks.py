@@ -14,8 +14,8 @@ import onnx
 from torch import Tensor
 
 from memmlp.common.progress import tell
+from memmlp.deploy.deployment import lower
 from memmlp.deploy.export import export
-from memmlp.deploy.quantization import quantise
 from memmlp.live.full_graph import export_full
 from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES
@@ -78,7 +78,7 @@ class Writer:
         stream = streaming(model) if has_stream(model) else None
         with tempfile.TemporaryDirectory() as temporary:
             made = Path(temporary)
-            played = self._played(network, stream or model, made) if network.trained else None
+            played = self._played(network, stream, made) if network.trained else None
             graphs = self._timed(network, stream, made, played) if self.bench else []
         return {
             "key": network.key,
@@ -93,24 +93,33 @@ class Writer:
             "clips": list(network.clips),
         }
 
-    def _played(self, network: SiteNetwork, graph: WindowModel | StreamingGraph, made: Path) -> Entry:
+    def _played(self, network: SiteNetwork, stream: StreamingGraph | None, made: Path) -> Entry:
         """Write the full graph with its weights."""
-        path = made / "play.onnx"
-        export_full(graph, path, network.run, SPACE.name)
+        path = _whole(made, "streaming" if stream else "naive")
+        export_full(stream or network.model, path, network.run, SPACE.name)
         return {"file": self._kept(network.key, path.read_bytes()), "weights": []}
 
     def _timed(
         self, network: SiteNetwork, stream: StreamingGraph | None, made: Path, played: Entry | None
     ) -> list[Entry]:
-        """Write the graphs that are timed: as published, as stream, and that in int8."""
+        """Write the graphs that are timed: as published, as stream, and that in less precision."""
         rows = [self._pair(network, network.model, "naive", made, None if stream else played)]
         if stream is not None:
             rows.append(self._pair(network, stream, "streaming", made, played))
-            source, path = made / "streaming.onnx", made / "int8.onnx"
-            quantise(source, path, stream.ends, self.calibration)
-            step = self.skeleton(f"{network.key}-int8", onnx.load(path))
-            rows.append({"graph": "streaming", "precision": "int8", "step": step, "whole": None})
+            rows += [self._less_precise(network, stream, precision, made) for precision in ("int8", "fp16")]
         return rows
+
+    def _less_precise(
+        self, network: SiteNetwork, stream: StreamingGraph, precision: str, made: Path
+    ) -> Entry:
+        """Write a stream in less precision; of int8 there is no full graph."""
+        path, key, whole = made / "less.onnx", f"{network.key}-{precision}", None
+        if precision == "fp16":
+            lower(precision, _whole(made, "streaming"), path, stream.ends, self.calibration)
+            whole = self.skeleton(f"{key}-whole", onnx.load(path))
+        lower(precision, made / "streaming.onnx", path, stream.ends, self.calibration)
+        step = self.skeleton(key, onnx.load(path))
+        return {"graph": "streaming", "precision": precision, "step": step, "whole": whole}
 
     def _pair(
         self,
@@ -121,7 +130,7 @@ class Writer:
         played: Entry | None,
     ) -> Entry:
         """Write a graph in float32, alone and as the whole way from trackers to joints."""
-        step, whole = made / f"{name}.onnx", made / f"{name}-whole.onnx"
+        step, whole = made / f"{name}.onnx", _whole(made, name)
         export(graph, step, network.run)
         if played is None:
             export_full(graph, whole, network.run, SPACE.name)
@@ -141,6 +150,10 @@ class Writer:
         (self.folder / address).parent.mkdir(exist_ok=True)
         (self.folder / address).write_bytes(gzip.compress(content, 6, mtime=0))
         return address
+
+
+def _whole(made: Path, graph: str) -> Path:
+    return made / f"{graph}-whole.onnx"
 
 
 def body_of(rest: np.ndarray) -> Entry:

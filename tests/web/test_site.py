@@ -31,6 +31,7 @@ def test_everything_that_the_page_names_is_there(site: Made):
         ("naive", "fp32"),
         ("streaming", "fp32"),
         ("streaming", "int8"),
+        ("streaming", "fp16"),
     ]
     imports = re.compile(r"""(?:from|import\()\s*['"](\./[^'"$]+)['"]""")
     for path in site.folder.glob("*.js"):
