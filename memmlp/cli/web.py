@@ -18,6 +18,9 @@ BASE = ("profile=paper", "model=avatar_poser")
 """What the bench compares with: AvatarPoser of the paper's size, with random weights."""
 
 
+CALIBRATION = 2  # clips: int8's ranges do not matter for the time
+
+
 @click.command("web")
 @click.argument("runs", nargs=-1, required=True)
 @click.option("--out", required=True, type=PATH, help="Folder to write the site into.")
@@ -67,7 +70,7 @@ def web(
         networks=[network_of(one, found[one.run.id]) for one in opened],
         base=None if no_bench else base(),
         clips=list({clip.key: clip for some in found.values() for clip in some}.values()),
-        calibration=[] if no_bench else opened[0].data.open("train").clips(),
+        calibration=[] if no_bench else opened[0].data.open("train").clips()[:CALIBRATION],
         webgpu=not no_webgpu,
     )
     size = site.make(out)
@@ -87,11 +90,13 @@ def clips_of(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
 
 def network_of(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
     """Return a run's network as a site has it."""
+    from memmlp.runs.identity import flatten
     from memmlp.runs.name import run_name
     from memmlp.web.networks import SiteNetwork
 
-    run = opened.run
-    name = run_name(run.manifest, run.config)
+    run, config = opened.run, flatten(opened.run.config)
+    name, model = run_name(run.manifest, config).removeprefix("default · "), config["model.name"]
+    name = name if f"model={model}" in name else f"{model} {name}"
     return SiteNetwork(run.id, name, run.id, opened.network(), tuple(clip.key for clip in clips))
 
 

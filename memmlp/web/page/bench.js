@@ -52,8 +52,9 @@ class Bench {
   }
 
   table() {
-    const head = ['network', 'graph', 'backend', ['step', 'median, ms'], ['', 'p95, ms'], ['ratio', 'to AvatarPoser'], ['whole pose', 'median, ms'], ['', 'p95, ms']];
-    const side = head.map(name => (Array.isArray(name) ? h('th', { class: 'n' }, name[0], h('small', {}, name[1])) : h('th', {}, name)));
+    const head = [['network'], ['graph'], ['step', 'median, ms', 'n'], ['', 'p95, ms', 'n wide'], ['ratio', 'to AvatarPoser', 'n'],
+      ['whole pose', 'median, ms', 'n'], ['', 'p95, ms', 'n wide']];
+    const side = head.map(([name, unit, kind]) => h('th', { class: kind }, name, unit && h('small', {}, unit)));
     return h('div', { class: 'scroll' }, h('table', { class: 'times' }, h('thead', {}, h('tr', {}, side)), this.body));
   }
 
@@ -158,14 +159,14 @@ class Bench {
   row(item, backend, most) {
     const found = this.results.get(`${item.key} ${backend}`);
     const reason = this.failures.get(`${item.key} ${backend}`);
-    const number = value => h('td', { class: 'n' }, value === null || value === undefined ? '–' : value.toFixed(2));
-    const words = [`${GRAPHS[item.graph]}, ${item.precision}`, backend].map(word => h('td', {}, word));
+    const number = (value, kind = 'n') => h('td', { class: kind }, value === null || value === undefined ? '–' : value.toFixed(2));
+    const graph = h('td', {}, `${GRAPHS[item.graph]}, ${item.precision}, ${backend}`);
     const name = h('th', { scope: 'row' }, item.network.name, h('small', {}, size(item.network)));
-    if (reason) return h('tr', {}, name, words, h('td', { colSpan: 5, class: 'faint' }, reason));
+    if (reason) return h('tr', {}, name, graph, h('td', { colSpan: 5, class: 'faint' }, reason));
     const share = `${(100 * (found?.ratio_to_avatar_poser ?? 0)) / most}%`;
-    return h('tr', {}, name, words, number(found?.median_ms), number(found?.p95_ms),
+    return h('tr', {}, name, graph, number(found?.median_ms), number(found?.p95_ms, 'n wide'),
       h('td', { class: 'n' }, found?.ratio_to_avatar_poser?.toFixed(2) ?? '–', h('span', { class: 'share' }, h('i', { style: `width: ${found ? share : 0}` }))),
-      number(found?.whole_median_ms), number(found?.whole_p95_ms));
+      number(found?.whole_median_ms), number(found?.whole_p95_ms, 'n wide'));
   }
 
   // The measurement as `memmlp table 17 --add` takes it.

@@ -5,6 +5,7 @@ import { Limb } from './stage.js';
 
 const AWAY = 1.3; // metres from the wearer to the mirror
 const [WIDTH, HEIGHT] = [1.3, 2.1]; // metres of the mirror
+const FEW = [12, 1]; // sides and rings of a limb: it has one colour, and is drawn for two eyes and a mirror
 const SKIN = 0x27a9e1;
 const PANEL = [1024, 256]; // pixels of the words
 const FACE = ['#14191f', '#e3e8ee'];
@@ -18,7 +19,7 @@ export class Mirror {
     this.camera = new THREE.PerspectiveCamera(60, 1, 0.05, 60);
     this.camera.position.set(0, 1.55, 0);
     const material = new THREE.MeshStandardMaterial({ color: SKIN, roughness: 0.7, vertexColors: false });
-    this.limbs = limbs.map(limb => new Limb(limb, material, 1));
+    this.limbs = limbs.map(limb => new Limb(limb, material, 1, ...FEW));
     const skull = joints.flatMap((name, i) => (/head|neck/.test(name) ? [i] : []));
     this.own = new THREE.Group();
     this.own.add(...this.limbs.filter((_, i) => !skull.includes(limbs[i].end)).map(limb => limb.mesh));

@@ -130,10 +130,11 @@ class Body {
 
 // A round limb: one surface of revolution, with a half circle at each end and a line between.
 export class Limb {
-  constructor({ start, end, radii, tip }, material, slim) {
+  constructor({ start, end, radii, tip }, material, slim, round = ROUND, rings = RINGS) {
     Object.assign(this, { start, end, tip });
-    this.profile = outline(...radii.map(radius => slim * radius));
-    this.geometry = new THREE.LatheGeometry(this.profile.map(p => new THREE.Vector2(p.x, p.y + p.part)), ROUND);
+    this.profile = outline(...radii.map(radius => slim * radius), rings);
+    this.round = round;
+    this.geometry = new THREE.LatheGeometry(this.profile.map(p => new THREE.Vector2(p.x, p.y + p.part)), round);
     const count = this.geometry.attributes.position.count;
     this.geometry.setAttribute('color', new THREE.BufferAttribute(new Float32Array(3 * count), 3));
     this.mesh = new THREE.Mesh(this.geometry, material);
@@ -175,16 +176,16 @@ export class Limb {
 
   each(action) {
     const points = this.profile.length;
-    for (let v = 0; v < (ROUND + 1) * points; v++) action(v, this.profile[v % points], v % points);
+    for (let v = 0; v < (this.round + 1) * points; v++) action(v, this.profile[v % points], v % points);
   }
 }
 
 // The limb's outline from end to end: at radius x, y above the point that is `part` of the way along.
-function outline(start, end) {
+function outline(start, end, count) {
   const quarter = Array.from({ length: 7 }, (_, i) => (Math.PI / 12) * i);
   const cap = (radius, side, part) =>
     quarter.map(angle => ({ x: radius * Math.sin(angle), y: side * radius * Math.cos(angle), part }));
-  const rings = Array.from({ length: RINGS - 1 }, (_, i) => (i + 1) / RINGS);
+  const rings = Array.from({ length: count - 1 }, (_, i) => (i + 1) / count);
   const between = rings.map(part => ({ x: start + part * (end - start), y: 0, part }));
   return [...cap(start, -1, 0), ...between, ...cap(end, 1, 1).reverse()];
 }
