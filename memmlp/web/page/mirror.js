@@ -41,9 +41,9 @@ export class Mirror {
     const sun = new THREE.DirectionalLight(0xffffff, 1.8);
     sun.position.set(1.4, 4, 1.8);
     this.floor = new THREE.GridHelper(8, 16, 0x6b7683, 0x6b7683);
-    this.ground = new THREE.Mesh(new THREE.CircleGeometry(12, 48), new THREE.MeshBasicMaterial({ color: 0xd9dee3 }));
+    this.ground = new THREE.Mesh(new THREE.CircleGeometry(12, 48), new THREE.MeshBasicMaterial({ color: 0xd9dee3, depthWrite: false }));
     this.ground.rotation.x = -Math.PI / 2;
-    this.ground.position.y = -0.005;
+    this.ground.renderOrder = -1; // before the lines on it, which are as far away
     this.sky = new THREE.Color(0xeef1f4);
     this.scene.add(sun, this.floor, this.ground);
     this.through(false);
