@@ -13,7 +13,7 @@ const FACE = ['#14191f', '#e3e8ee'];
 export class Mirror {
   // joints: names of the joints; limbs: how they are shown (site.json).
   constructor(canvas, { limbs, joints }) {
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
     this.renderer.xr.enabled = true;
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(60, 1, 0.05, 60);
