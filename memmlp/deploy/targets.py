@@ -165,7 +165,7 @@ class _Facts:
     """What must be known of a graph: its nodes, its constants, and the types and ranks of its tensors."""
 
     def __init__(self, model: ModelProto, folds: bool):
-        inferred = onnx.shape_inference.infer_shapes(model).graph
+        inferred = _inferred(model)
         self.constants = {tensor.name for tensor in inferred.initializer}
         self.types = {tensor.name: tensor.data_type for tensor in inferred.initializer}
         self.ranks = {tensor.name: len(tensor.dims) for tensor in inferred.initializer}
@@ -179,6 +179,14 @@ class _Facts:
                 self.constants.update(node.output)
             if not (folds and folded):
                 self.nodes.append(node)
+
+
+def _inferred(model: ModelProto) -> GraphProto:
+    """Return a model's graph with the types and ranks of its tensors, as far as onnx can tell."""
+    try:
+        return onnx.shape_inference.infer_shapes(model).graph
+    except onnx.shape_inference.InferenceError:
+        return model.graph
 
 
 def _reasons(node: NodeProto, version: int, listed: Published, facts: _Facts) -> Iterator[str]:

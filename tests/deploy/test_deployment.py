@@ -8,7 +8,6 @@ from pathlib import Path
 from shutil import copyfile
 
 import exported
-import numpy as np
 import onnx
 import pytest
 import tiny
@@ -19,7 +18,7 @@ from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.deploy.deployment import GRAPHS, Deployment
 from memmlp.deploy.parity import streamed
-from memmlp.deploy.quantization import accuracy, compared, quantise
+from memmlp.deploy.quantization import quantise
 from memmlp.deploy.session import OnnxStream
 from memmlp.networks.memory import CodeMemory
 from memmlp.networks.streaming import StreamingGraph, streaming
@@ -90,34 +89,6 @@ def test_int8_is_near_and_keeps_the_metadata(pair):
     assert props[0].items() <= props[1].items()
     assert quantised.parent != exact.parent
     assert [path.name for path in quantised.parent.iterdir()] == ["int8.onnx"]
-
-
-def test_int8_may_stand_for_float32_only_if_it_is_as_good(pair, step_files):
-    model = exported.NETWORKS["mem_mlp"]()
-    exact, quantised = pair
-    cost = compared(exact, quantised, model.normalizer, CLIPS)
-    assert cost["growth"] == pytest.approx(cost["int8"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
-    assert cost["default"] == (cost["growth"] <= 0.01)
-    other = step_files("refined")  # of two networks the better one may stand for the other alone
-    both = [compared(*pair, model.normalizer, CLIPS) for pair in ((exact, other), (other, exact))]
-    assert sorted(cost["default"] for cost in both) == [False, True]
-    assert (1 + both[0]["growth"]) * (1 + both[1]["growth"]) == pytest.approx(1)
-    assert compared(exact, exact, model.normalizer, CLIPS)["default"]
-
-
-def test_accuracy_is_that_of_the_evaluation(pair):
-    from memmlp.evaluation import modes as evaluation
-
-    model = exported.NETWORKS["mem_mlp"]()
-    exact, _ = pair
-    found = accuracy(exact, model.normalizer, CLIPS)
-    motions = evaluation.stream(model, CLIPS)
-    rows = [
-        evaluation.rotations_report(model.normalizer, motion, clip)
-        for motion, clip in zip(motions, CLIPS, strict=True)
-    ]
-    for name, value in found.items():
-        assert value == pytest.approx(np.mean([row[name] for row in rows]), rel=1e-3), name
 
 
 def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
