@@ -102,6 +102,8 @@ def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
     cost = record["int8"]
     assert cost["growth"] == pytest.approx(cost["int8"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
     assert cost["median_ms"] > 0
+    assert cost["pose_median_ms"] > 0
+    assert 0 < record["pose_median_ms"] <= record["pose_p95_ms"]
     assert cost["onnx_bytes"] == deployed.int8.stat().st_size
     assert made.verify() == []
     assert math.isclose(cost["fp32"]["MPJPE"], made.results["stream"]["rotation"]["MPJPE"], rel_tol=1e-3)
@@ -117,7 +119,9 @@ def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
     assert made.verify() == [f"deployments/{deployed.folder.name}/step.int8.onnx"]
 
     # The float32 file is exported as it is without int8 (tests/pipeline/test_run_stages.py).
-    monkeypatch.setattr("memmlp.deploy.export.export", lambda model, path, run: copyfile(deployed.onnx, path))
+    monkeypatch.setattr(
+        "memmlp.deploy.export.export", lambda model, path, run, opset: copyfile(deployed.onnx, path)
+    )
     line = ["export", made.id, "--out", "int8.onnx", "--precision", "int8"]
     assert "MPJPE" in memmlp(*line, "--max-growth", "50").out
     Path("int8.onnx").unlink()
@@ -138,3 +142,20 @@ def test_the_naive_graph_by_switch(tmp_path):
     assert deployed["naive"]["step_macs"] == deployed["naive"]["macs"] == deployed["auto"]["macs"]
     assert deployed["auto"]["step_macs"] < deployed["auto"]["macs"]
     assert build_experiment(composed(["export.graph=naive"])).deployment.graph == "naive"
+
+
+def test_a_deployment_in_fp16_and_an_older_opset(tmp_path):
+    place, model = DeploymentFolder(tmp_path), exported.NETWORKS["mem_mlp"]()
+    deployment = build_experiment(composed(["export.precision=fp16", "export.opset=15"])).deployment
+    assert (deployment.precision, deployment.opset) == ("fp16", 15)
+    record = deployment.deploy(model, place, "0" * 16, CLIPS, CLIPS)
+    cost = record["fp16"]
+    assert cost["growth"] == pytest.approx(cost["fp16"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
+    assert cost["jitter_growth"] == pytest.approx(cost["fp16"]["Jitter"] / cost["fp32"]["Jitter"] - 1)
+    assert cost["onnx_bytes"] == place.half.stat().st_size
+    assert cost["median_ms"] > 0
+    for path in (place.onnx, place.half):
+        assert [one.version for one in onnx.load(path).opset_import] == [15]
+    place.finish({"run": "0" * 16, "settings": {}, **record})
+    assert set(place.record["artifacts"]) == {"step.onnx", "step.fp16.onnx"}
+    assert not place.prefers_int8
