@@ -25,7 +25,7 @@ from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
 from memmlp.live.trackers import GAP
-from memmlp.motion.body import builtin_rest_joints
+from memmlp.motion.body import PARENTS, builtin_rest_joints
 
 pytestmark = pytest.mark.slow
 
@@ -52,17 +52,20 @@ class Player:
 
     Attributes:
         taken: the trackers' positions (3, 3) of each frame that the network was given.
+        turned: how each bone turned since the T-pose (N, 22, 3, 3), in the world.
     """
 
     def __init__(self, program: Path, network: Path, folder: Path):
         self.program, self.folder, self.session = program, folder, open_session(network)
+        self.quaternions = False  # whether the network gives rotations as these
 
     def __call__(self, rows: Rows) -> np.ndarray:
         """Where the rig's bones (N, 22, 3) are after each sample."""
         names = ("model.txt", "avatar.csv", "samples.csv", "bones.csv")
         model, avatar, samples, out = files = [self.folder / name for name in names]
         parts = (self.session.get_inputs(), self.session.get_outputs())
-        model.write_text("\n\n".join("\n".join(described(one) for one in part) for part in parts))
+        ends = "\n\n".join("\n".join(described(one) for one in part) for part in parts)
+        model.write_text(ends.replace("rotations 1 22 3 3", "rotations 1 22 4") if self.quaternions else ends)
         np.savetxt(avatar, REST, delimiter=",")
         samples.write_text("\n".join(",".join(written(*row)) for row in rows))
         self.taken: list[np.ndarray] = []
@@ -71,10 +74,14 @@ class Player:
             while given := self._inputs(process.stdout):
                 self.taken.append(given["tracker_positions"][0])
                 for made in self.session.run(None, given):
+                    if self.quaternions and made.shape == (1, 22, 3, 3):
+                        made = matrix_to_quaternion(made[0])
                     process.stdin.write(made.astype(np.float32).tobytes())
                 process.stdin.flush()
             assert process.wait(60) == 0
-        return np.loadtxt(out, delimiter=",").reshape(-1, 22, 3)
+        bones = np.loadtxt(out, delimiter=",").reshape(-1, 22, 7)
+        self.turned = quaternion_to_matrix(bones[..., 3:])
+        return bones[..., :3]
 
     def _inputs(self, stream: IO[bytes]) -> dict[str, np.ndarray]:
         """The inputs of the next step that the program asks for; none at its end."""
@@ -123,10 +130,18 @@ def stream(step_files: Callable[[str], Path]) -> Stream:
     return Stream(step_files("mem_mlp"), space="unity")
 
 
-def test_bones_are_where_the_stream_has_the_joints(play: Player, played: Callable[[str], Played]):
+@pytest.mark.parametrize("quaternions", [False, True])
+def test_bones_are_where_the_stream_has_the_joints(
+    quaternions: bool, play: Player, played: Callable[[str], Played]
+):
+    play.quaternions = quaternions
     bones = play(rows(trackers("unity")))
     assert wearer.fastest(bones) > 10
     np.testing.assert_allclose(bones, played("unity").joints, atol=1e-4)
+    turns = np.stack([pose.rotations for pose in played("unity").poses])
+    for joint, parent in enumerate(PARENTS[1:], 1):
+        turns[:, joint] = turns[:, parent] @ turns[:, joint]
+    np.testing.assert_allclose(play.turned, turns, atol=1e-4)
 
 
 def test_other_rates_and_gaps(play: Player, stream: Stream):

@@ -49,6 +49,10 @@ def read_motion(path: Path) -> Motion:
             sys.exit(
                 f"{path}: in the space {saved['space']}; Blender's is amass (memmlp export --space amass)"
             )
+        if saved["rotations"].ndim != 4:
+            sys.exit(
+                f"{path}: rotations as quaternions; allowed are matrices (memmlp export without --rotations)"
+            )
         local = UPRIGHT @ saved["rotations"].astype(float) @ UPRIGHT.T
         local[:, 0] = saved["rotations"][:, 0] @ UPRIGHT.T
         joints, parents = saved["joints"].tolist(), saved["parents"].tolist()

@@ -37,8 +37,9 @@ export class FullBody {
   /**
    * Take in one frame: positions (9 numbers: head, left, right) in metres, rotations (27: row by row) matrices.
    *
-   * Returns Float32Arrays: rotations (22 x 9), each relative to its parent's and the root's global; positions
-   * (22 x 3), metres, by forward kinematics; joints (22 x 3), the network's own guess of the positions.
+   * Returns Float32Arrays: rotations (22 x 9), each relative to its parent's and the root's global, or
+   * quaternions (22 x 4) of a file that was exported so; positions (22 x 3), metres, by forward kinematics;
+   * joints (22 x 3), the network's own guess of the positions.
    */
   async step(positions, rotations) {
     const made = await this.session.run({

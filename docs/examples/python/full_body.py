@@ -51,8 +51,9 @@ class FullBody:
     def step(self, positions: np.ndarray, rotations: np.ndarray) -> dict[str, np.ndarray]:
         """Take in one frame of head, left and right: positions (3, 3), metres, and matrices (3, 3, 3).
 
-        Returns rotations (22, 3, 3), each relative to its parent's and the root's global; positions (22, 3),
-        metres, by forward kinematics; joints (22, 3), metres, the network's own guess of the positions.
+        Returns rotations (22, 3, 3), each relative to its parent's and the root's global, or quaternions
+        (22, 4) of a file that was exported so; positions (22, 3), metres, by forward kinematics; joints
+        (22, 3), metres, the network's own guess of the positions.
         """
         trackers = {"tracker_positions": positions[None], "tracker_rotations": rotations[None]}
         given = {name: value.astype(np.float32) for name, value in trackers.items()} | self.state

@@ -84,13 +84,24 @@ namespace Memmlp
         void Read()
         {
             float[] positions = ((Tensor<float>)worker.PeekOutput("positions")).DownloadToArray();
-            float[] matrices = ((Tensor<float>)worker.PeekOutput("rotations")).DownloadToArray();
+            float[] rotations = ((Tensor<float>)worker.PeekOutput("rotations")).DownloadToArray();
+            bool quaternions = rotations.Length == 4 * Joints.Length; // of memmlp export --rotations quaternion
             for (int joint = 0; joint < Joints.Length; joint++)
             {
                 Positions[joint] = Vector(positions, 3 * joint, 1);
-                Vector3 up = Vector(matrices, 9 * joint + 1, 3), forward = Vector(matrices, 9 * joint + 2, 3);
-                Rotations[joint] = Quaternion.LookRotation(forward, up);
+                Rotations[joint] = quaternions ? Turn(rotations, 4 * joint) : Look(rotations, 9 * joint);
             }
+        }
+
+        static Quaternion Turn(float[] array, int start)
+        {
+            return new Quaternion(array[start], array[start + 1], array[start + 2], array[start + 3]);
+        }
+
+        /// <summary>Return the rotation of a matrix, whose columns are where right, up and forward go.</summary>
+        static Quaternion Look(float[] array, int start)
+        {
+            return Quaternion.LookRotation(Vector(array, start + 2, 3), Vector(array, start + 1, 3));
         }
 
         static void Write(Vector3 vector, float[] array, int start, int stride)

@@ -1,4 +1,4 @@
-// Plays samples of trackers through TrackedBody as Unity would, and writes where the avatar's bones are.
+// Plays samples of trackers through TrackedBody as Unity would, and writes where the avatar's bones are and how they turned.
 //
 // play.exe model.txt avatar.csv samples.csv bones.csv: the model's inputs and outputs, a line each with an empty
 // line between them; a row of 3 numbers for each bone, its place in T-pose; and rows of a time, 21 numbers and a
@@ -28,6 +28,7 @@ public static class Play
         };
         Transform[] rig = Rig(File.ReadAllLines(words[1]).Select(Numbers).ToArray());
         tracked.avatar = new Transform { attached = new Animator { find = bone => Find(rig, bone) } };
+        Quaternion[] rest = rig.Select(bone => bone.rotation).ToArray();
         Call(tracked, "Start");
         StringBuilder bones = new StringBuilder();
         foreach (string line in File.ReadAllLines(words[2]))
@@ -39,7 +40,7 @@ public static class Play
             Call(tracked, "Update");
             if (row[22] == "calibrate" && !tracked.Calibrate())
                 throw new InvalidOperationException("not calibrated");
-            bones.AppendLine(string.Join(",", rig.Select(bone => Words(bone.position))));
+            bones.AppendLine(string.Join(",", rig.Select((bone, joint) => Words(bone, rest[joint]))));
         }
         File.WriteAllText(words[3], bones.ToString());
     }
@@ -87,8 +88,12 @@ public static class Play
     static float[] Numbers(string line) { return line.Split(',').Select(word => (float)Number(word)).ToArray(); }
     static double Number(string word) { return double.Parse(word, CultureInfo.InvariantCulture); }
 
-    static string Words(Vector3 v)
+    // Where a bone is, and the quaternion by which it turned.
+    static string Words(Transform bone, Quaternion rest)
     {
-        return string.Format(CultureInfo.InvariantCulture, "{0:R},{1:R},{2:R}", v.x, v.y, v.z);
+        Vector3 p = bone.position;
+        Quaternion q = bone.rotation * Quaternion.Inverse(rest);
+        float[] values = { p.x, p.y, p.z, q.x, q.y, q.z, q.w };
+        return string.Join(",", values.Select(value => value.ToString("R", CultureInfo.InvariantCulture)));
     }
 }
