@@ -112,7 +112,7 @@ class BoDiffusion(WholeWindow):
         self.blocks = nn.ModuleList(DiTBlock(width, heads) for _ in range(depth))
         self.head = nn.Linear(width, N_JOINTS * (NOISY + CHANNELS))
         self.joint_head = nn.Linear(NOISY + CHANNELS, 2 * NOISY)
-        self.register_buffer("noises", self.drawn(frames))
+        self.register_buffer("noises", self.drawn(frames), persistent=False)  # more with more sampling steps
 
     @property
     def streams(self) -> bool:

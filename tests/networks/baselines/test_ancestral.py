@@ -64,6 +64,13 @@ def test_sampling_is_an_independent_numpy_computation(count):
     np.testing.assert_allclose(found.numpy(), x, atol=1e-4)
 
 
+def test_the_share_says_where_a_variance_lies_between_the_least_and_the_largest():
+    diffusion, share = AncestralDiffusion(60, 3).double(), torch.tensor([0.5, -1.0, 1.0]).double()
+    _, variance = diffusion.step(share, Made(share, share), 0, OPEN)
+    _, _, least, largest = (table[-1] for table in tables(kept(60)[[19, 39, 59]]))
+    np.testing.assert_allclose(variance, [largest**0.75 * least**0.25, least, largest], rtol=1e-5)
+
+
 def test_the_losses_are_an_independent_numpy_computation():
     """Beyond the first step the bound is the divergence of two Gaussians, by their densities on a grid."""
     diffusion, draw = AncestralDiffusion(20, 2).double(), torch.Generator().manual_seed(0)

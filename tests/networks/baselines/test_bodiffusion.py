@@ -19,6 +19,7 @@ from memmlp.networks.streaming import has_stream, streaming
 
 CLIP = tiny.clip(25)
 TRUTH = tiny.clip(7)[None].expand(64, -1, -1)
+FINER = {"diffusion_steps": 60, "sampling_steps": 52, "depth": 1}
 
 
 @torch.no_grad()
@@ -60,7 +61,8 @@ def test_the_denoiser_learns_from_the_noised_truth_of_the_window():
         denoise = model.denoise
         model.denoise = lambda *args, denoise=denoise, seen=seen: (seen.append(args), denoise(*args))[1]
         torch.manual_seed(0)
-        model.learn(TRUTH[:, -1:, :SPARSE_DIM], model.true_state(TRUTH[:, :-1]), TRUTH)
+        motion, _ = model.learn(TRUTH[:, -1:, :SPARSE_DIM], model.true_state(TRUTH[:, :-1]), TRUTH)
+        assert float(motion[..., ROTATION].detach().abs().max()) == pytest.approx(1)  # kept within limits
         found.append({name: float(term.detach()) for name, term in model.auxiliary_losses(TRUTH).items()})
         assert model.auxiliary_losses(TRUTH) == {}
     (noisy, time, encoded), *_ = seen
@@ -137,6 +139,20 @@ def test_offline_it_is_no_stream():
     assert "offline" not in Evaluation(["window"], 4, NoIK(), 0).report(
         tiny.baseline("bodiffusion"), tiny.frames((20,)), "window"
     )
+
+
+@torch.no_grad()
+def test_trained_weights_may_sample_with_more_steps_than_any_without_noise():
+    model = tiny.baseline("bodiffusion", diffusion_steps=60, depth=1)
+    finer = tiny.baseline("bodiffusion", seed=1, **FINER)
+    finer.load_state_dict(model.state_dict())
+    assert (len(model.noises), len(finer.noises)) == (1, 3)
+    window = CLIP[None, :7, :SPARSE_DIM]
+    motions = [one.advance(window, one.initial_state())[0] for one in (model, finer)]
+    assert not torch.allclose(*motions, atol=1e-3)
+    live = streaming(finer.double())
+    expected = finer.advance(window.double()[:, :1], finer.initial_state(), 1)[0]
+    torch.testing.assert_close(live.advance(window.double()[:, :1], live.initial_state())[0], expected)
 
 
 def test_sampling_draws_nothing():
