@@ -23,8 +23,6 @@ from memmlp.cli.options import (
 )
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from memmlp.live.calibration import Calibration
     from memmlp.live.outputs.output import Output, Outputs
     from memmlp.live.player.server import File
@@ -235,7 +233,7 @@ def clip_of(feed: Feed) -> TrackedClip:
         InputError: for a test clip where the network is an ONNX file, which has none, or an unknown name.
     """
     from memmlp.common.errors import InputError
-    from memmlp.live.player.sources import TrackedClip
+    from memmlp.live.player.sources import TrackedClip, npz_frames
 
     if feed.clip is not None and feed.clip.endswith(".npz"):
         return TrackedClip(Path(feed.clip).stem, npz_frames(Path(feed.clip)))
@@ -248,30 +246,6 @@ def clip_of(feed: Feed) -> TrackedClip:
     test = open_run(feed.outputs, feed.network).test
     index = 0 if feed.clip is None else clip_index(test, feed.clip)
     return TrackedClip(test.names[index], test.clip(index).numpy())
-
-
-def npz_frames(path: Path) -> np.ndarray:
-    """Return the frames (N, 252) of an AMASS npz, resampled to 60 Hz, on the built-in body.
-
-    Raises:
-        InputError: for a clip of fewer than 3 frames at 60 Hz.
-    """
-    import torch
-
-    from memmlp.common.errors import InputError
-    from memmlp.motion.body import builtin_rest_joints
-    from memmlp.motion.clip import resample
-    from memmlp.motion.features import motion_frames
-    from memmlp.motion.formats.npz import read_clip
-    from memmlp.motion.plausible import check_plausible
-
-    recorded = read_clip(path, path.stem)
-    check_plausible(path, recorded)
-    clip, _ = resample(recorded)
-    if len(clip) < 3:
-        raise InputError(f"{path}: {len(clip)} frames at 60 Hz; allowed are 3 or more")
-    tensors = (torch.tensor(part) for part in (clip.poses, clip.trans, builtin_rest_joints()))
-    return motion_frames(*tensors).numpy()
 
 
 def sent(feed: Feed) -> None:
@@ -320,9 +294,11 @@ def opened(feed: Feed, space: SpaceName, room: Room) -> tuple[Stream, str]:
     from memmlp.live.stream import Stream
 
     file, name = network_file(feed)
-    known = known_of(room, space)
-    height, floor = known.height, known.floor
-    return Stream(file, space=space, offsets=known.offsets, height=height, floor=floor), name
+    stream = Stream(file, space=space)
+    known = known_of(room, space, stream)
+    stream.offsets = known.offsets
+    stream.fit(known.height, known.floor)
+    return stream, name
 
 
 def network_file(feed: Feed) -> tuple[Path, str]:
@@ -335,16 +311,21 @@ def network_file(feed: Feed) -> tuple[Path, str]:
     return run.preferred_onnx, f"run {run.id[:8]}"
 
 
-def known_of(room: Room, space: SpaceName) -> Calibration:
+def known_of(room: Room, space: SpaceName, stream: Stream) -> Calibration:
     """Return what is known of the wearer: by the file of --calibration, and by the options before it."""
     from memmlp.live.calibration import Calibration, read_calibration
+    from memmlp.live.wearer import stature
 
-    known = Calibration(space)
+    body = stature(stream.network.skeleton)
+    known = Calibration(space, body)
     if room.calibration is not None and room.calibration.exists():
-        known = read_calibration(room.calibration, space)
+        known = read_calibration(room.calibration, space, body)
     height = known.height if room.height is None else room.height / 100
     floor = known.floor if room.floor is None else room.floor / 100
-    return Calibration(space, known.offsets, height, floor)
+    if known.offsets is not None and abs((height or body) - (known.height or body)) > 0.005:
+        was = 100 * (known.height or body)
+        noted(f"{room.calibration}: its calibration is of a height of {was:.0f} cm; calibrate again")
+    return Calibration(space, body, known.offsets, height, floor)
 
 
 def outputs_of(room: Room, stream: Stream) -> Outputs:
@@ -381,6 +362,8 @@ def avatar_saved(feed: Feed, path: Path) -> None:
 
     if path.suffix.lower() != ".vrm":
         raise InputError(f"--save-avatar {path}: no such kind of file; allowed: .vrm")
+    if path.exists():
+        raise InputError(f"--save-avatar {path}: is there already; allowed is a new file")
     file, _ = network_file(feed)
     try:
         write_vrm(path, ExportedNetwork(file).skeleton.rest)

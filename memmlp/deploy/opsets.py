@@ -7,7 +7,8 @@ and any other one that differs is refused.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import onnx
@@ -82,7 +83,7 @@ def _since(kind: str, opset: int) -> int:
     return onnx.defs.get_schema(kind, opset).since_version
 
 
-def _attributes(node: NodeProto) -> Mapping[str, object]:
+def _attributes(node: NodeProto) -> dict[str, Any]:
     return {attribute.name: helper.get_attribute_value(attribute) for attribute in node.attribute}
 
 
@@ -109,11 +110,11 @@ def _normalised(node: NodeProto, constants: Constants) -> Iterator[NodeProto]:
     attributes = _attributes(node)
     assert attributes.get("axis", -1) == -1
     name, x = node.output[0], node.input[0]
-    epsilon = constants.add(f"{name}.epsilon", np.float32(attributes.get("epsilon", 1e-5)))
-    two = constants.add(f"{name}.two", np.float32(2))
+    epsilon = constants.add(f"{name}.epsilon", np.array(attributes.get("epsilon", 1e-5), np.float32))
+    two = constants.add(f"{name}.two", np.array(2, np.float32))
     scaled = name if len(node.input) == 2 else f"{name}.scaled"
 
-    def step(kind: str, inputs: list[str], output: str, **settings: object) -> NodeProto:
+    def step(kind: str, inputs: list[str], output: str, **settings: Any) -> NodeProto:
         return helper.make_node(kind, inputs, [output], output, **settings)
 
     yield step("ReduceMean", [x], f"{name}.mean", axes=[-1])

@@ -104,12 +104,12 @@ class Finding(NamedTuple):
 
     Attributes:
         what: the operator with its version, or the opset.
-        count: how many nodes it concerns; 0 for the opset.
+        nodes: how many it concerns; 0 for the opset.
         why: what is wrong with it.
     """
 
     what: str
-    count: int
+    nodes: int
     why: str
 
 
@@ -119,9 +119,10 @@ def published(name: str) -> Published:
         return _kernels(KERNELS[name])
     text = resources.files("memmlp.deploy").joinpath("operators", f"{name}.yaml").read_text("utf-8")
     found: dict[str, Any] = yaml.safe_load(text)
-    rules = {operator: _rule(said or {}) for operator, said in found.pop("operators").items()}
-    dates = {key: str(found.pop(key)) for key in ("dated", "read") if key in found}
-    return Published(operators=rules, **dates, **found | {"opsets": tuple(found.get("opsets", ()))})
+    found |= {key: str(found[key]) for key in ("dated", "read") if key in found}
+    found["opsets"] = tuple(found.get("opsets", ()))
+    found["operators"] = {operator: _rule(said or {}) for operator, said in found["operators"].items()}
+    return Published(**found)
 
 
 def findings(model: ModelProto, listed: Published) -> list[Finding]:
@@ -165,7 +166,7 @@ class _Facts:
     """What must be known of a graph: its nodes, its constants, and the types and ranks of its tensors."""
 
     def __init__(self, model: ModelProto, folds: bool):
-        inferred = onnx.shape_inference.infer_shapes(model).graph
+        inferred = _inferred(model)
         self.constants = {tensor.name for tensor in inferred.initializer}
         self.types = {tensor.name: tensor.data_type for tensor in inferred.initializer}
         self.ranks = {tensor.name: len(tensor.dims) for tensor in inferred.initializer}
@@ -179,6 +180,14 @@ class _Facts:
                 self.constants.update(node.output)
             if not (folds and folded):
                 self.nodes.append(node)
+
+
+def _inferred(model: ModelProto) -> GraphProto:
+    """Return a model's graph with the types and ranks of its tensors, as far as onnx can tell."""
+    try:
+        return onnx.shape_inference.infer_shapes(model).graph
+    except onnx.shape_inference.InferenceError:
+        return model.graph
 
 
 def _reasons(node: NodeProto, version: int, listed: Published, facts: _Facts) -> Iterator[str]:
@@ -223,7 +232,8 @@ def _version(node: NodeProto, opset: int) -> int:
 
 
 def _is_function(node: NodeProto, version: int) -> bool:
-    return onnx.defs.has(node.op_type, version) and onnx.defs.get_schema(node.op_type, version).has_function
+    known: Any = onnx.defs.get_schema(node.op_type, version) if onnx.defs.has(node.op_type, version) else None
+    return known is not None and (known.has_function or known.has_context_dependent_function)
 
 
 def _type(kind: int) -> str:
@@ -240,7 +250,8 @@ def _within(version: int, part: str) -> bool:
 
 
 def _rule(said: Mapping[str, Any]) -> Rule:
-    return Rule(**{key: tuple(value) if isinstance(value, list) else value for key, value in said.items()})
+    given: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in said.items()}
+    return Rule(**given)
 
 
 def _kernels(title: str) -> Published:

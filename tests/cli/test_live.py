@@ -14,6 +14,9 @@ from conftest import Memmlp, one_line
 from glb import Glb
 from processes import PATIENCE, started
 
+from memmlp.cli.live import Room, known_of
+from memmlp.live.calibration import Calibration, save_calibration
+from memmlp.live.stream import Offsets, Stream
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.synthetic import synthesize_clip
 
@@ -28,6 +31,7 @@ from memmlp.motion.synthetic import synthesize_clip
         (["--udp", "9001", "--token", "a token of many letters"], "--token: goes with --host"),
         (["--udp", "9001", "--host", "0.0.0.0", "--token", "short"], "--token: 5 characters"),
         (["--vmc", "127.0.0.1:none"], "--vmc"),
+        (["--save-avatar", "{avatar}"], "is there already"),
         (["--save-avatar", "me.glb"], "--save-avatar me.glb: no such kind of file; allowed: .vrm"),
         (["--clip", "{clip}", "--avatar", "none.vrm"], "--avatar none.vrm: no such file"),
         (["--clip", "{clip}", "--avatar", "{clip}"], "no binary glTF"),
@@ -38,7 +42,9 @@ from memmlp.motion.synthetic import synthesize_clip
     ],
 )
 def test_what_is_refused(memmlp: Memmlp, clip: Path, step: Path, words: list[str], told: str):
-    line = [word.replace("{clip}", str(clip)) for word in words]
+    avatar = clip.with_suffix(".vrm")
+    avatar.write_bytes(b"precious")
+    line = [word.format(clip=clip, avatar=avatar) for word in words]
     assert one_line(memmlp("live", str(step), "--no-browser", "--port", "0", *line), told)
 
 
@@ -89,3 +95,18 @@ def test_the_avatar_as_a_file(memmlp: Memmlp, step: Path, tmp_path: Path):
     assert memmlp("live", str(step), "--save-avatar", "me.vrm").code == 0
     assert "VRMC_vrm" in Glb(tmp_path / "me.vrm").json["extensions"]
     assert np.isfinite(Glb(tmp_path / "me.vrm").vertices(None)).all()
+
+
+def test_a_calibration_of_another_height_is_told(
+    step: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Its offsets are of that height, and would be wrong in silence."""
+    stream = Stream(step)
+    worn = Offsets(np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)))
+    save_calibration(tmp_path / "me.json", Calibration("amass", 1.72, worn, 1.80, 0.02))
+    room = Room(None, None, tmp_path / "me.json", (), (), (), None, 0, "127.0.0.1", None, True)
+    known = known_of(room, "amass", stream)
+    assert (known.height, known.floor, capsys.readouterr().err) == (1.80, 0.02, "")
+    known = known_of(room._replace(height=186.0, floor=5.0), "amass", stream)
+    assert (known.height, known.floor) == (1.86, 0.05)
+    assert "its calibration is of a height of 180 cm; calibrate again" in capsys.readouterr().err

@@ -37,6 +37,7 @@ def needed(tmp_path: Path) -> dict[str, list[str]]:
         "predictor=rotation_only": ["hand=fk"],
         "loss=agrol": ["model=agrol_mlp"],
         "loss=avatar_poser": ["model=avatar_poser"],
+        "loss=own": ["model=bodiffusion"],
         **{f"loss={name}": ["model=agrol_mlp"] for name in OF_TERMS},
         "predictor=rotation_only_memory": ["hand=fk"],
     }

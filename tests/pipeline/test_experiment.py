@@ -56,7 +56,7 @@ CHANGES: dict[str, str] = {
     "optim.validate_every": "1", "optim.log_every": "1",
     "evaluation.modes": "[stream]", "evaluation.batch": "1", "evaluation.ik": "off",
     "evaluation.ik_iterations": "3",
-    "export.graph": "naive", "export.precision": "int8", "export.latency_steps": "250",
+    "export.graph": "naive", "export.precision": "int8", "export.opset": "15", "export.latency_steps": "250",
     "tracking.mlflow.uri": "sqlite:///other.db", "tracking.wandb.project": "other",
 }  # fmt: skip
 

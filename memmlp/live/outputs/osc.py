@@ -95,7 +95,7 @@ class Receiver:
         try:
             self.socket.sendto(datagram, self.address)
         except OSError as error:
-            if error.errno not in (errno.EAGAIN, errno.ENOBUFS, errno.ECONNREFUSED):
+            if error.errno not in (errno.EAGAIN, errno.ENOBUFS):
                 raise
 
     def close(self) -> None:

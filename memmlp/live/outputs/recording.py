@@ -60,7 +60,7 @@ class Recording:
             format_of(path, "--record")
             if path.exists():
                 raise InputError(f"--record {path}: is there already; allowed is a new file")
-        if len(set(paths)) < len(paths):
+        if len({path.resolve() for path in paths}) < len(paths):
             raise InputError("--record: the same file twice; allowed are different files")
         self.name = "recording " + ", ".join(path.name for path in paths)
         self.paths, self.rest, self.fps, self.tell = paths, rest, fps, tell

@@ -21,6 +21,7 @@ from memmlp.live.player.packets import TrackerPoses
 from memmlp.live.spaces import SpaceName
 from memmlp.live.stream import Offsets, Stream
 from memmlp.live.trackers import TRACKERS
+from memmlp.live.wearer import stature
 from memmlp.motion.body import ROOT
 
 COUNTDOWN = 5.0  # seconds
@@ -169,7 +170,8 @@ class Fitting:
     def _save(self) -> None:
         if self.path is not None:
             stream = self.stream
-            made = Calibration(self.space, stream.offsets, self.own_height, stream.wearer.floor)
+            body = stature(stream.network.skeleton)
+            made = Calibration(self.space, body, stream.offsets, self.own_height, stream.wearer.floor)
             save_calibration(self.path, made)
 
     def _say(self, said: str, failed: bool = False) -> None:

@@ -8,6 +8,7 @@ import socket
 import time
 from collections.abc import Callable, Sequence
 from ipaddress import IPv4Network, ip_address
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -112,6 +113,29 @@ class TrackedClip:
         """Return the index of the frame before a time, and the fraction of the way to the next frame."""
         first = min(max(int(time * FPS), 0), len(self.joints) - 2)
         return first, time * FPS - first
+
+
+def npz_frames(path: Path) -> np.ndarray:
+    """Return the frames (N, 252) of an AMASS npz, resampled to 60 Hz, on the built-in body.
+
+    Raises:
+        InputError: for a clip of fewer than 3 frames at 60 Hz.
+    """
+    import torch
+
+    from memmlp.motion.body import builtin_rest_joints
+    from memmlp.motion.clip import resample
+    from memmlp.motion.features import motion_frames
+    from memmlp.motion.formats.npz import read_clip
+    from memmlp.motion.plausible import check_plausible
+
+    recorded = read_clip(path, path.stem)
+    check_plausible(path, recorded)
+    clip, _ = resample(recorded)
+    if len(clip) < 3:
+        raise InputError(f"{path}: {len(clip)} frames at 60 Hz; allowed are 3 or more")
+    tensors = (torch.tensor(part) for part in (clip.poses, clip.trans, builtin_rest_joints()))
+    return motion_frames(*tensors).numpy()
 
 
 def in_space(trackers: TrackerPoses, space: Space) -> TrackerPoses:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from types import SimpleNamespace
 
 import numpy as np
@@ -91,6 +92,35 @@ def test_a_bundle_s_floats_are_where_they_belong():
         found = messages(bundle.write(values))
         assert [m.values[:2] for m in found] == [[name, 7] for name in names]
         assert [v for m in found for v in m.values[2:]] == values.tolist()
+
+
+class Network:
+    """A socket in a network in some state."""
+
+    def __init__(self, state: int):
+        self.state = state
+
+    def sendto(self, *_: object) -> None:
+        raise OSError(self.state, "as it is")
+
+    def close(self) -> None: ...
+
+
+def test_a_busy_network_drops_a_datagram_and_no_way_is_an_error():
+    receiver = Receiver("127.0.0.1", 39539, "--vmc")
+    receiver.close()
+    for state in (errno.EAGAIN, errno.ENOBUFS):
+        receiver.socket = Network(state)
+        receiver.send(b"")
+    receiver.socket = Network(errno.ENETUNREACH)
+    with pytest.raises(OSError, match="as it is"):
+        receiver.send(b"")
+
+
+def test_nothing_is_waited_for():
+    receiver = Receiver("127.0.0.1", 39539, "--vmc")
+    assert receiver.socket.getblocking() is False
+    receiver.close()
 
 
 def test_an_unknown_host_is_one_line():

@@ -52,7 +52,7 @@ def test_frames_that_no_pose_was_made_for_are_filled(recording, tmp_path: Path, 
     assert told == [f"{tmp_path / 'a.npz'}: 1.0 s, 40 of 61 frames interpolated"]
 
 
-@pytest.mark.parametrize("later", [10.0, -3.0])
+@pytest.mark.parametrize("later", [10.0, 0.7, -3.0])
 def test_breaks_are_left_out_and_told(recording, tmp_path: Path, told: list[str], later: float):
     made = recording("a.npz")
     for index in range(10):

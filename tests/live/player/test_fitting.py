@@ -69,7 +69,7 @@ def test_a_calibration_waits_for_its_countdown(worn: Wearing):
         "me.json",
     )
     assert "0 cm from the joints" in state["said"]
-    saved = read_calibration(worn.path, "amass").offsets
+    saved = read_calibration(worn.path, "amass", 1.72).offsets
     np.testing.assert_allclose(saved.positions, worn.stream.offsets.positions)
 
 
@@ -101,7 +101,7 @@ def test_height_and_floor(worn: Wearing):
     worn.order("height", None)
     worn.fitting.step(None)
     assert (worn.stream.wearer.scale, worn.stream.wearer.floor) == (1, 0)
-    saved = read_calibration(worn.path, "amass")
+    saved = read_calibration(worn.path, "amass", 1.72)
     assert (saved.height, saved.floor) == (None, 0)
 
 
@@ -122,7 +122,7 @@ def test_forgotten_and_cancelled(worn: Wearing):
     worn.now += 100
     worn.fitting.step(worn.pose())
     assert worn.stream.offsets is None
-    assert read_calibration(worn.path, "amass").offsets is None
+    assert read_calibration(worn.path, "amass", 1.72).offsets is None
     assert (worn.told[-1]["waiting"], worn.told[-1]["calibrated"]) == (None, False)
 
 
