@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 from collections.abc import Iterable
 from pathlib import Path
@@ -58,9 +59,9 @@ def written(clips: Iterable[SiteClip], folder: Path) -> list[dict[str, Any]]:
     """Write clips into a site's folder, and return what the page has to know of them."""
     entries = []
     for clip in clips:
-        path = folder / "clips" / f"{clip.key}.bin"
+        path = folder / "clips" / f"{clip.key}.gz"
         path.parent.mkdir(exist_ok=True)
-        path.write_bytes(clip.content)
+        path.write_bytes(gzip.compress(clip.content, 9, mtime=0))
         entries.append(
             {"key": clip.key, "name": clip.name, "file": f"clips/{path.name}", "frames": clip.frames}
         )

@@ -1,6 +1,7 @@
 // Plays test clips through a network in this browser: the truth in grey, the prediction coloured by its error.
 
 import { h, replace, select } from './dom.js';
+import { fetched } from './fetched.js';
 import { History } from './history.js';
 import { Remote } from './remote.js';
 import { Stage } from './stage.js';
@@ -82,9 +83,8 @@ class Play {
     if (!this.clip) return this.tell('This network has no test clip on this site.');
     this.tell('Loading the network.');
     try {
-      const [answer] = await Promise.all([fetch(this.clip.file), this.remote.open('play', this.network.play)]);
-      if (!answer.ok) throw new Error(`${this.clip.file}: the server says ${answer.status}`);
-      const clip = new Clip(await answer.arrayBuffer());
+      const [content] = await Promise.all([fetched(this.clip.file), this.remote.open('play', this.network.play)]);
+      const clip = new Clip(content.buffer);
       this.tell('');
       this.stage ??= this.drawn();
       this.ticking ??= requestAnimationFrame(this.tick);
