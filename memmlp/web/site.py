@@ -65,9 +65,7 @@ class Site:
             unfinished.mkdir(parents=True)
             self._fill(unfinished)
             total = sum(path.stat().st_size for path in _files(unfinished))
-            if out.exists():
-                shutil.rmtree(out)
-            publish(unfinished, out)
+            _replace(out, unfinished)
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)
         return total
@@ -104,6 +102,15 @@ def check_place(out: Path) -> None:
         )
     if not out.absolute().parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}")
+
+
+def _replace(out: Path, unfinished: Path) -> None:
+    """Put a finished site in its place; an earlier one is gone when the new one stands."""
+    earlier = temporary(out)
+    if out.exists():
+        out.rename(earlier)
+    publish(unfinished, out)
+    shutil.rmtree(earlier, ignore_errors=True)
 
 
 def _files(folder: Path) -> list[Path]:

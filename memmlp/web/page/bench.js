@@ -90,12 +90,12 @@ class Bench {
     try {
       for (const backend of this.gpu.checked ? ['wasm', 'webgpu'] : ['wasm']) await this.backend(backend, each);
       this.stop(`Measured ${this.results.size} rows, ${each * ROUNDS} steps each.`);
-      this.copy.disabled = this.save.disabled = this.results.size === 0;
       say(this.note.textContent);
       document.documentElement.dataset.bench = 'done';
     } catch (error) {
       if (error.message !== 'stopped') this.stop(`This did not work: ${error.message}`);
     }
+    this.copy.disabled = this.save.disabled = this.results.size === 0;
   }
 
   // Time everything on a backend. What does not run there has its reason in its row.

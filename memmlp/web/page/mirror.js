@@ -13,7 +13,7 @@ const FACE = ['#14191f', '#e3e8ee'];
 export class Mirror {
   // joints: names of the joints; limbs: how they are shown (site.json).
   constructor(canvas, { limbs, joints }) {
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
     this.renderer.xr.enabled = true;
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(60, 1, 0.05, 60);
@@ -41,9 +41,9 @@ export class Mirror {
     const sun = new THREE.DirectionalLight(0xffffff, 1.8);
     sun.position.set(1.4, 4, 1.8);
     this.floor = new THREE.GridHelper(8, 16, 0x6b7683, 0x6b7683);
-    this.ground = new THREE.Mesh(new THREE.CircleGeometry(12, 48), new THREE.MeshBasicMaterial({ color: 0xd9dee3 }));
+    this.ground = new THREE.Mesh(new THREE.CircleGeometry(12, 48), new THREE.MeshBasicMaterial({ color: 0xd9dee3, depthWrite: false }));
     this.ground.rotation.x = -Math.PI / 2;
-    this.ground.position.y = -0.005;
+    this.ground.renderOrder = -1; // before the lines on it, which are as far away
     this.sky = new THREE.Color(0xeef1f4);
     this.scene.add(sun, this.floor, this.ground);
     this.through(false);

@@ -87,7 +87,7 @@ class Play {
       const clip = new Clip(await answer.arrayBuffer());
       this.tell('');
       this.stage ??= this.drawn();
-      requestAnimationFrame(this.tick);
+      this.ticking ??= requestAnimationFrame(this.tick);
       await this.rounds(clip, round);
     } catch (error) {
       if (round === this.round) this.tell(error.message);

@@ -42,7 +42,8 @@ export class Stream {
     const { positions, rotations, lost } = this.joints([head, left, right].map(read));
     const { frames, restarted } = this.trackers.take(time, positions, rotations, lost);
     const held = TRACKERS.filter((_, i) => lost[i]);
-    this.newest = this.newest.then(last => this.posed(frames, restarted, held, last));
+    const { scale } = this;
+    this.newest = this.newest.then(last => this.posed(frames, { restarted, held, scale }, last));
     return this.newest;
   }
 
@@ -78,7 +79,7 @@ export class Stream {
     };
   }
 
-  async posed(frames, restarted, held, last) {
+  async posed(frames, { restarted, held, scale }, last) {
     if (!frames.length) return { ...last, held, fresh: false, restarted: false };
     let made = null;
     for (const [index, { positions, rotations }] of frames.entries()) {
@@ -88,7 +89,7 @@ export class Stream {
         fresh: restarted && index === 0,
       });
     }
-    const metres = joints => joints.map(x => x / this.scale);
+    const metres = joints => joints.map(x => x / scale);
     return {
       time: frames.at(-1).time, positions: metres(made.positions), rotations: made.rotations, joints: metres(made.joints),
       held, fresh: true, restarted,

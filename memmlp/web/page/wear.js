@@ -13,6 +13,7 @@ const AWAITED = 2; // samples that may wait for the network; what comes then is 
 const TIMED = 600; // the newest poses whose times are told
 const USUAL = 91; // the newest frames of the display, whose median tells its rate
 const SURE = 10; // so many of them at least
+const [SHORTEST, TALLEST] = [0.9, 2.4]; // metres; outside of them a floor or a height is wrong
 const INVITE = ['Pull a trigger or pinch, then stand upright in T-pose:', 'arms to the sides, palms down, eyes forward'];
 
 export function wear(page, site) {
@@ -83,6 +84,7 @@ class Wear {
   }
 
   async enter(mode) {
+    if (!this.height.reportValidity()) return;
     try {
       const session = await navigator.xr.requestSession(mode, { requiredFeatures: ['local-floor'], optionalFeatures: ['hand-tracking'] });
       this.begin(session, mode);
@@ -160,14 +162,8 @@ class Wear {
     if (left > 0) return mirror.tell(`T-pose ... ${Math.ceil(left)}`, INVITE[1]);
     worn.due = null;
     try {
-      const before = worn.stream.scale;
-      this.scaled(trackers[0]);
-      try {
-        worn.stream.calibrate(...trackers);
-      } catch (error) {
-        worn.stream.scale = before;
-        throw error;
-      }
+      if (!trackers.includes(null)) this.scaled(trackers[0]);
+      worn.stream.calibrate(...trackers);
       worn.calibrated = true;
       this.stand(trackers[0]);
       mirror.tell(`Calibrated, ${worn.tall.toFixed(2)} m tall.`, 'Pull a trigger or pinch to do it again.');
@@ -182,6 +178,7 @@ class Wear {
     const { body } = this.network;
     const typed = this.height.valueAsNumber / 100;
     const tall = typed > 0 ? typed : head ? head.position[1] / body.eyes : body.height;
+    if (!(tall >= SHORTEST && tall <= TALLEST)) throw new Error(`${tall.toFixed(2)} m tall; stand upright, or type in your height`);
     this.worn.tall = tall;
     this.worn.stream.scale = body.height / tall;
   }
