@@ -11,7 +11,12 @@ const YARDSTICK = 'yardstick';
 export function bench(page, site) {
   const view = new Bench(page, site);
   view.describe();
-  return () => view.stop();
+  const hidden = () => { if (document.hidden && view.remote) view.stop('Stopped: browsers slow down a page that is not in front.'); };
+  document.addEventListener('visibilitychange', hidden);
+  return () => {
+    document.removeEventListener('visibilitychange', hidden);
+    view.stop();
+  };
 }
 
 // What is timed: { key, network, graph, precision, step, whole }, the graphs of the base first.
