@@ -133,7 +133,7 @@ class AGRoLStream(StreamingGraph):
     A ring would spare one copy of them, but turning the T x T matrices of 12 blocks to its order costs more.
     """
 
-    ends: tuple[str, ...] = ("model.stem", "model.head")
+    ends = ("model.stem", "model.head")
     width: int
     blocks: list[MLPBlock]
 
