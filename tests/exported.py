@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tiny
 
@@ -12,6 +13,9 @@ from memmlp.motion.coordinates import Heading
 from memmlp.networks.memory import CodeMemory, LSTMMemory, NoMemory
 from memmlp.networks.predictor import RotationOnly
 from memmlp.networks.window_model import WindowModel
+
+if TYPE_CHECKING:
+    from onnx import GraphProto
 
 LARGEST = ("manikin_s", "manikin_l", "hmd_poser", "avatar_jlm")
 NETWORKS: dict[str, Callable[[], WindowModel]] = {
@@ -34,3 +38,24 @@ def write(name: str, path: Path) -> None:
     from memmlp.networks.streaming import streaming
 
     export(streaming(NETWORKS[name]()), path, "0123456789abcdef")
+
+
+DATA_DEPENDENT = {
+    "Compress", "Equal", "GatherND", "If", "Loop", "NonZero", "Or", "Range", "Scan", "ScatterElements",
+    "ScatterND", "Shape", "Unique",
+}  # fmt: skip
+"""Operators whose shape or work follows from the data, and those that lead to them."""
+
+INDICES = {"Slice": 1, "Split": 1, "Reshape": 1, "Expand": 1, "Pad": 1, "Tile": 1}
+"""Operators whose inputs from this one on must be constants. (A table may be looked into at any index.)"""
+
+
+def data_dependent(graph: GraphProto) -> set[str]:
+    """Return the operators of a graph whose shape or work depends on the data."""
+    constants = {tensor.name for tensor in graph.initializer}
+    found = set()
+    for node in graph.node:
+        computed = set(node.input[INDICES.get(node.op_type, len(node.input)) :]) - constants - {""}
+        if node.op_type in DATA_DEPENDENT or computed:
+            found.add(node.op_type)
+    return found

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from memmlp.deploy import latency
 from memmlp.deploy.export import export
+from memmlp.deploy.half import halve
 from memmlp.deploy.parity import streamed
 from memmlp.deploy.quantization import quantise
 from memmlp.deploy.session import OnnxStream
@@ -337,6 +338,15 @@ def int8() -> Numbers:
         return summary("motion", streamed(OnnxStream(quantised), tiny.clip(25)))
 
 
+def fp16() -> Numbers:
+    """An exported stream in fp16."""
+    with tempfile.TemporaryDirectory() as folder:
+        exact, half = (Path(folder) / f"{name}.onnx" for name in ("exact", "half"))
+        exact.write_bytes(exported("graph.streaming"))
+        halve(exact, half, streaming(tiny.model()).ends)
+        return summary("motion", streamed(OnnxStream(half), tiny.clip(25)))
+
+
 CASES: dict[str, Callable[[], Numbers]] = {
     "features": features,
     **{
@@ -414,6 +424,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "graph.streaming": partial(deployed, "graph.streaming"),
     "graph.naive": partial(deployed, "graph.naive"),
     "int8": int8,
+    "fp16": fp16,
 }  # fmt: skip
 UNSEEN = ("export", "latency")
 """Components without numbers of their own: a file's form, and times."""
@@ -439,8 +450,8 @@ def changed(now: Mapping[str, float], before: Mapping[str, float], tolerance: fl
 
 
 def tolerance(case: str) -> float:
-    """How far processors' numbers may differ: int8 and Muon's bfloat16 round, by one more or less."""
-    return 2e-2 if case in ("int8", "optim.muon") else 2e-4
+    """How far processors' numbers may differ: where few bits are left, they round by one more or less."""
+    return 2e-2 if case in ("int8", "fp16", "optim.muon") else 2e-4
 
 
 def stored() -> dict[str, dict[str, object]]:

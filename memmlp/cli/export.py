@@ -1,9 +1,9 @@
-"""`memmlp export`: the ONNX file of a finished run, checked against torch."""
+"""`memmlp export`: the ONNX file of a finished run, checked against torch and what runtimes publish."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
@@ -15,10 +15,30 @@ if TYPE_CHECKING:
     from memmlp.networks.streaming import StreamingGraph
     from memmlp.networks.window_model import WindowModel
 
+TARGETS = ("onnxruntime", "web", "wasm", "webgpu", "webnn", "unity", "tensorrt", "coreml", "qnn")
+"""Those of memmlp.deploy.targets, without importing ONNX Runtime for the help."""
+
+
+class Form(NamedTuple):
+    """What file is wanted of a run.
+
+    Attributes:
+        graph: "auto", "streaming" or "naive".
+        precision: "fp32", "fp16" or "int8".
+        opset: the file's ONNX opset.
+        full: the frame of reference and the format of the joints' rotations, for a file that covers the whole
+            way from trackers to joints; None for the network alone.
+    """
+
+    graph: str
+    precision: str
+    opset: int
+    full: tuple[str, str] | None
+
 
 @click.command("export")
-@click.argument("run")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="ONNX file to write.")
+@click.argument("run", metavar="RUN|FILE.onnx")
+@click.option("--out", type=click.Path(path_type=Path), help="ONNX file to write; not needed with --check.")
 @click.option(
     "--graph",
     default="auto",
@@ -31,15 +51,22 @@ if TYPE_CHECKING:
     "--precision",
     default="fp32",
     show_default=True,
-    type=click.Choice(["fp32", "int8"]),
-    help="Precision of the weights: fp32, or int8, which is calibrated on training clips and measured on "
-    "test clips.",
+    type=click.Choice(["fp32", "fp16", "int8"]),
+    help="Precision of the inner layers' weights; fp16 and int8 are measured on test clips, and int8 is "
+    "calibrated on training clips.",
 )
 @click.option(
     "--max-growth",
     default=1.0,
     show_default=True,
-    help="How much MPJPE may grow in int8, percent; no file is written where it grows more.",
+    help="How much MPJPE may grow in fp16 or int8, percent; no file is written where it grows more.",
+)
+@click.option(
+    "--opset",
+    default=18,
+    show_default=True,
+    type=click.IntRange(15, 26),
+    help="ONNX operator set of the file; Unity's engine reads up to 15.",
 )
 @click.option(
     "--scope",
@@ -55,22 +82,76 @@ if TYPE_CHECKING:
     help="Frame of reference of poses, with --scope full.  [default: amass]",
 )
 @click.option(
+    "--rotations",
+    type=click.Choice(["matrix", "quaternion"]),
+    help="Format of the joints' rotations, with --scope full; quaternions are x, y, z, w.  [default: matrix]",
+)
+@click.option(
     "--clips", default=1, show_default=True, help="How many test clips the file is checked on; 0 for all."
+)
+@click.option(
+    "--check",
+    "targets",
+    multiple=True,
+    type=click.Choice(TARGETS),
+    help="List the operators of the file that lie outside of what this target publishes; may be repeated. "
+    "With FILE.onnx nothing is exported.",
 )
 @plugins_option
 @outputs_option
 def export(
     run: str,
-    out: Path,
+    out: Path | None,
     graph: str,
     precision: str,
     max_growth: float,
+    opset: int,
     scope: str,
     space: str | None,
+    rotations: str | None,
     clips: int,
+    targets: tuple[str, ...],
     outputs: Path,
 ) -> None:
-    """Export a finished run (id, its beginning, or folder) as ONNX and check it on whole test clips."""
+    """Export a finished run (id, its beginning, or folder) as ONNX and check it on whole test clips.
+
+    With --check the exit code is 1 where a target does not have all operators; the file is written anyway.
+    """
+    import tempfile
+
+    from memmlp.common.errors import InputError
+
+    if run.endswith(".onnx"):
+        if out or not targets:
+            raise InputError(f"{run}: is an ONNX file already; allowed with it is --check alone")
+        check(Path(run), targets)
+        return
+    if out is None and not targets:
+        raise InputError("--out: is missing; it may be left out with --check alone")
+    if out is not None and not out.parent.is_dir():
+        raise InputError(f"--out {out}: there is no folder {out.parent}")
+    named = f"--space {space}" if space else f"--rotations {rotations}" if rotations else None
+    if scope == "network" and named:
+        raise InputError(f"{named}: the network itself knows AMASS' world alone; allowed with --scope full")
+    full = (space or "amass", rotations or "matrix") if scope == "full" else None
+    with tempfile.TemporaryDirectory(prefix="memmlp-export-") as folder:
+        path = out or Path(folder) / f"{run.strip('/').rpartition('/')[2]}.onnx"
+        write(run, path, outputs, Form(graph, precision, opset, full), clips, max_growth / 100)
+        if targets:
+            check(path, targets)
+
+
+def write(run: str, out: Path, outputs: Path, form: Form, clips: int, max_growth: float) -> None:
+    """Write the file of a run, provided that it is as it should be.
+
+    Args:
+        run: the run's id, its beginning, or its folder.
+        out: the file to write.
+        outputs: the folder in which runs are kept.
+        form: what file is wanted.
+        clips: how many test clips a float32 file is checked on; 0 for all.
+        max_growth: the fraction by which MPJPE may grow with less precision (0.01 is 1 %).
+    """
     from memmlp.common.errors import InputError
     from memmlp.common.progress import tell
     from memmlp.config.open_run import open_run
@@ -79,31 +160,22 @@ def export(
     from memmlp.runs.lookup import find_run
 
     found = find_run(outputs, run)
-    if not out.parent.is_dir():
-        raise InputError(f"--out {out}: there is no folder {out.parent}")
-    if scope == "network" and space:
-        raise InputError(
-            f"--space {space}: the network itself knows AMASS' world alone; allowed with --scope full"
-        )
     _, experiment, data = open_run(outputs, run)
     model = experiment.architecture.load(found.weights())
-    network = GRAPHS[graph](model)
+    network = GRAPHS[form.graph](model)
     test = data.open("test").clips()
-    if precision == "fp32":
+    if form.precision == "fp32":
         tell(f"export: write {out}, and compare it with torch on {len(test[: clips or None])} test clips")
-        write_exact(
-            model,
-            network,
-            out,
-            found.id,
-            test[: clips or None],
-            full=space or "amass" if scope == "full" else None,
+        write_exact(model, network, out, found.id, test[: clips or None], form)
+    elif isinstance(network, StreamingGraph) and not (form.precision == "int8" and form.full):
+        tell(
+            f"export: write {out} in {form.precision}, and measure what that costs on {len(test)} test clips"
         )
-    elif scope == "network" and isinstance(network, StreamingGraph):
-        tell(f"export: write {out} in int8, and measure what that costs on {len(test)} test clips")
-        write_int8(network, out, found.id, data.open("train").clips(), test, max_growth / 100)
+        train = data.open("train").clips() if form.precision == "int8" else []
+        write_less_precise(network, out, found.id, train, test, form, max_growth)
     else:
-        raise InputError("--precision int8: allowed with --scope network and a streaming graph")
+        allowed = "--scope network and a streaming graph" if form.precision == "int8" else "a streaming graph"
+        raise InputError(f"--precision {form.precision}: allowed with {allowed}")
 
 
 def write_exact(
@@ -112,7 +184,7 @@ def write_exact(
     out: Path,
     run_id: str,
     clips: list[Tensor],
-    full: str | None,
+    form: Form,
 ) -> None:
     """Write the float32 ONNX file, provided that it computes on all clips what the trained model does.
 
@@ -122,8 +194,7 @@ def write_exact(
         out: the file to write.
         run_id: the run's id, for the file's metadata.
         clips: frames (N, 252) of each clip to compare on.
-        full: the frame of reference of the poses, for a file that covers the whole way from trackers to
-            joints; None for the network alone.
+        form: what file is wanted.
 
     Raises:
         ClickException: where file and model differ by more than the tolerance; nothing is written then.
@@ -132,17 +203,15 @@ def write_exact(
 
     import numpy as np
 
-    from memmlp.deploy.export import export as export_network
     from memmlp.deploy.parity import TOLERANCE, parity
-    from memmlp.live.full_graph import export_full, full_parity
+    from memmlp.live.full_graph import full_parity
 
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         path = Path(folder) / "step.onnx"
-        if full:
-            export_full(network, path, run_id, full)
-            apart = [full_parity(model, path, clip, full) for clip in clips]
+        write_graph(network, path, run_id, form)
+        if form.full:
+            apart = [full_parity(model, path, clip, form.full[0]) for clip in clips]
         else:
-            export_network(network, path, run_id)
             apart = [parity(model, path, clip) for clip in clips]
         worst = float(np.max(apart))  # NaN as soon as one is NaN, unlike max()
         said = f"differs from torch by {worst:.1e} at most on {len(clips)} test clips"
@@ -152,22 +221,37 @@ def write_exact(
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {said}")
 
 
-def write_int8(
+def write_graph(network: WindowModel | StreamingGraph, path: Path, run_id: str, form: Form) -> None:
+    """Write the ONNX file of the network, or of the whole way, in float32 and unchecked."""
+    from memmlp.deploy.export import export as export_network
+    from memmlp.live.full_graph import export_full
+
+    if form.full:
+        export_full(network, path, run_id, *form.full, form.opset)
+    else:
+        export_network(network, path, run_id, form.opset)
+
+
+def write_less_precise(
     network: StreamingGraph,
     out: Path,
     run_id: str,
     train: list[Tensor],
     test: list[Tensor],
+    form: Form,
     max_growth: float,
 ) -> None:
-    """Write the int8 ONNX file, provided that it is accurate enough, and say what it costs.
+    """Write the fp16 or int8 ONNX file, provided that it is accurate enough, and say what it costs.
+
+    What it costs is measured of the network, for a file of the whole way too: its layers are the same.
 
     Args:
-        network: the streaming graph to quantise.
+        network: the streaming graph.
         out: the file to write.
         run_id: the run's id, for the file's metadata.
-        train: frames (N, 252) of the clips that calibrate the quantisation.
+        train: frames (N, 252) of the clips that calibrate int8.
         test: frames (N, 252) of the clips that the cost is measured on.
+        form: what file is wanted.
         max_growth: the fraction by which MPJPE may grow (0.01 is 1 %).
 
     Raises:
@@ -175,18 +259,48 @@ def write_int8(
     """
     import tempfile
 
-    from memmlp.deploy.export import export as export_network
-    from memmlp.deploy.quantization import compared, quantise
+    from memmlp.deploy.cost import compared
+    from memmlp.deploy.deployment import lower
 
+    precision = form.precision
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
-        exact, quantised = Path(folder) / "fp32.onnx", Path(folder) / "int8.onnx"
-        export_network(network, exact, run_id)
-        quantise(exact, quantised, network.ends, train)
-        cost = compared(exact, quantised, network.normalizer, test)
+        exact, other = Path(folder) / "fp32.onnx", Path(folder) / "other.onnx"
+        write_graph(network, exact, run_id, form._replace(full=None))
+        lower(precision, exact, other, network.ends, train)
+        cost = compared(exact, other, precision, network.normalizer, test)
         said = ", ".join(
-            f"{name} {cost['fp32'][name]:.2f} -> {cost['int8'][name]:.2f}" for name in ("MPJPE", "Jitter")
+            f"{name} {cost['fp32'][name]:.2f} -> {cost[precision][name]:.2f}" for name in ("MPJPE", "Jitter")
         )
         if not cost["growth"] <= max_growth:
             raise click.ClickException(f"{said}: more than --max-growth {100 * max_growth:g} %, not written")
-        quantised.replace(out)
+        if form.full:
+            write_graph(network, exact, run_id, form)
+            lower(precision, exact, other, network.ends, train)
+        other.replace(out)
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, on test clips {said}")
+
+
+def check(path: Path, targets: tuple[str, ...]) -> None:
+    """Print what of a file lies outside of what the targets publish, with where that is published.
+
+    Raises:
+        ClickException: where anything does.
+    """
+    from memmlp.deploy import targets as published
+
+    model = published.load_graph(path)
+    kinds = len({node.op_type for node in model.graph.node})
+    click.echo(f"{path.name}: {len(model.graph.node)} nodes of {kinds} operators")
+    lacking = []
+    for name in dict.fromkeys(name for target in targets for name in published.TARGETS[target]):
+        listed = published.published(name)
+        outside = published.findings(model, listed)
+        click.echo(f"{name}: {listed.source}")
+        for what, count, why in outside:
+            click.echo(f"  {what}{f', {count} nodes' if count else ''}: {why}")
+        for remark in published.remarks(model, listed):
+            click.echo(f"  note: {remark}")
+        click.echo(f"  so {listed.outside}" if outside else "  all operators are published")
+        lacking += [name] if outside else []
+    if lacking:
+        raise click.ClickException(f"{path.name}: outside of what {', '.join(lacking)} publishes")

@@ -44,6 +44,12 @@ def show_latency(console: Console, measured: Mapping[str, Any]) -> None:
         f"({measured['ratio_to_yardstick']:.2f} x the yardstick)",
         soft_wrap=True,
     )
+    if "pose_median_ms" in measured:  # runs of earlier versions lack it
+        console.print(
+            f"a whole pose, from trackers to joints: {measured['pose_median_ms']:.2f} ms median, "
+            f"{measured['pose_p95_ms']:.2f} ms p95",
+            soft_wrap=True,
+        )
     console.print(size(measured), soft_wrap=True)
 
 

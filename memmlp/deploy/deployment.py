@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
 from memmlp.deploy import latency
+from memmlp.deploy.cost import compared
 from memmlp.deploy.export import export
+from memmlp.deploy.half import halve
+from memmlp.deploy.opsets import NATIVE
 from memmlp.deploy.parity import TOLERANCE, parity
-from memmlp.deploy.quantization import compared, quantise
+from memmlp.deploy.quantization import quantise
 from memmlp.networks.streaming import StreamingGraph, has_stream, streaming
 from memmlp.networks.window_model import WindowModel
 from memmlp.runs.deployment_folder import DeploymentFolder
@@ -33,12 +37,14 @@ class Deployment:
     Attributes:
         latency_steps: number of timed steps, after a warm-up.
         graph: "auto", "streaming" or "naive" (see GRAPHS).
-        precision: "fp32", or "int8" for an int8 file beside the float32 one.
+        precision: "fp32", or "int8" or "fp16" for such a file beside the float32 one.
+        opset: the files' ONNX opset, one of memmlp.deploy.opsets.OPSETS.
     """
 
     latency_steps: int
     graph: str = "auto"
     precision: str = "fp32"
+    opset: int = NATIVE
 
     def deploy(
         self,
@@ -58,14 +64,14 @@ class Deployment:
             test: test clips (N, 252), to check the file and measure int8's accuracy.
 
         Returns:
-            The files' sizes, times and int8's accuracy.
+            The files' sizes, times and the accuracy of the one of less precision.
 
         Raises:
             RuntimeError: if ONNX Runtime's numbers differ from torch's by more than the tolerance.
         """
         deployed.folder.mkdir(parents=True, exist_ok=True)
         network = GRAPHS[self.graph](model)
-        export(network, deployed.onnx, run_id)
+        export(network, deployed.onnx, run_id, self.opset)
         worst = parity(model, deployed.onnx, test[0])
         if not worst <= TOLERANCE:
             raise RuntimeError(
@@ -78,19 +84,36 @@ class Deployment:
             "graph": "streaming" if isinstance(network, StreamingGraph) else "naive",
             "onnx_parity": worst,
         }
-        if self.precision == "int8" and isinstance(network, StreamingGraph):
-            record["int8"] = self._int8(network, deployed, train, test)
+        if self.precision != "fp32" and isinstance(network, StreamingGraph):
+            record[self.precision] = self._less_precise(network, deployed, train, test)
         return record
 
-    def _int8(
+    def _less_precise(
         self,
         network: StreamingGraph,
         deployed: DeploymentFolder,
         train: Sequence[Tensor],
         test: Sequence[Tensor],
     ) -> dict[str, Any]:
-        """Write the int8 file beside the float32 one, and return its accuracy, times and size."""
-        quantise(deployed.onnx, deployed.int8, network.ends, train)
-        cost = compared(deployed.onnx, deployed.int8, network.normalizer, test)
-        measured = latency.measure(deployed.int8, self.latency_steps)
-        return {**cost, **measured, "onnx_bytes": deployed.int8.stat().st_size}
+        """Write the file of less precision beside the other; return its accuracy, times and size."""
+        path = {"int8": deployed.int8, "fp16": deployed.half}[self.precision]
+        lower(self.precision, deployed.onnx, path, network.ends, train)
+        cost = compared(deployed.onnx, path, self.precision, network.normalizer, test)
+        measured = latency.measure(path, self.latency_steps)
+        return {**cost, **measured, "onnx_bytes": path.stat().st_size}
+
+
+def lower(precision: str, source: Path, path: Path, ends: Sequence[str], train: Sequence[Tensor]) -> None:
+    """Write a file of less precision.
+
+    Args:
+        precision: "int8" or "fp16".
+        source: the float32 ONNX file of a streaming graph.
+        path: the file to write.
+        ends: names of the graph's modules that stay in float32.
+        train: training clips (N, 252), to calibrate int8.
+    """
+    if precision == "int8":
+        quantise(source, path, ends, train)
+    else:
+        halve(source, path, ends)

@@ -18,12 +18,11 @@ from torch import Tensor, nn
 
 from memmlp import __version__
 from memmlp.common.fences import publish, temporary
+from memmlp.deploy.opsets import NATIVE, converted
 from memmlp.deploy.parity import deterministic
 from memmlp.motion.body import FEATURES, FPS, JOINTS, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.networks.streaming import StreamingGraph
 from memmlp.networks.window_model import WindowModel
-
-OPSET = 18
 
 
 class OneStep(nn.Module):
@@ -43,8 +42,12 @@ class OneStep(nn.Module):
         return rotation, position, *(new[name] for name in self.names)
 
 
-def export(model: WindowModel | StreamingGraph, path: Path, run_id: str) -> None:
-    """Write the model's streaming step, on the CPU in float32, as one ONNX file with its metadata."""
+def export(model: WindowModel | StreamingGraph, path: Path, run_id: str, opset: int = NATIVE) -> None:
+    """Write the model's streaming step, on the CPU in float32, as one ONNX file with its metadata.
+
+    Raises:
+        InputError: for an opset that the step cannot be brought to.
+    """
     step = OneStep(model.cpu().eval())
     names = [f"state.{name}" for name in step.names]
     save(
@@ -54,6 +57,7 @@ def export(model: WindowModel | StreamingGraph, path: Path, run_id: str) -> None
         ["rotation6d", "position", *(f"{name}.next" for name in names)],
         path,
         metadata(model, run_id),
+        opset,
     )
 
 
@@ -64,6 +68,7 @@ def save(
     outputs: list[str],
     path: Path,
     meta: dict[str, str],
+    opset: int = NATIVE,
 ) -> None:
     """Write a step as one ONNX file, atomically.
 
@@ -74,6 +79,10 @@ def save(
         outputs: names of its outputs in the file.
         path: the file to write.
         meta: the file's metadata.
+        opset: one of memmlp.deploy.opsets.OPSETS.
+
+    Raises:
+        InputError: for an opset that the step cannot be brought to.
     """
     quiet = logging.getLogger("torch.onnx")
     level = quiet.level
@@ -86,14 +95,14 @@ def save(
                 arguments,
                 input_names=inputs,
                 output_names=outputs,
-                opset_version=OPSET,
+                opset_version=NATIVE,
                 dynamo=True,
                 verbose=False,
             )
     finally:
         quiet.setLevel(level)
     assert program is not None
-    graph = program.model_proto
+    graph = converted(program.model_proto, opset)
     onnx.helper.set_model_props(graph, meta)
     unfinished = temporary(path)
     try:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
@@ -19,18 +18,10 @@ from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantTy
 from torch import Tensor
 
 from memmlp.common.fences import publish, temporary
-from memmlp.common.progress import progress_bar
-from memmlp.deploy.parity import streamed
 from memmlp.deploy.session import OnnxStream
-from memmlp.evaluation.modes import rotations_report
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.normalizer import Normalizer
-
-MAX_GROWTH = 0.01  # relative
-"""Of MPJPE, up to which int8 may stand for float32."""
 
 CALIBRATION_CLIPS, CALIBRATION_FRAMES, CALIBRATION_EVERY = 40, 400, 20
-TEST_FRAMES = 20_000  # accuracy is measured on at most this many
 
 
 class Calibration(CalibrationDataReader):
@@ -75,7 +66,7 @@ def quantise(source: Path, path: Path, ends: Sequence[str], clips: Sequence[Tens
             unfinished,
             Calibration(source, clips),
             quant_format=QuantFormat.QDQ,
-            nodes_to_quantize=_inner_layers(onnx.load(source), ends),
+            nodes_to_quantize=inner_layers(onnx.load(source), ends),
             op_types_to_quantize=["Gemm", "MatMul"],
             per_channel=True,
             reduce_range=True,  # seven bits
@@ -89,7 +80,7 @@ def quantise(source: Path, path: Path, ends: Sequence[str], clips: Sequence[Tens
         unfinished.unlink(missing_ok=True)
 
 
-def _inner_layers(graph: onnx.ModelProto, ends: Sequence[str]) -> list[str]:
+def inner_layers(graph: onnx.ModelProto, ends: Sequence[str]) -> list[str]:
     """Return the names of the nodes that multiply by a layer's weight, except those at the ends."""
     weights = {tensor.name for tensor in graph.graph.initializer}
     kept = tuple(f"model.{end}." for end in ends)
@@ -101,27 +92,3 @@ def _inner_layers(graph: onnx.ModelProto, ends: Sequence[str]) -> list[str]:
         and node.input[1].startswith("model.")
         and not node.input[1].startswith(kept)
     ]
-
-
-def accuracy(path: Path, normalizer: Normalizer, clips: Sequence[Tensor]) -> dict[str, float]:
-    """Measure the rotation branch's metrics, streamed in ONNX Runtime: means over clips (N, 252).
-
-    At most 20,000 frames are streamed; where there are more, the same share of each clip.
-    """
-    stream, share = OnnxStream(path), min(1.0, TEST_FRAMES / sum(map(len, clips)))
-    rows = []
-    for clip in progress_bar(clips, "measuring"):
-        truth = clip[: max(int(share * len(clip)), 2)]
-        rows.append(rotations_report(normalizer, streamed(stream, truth), truth))
-    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-
-
-def compared(exact: Path, quantised: Path, normalizer: Normalizer, clips: Sequence[Tensor]) -> dict[str, Any]:
-    """Measure what int8 costs on test clips.
-
-    Returns:
-        The metrics of both files, MPJPE's relative growth, and whether int8 may be the default.
-    """
-    before, after = (accuracy(path, normalizer, clips) for path in (exact, quantised))
-    growth = after["MPJPE"] / before["MPJPE"] - 1
-    return {"fp32": before, "int8": after, "growth": growth, "default": growth <= MAX_GROWTH}

@@ -3,9 +3,10 @@
 Inputs are one frame at 60 Hz: `tracker_positions` (1, 3, 3), metres, and `tracker_rotations` (1, 3, 3, 3),
 matrices, of head, left and right wrist; and the states `state.*`, all zeros for a fresh start.
 
-Outputs are `rotations` (1, 22, 3, 3), local matrices, the root's global; `positions` (1, 22, 3), metres, by
-forward kinematics with the head on its tracker; `joints` (1, 22, 3), metres, the network's own positions; and
-the new states, under the same names with the suffix `.next`.
+Outputs are `rotations` (1, 22, 3, 3), local matrices, or on demand (1, 22, 4), unit quaternions x, y, z, w
+whose w is not negative; the root's are global. `positions` (1, 22, 3), metres, by forward kinematics with the
+head on its tracker; `joints` (1, 22, 3), metres, the network's own positions; and the new states, under the
+same names with the suffix `.next`.
 
 All are in the frame of reference that was chosen (memmlp.live.spaces). Lost trackers, other rates and gaps
 (memmlp.live.trackers) are left to the caller: NaN in is NaN out.
@@ -13,16 +14,19 @@ All are in the frame of reference that was chosen (memmlp.live.spaces). Lost tra
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from memmlp.common.errors import InputError
 from memmlp.deploy.export import metadata, save
+from memmlp.deploy.opsets import NATIVE
 from memmlp.deploy.parity import in_torch
 from memmlp.deploy.session import OnnxStream
-from memmlp.live.rotations import BodyTree
+from memmlp.live.rotations import BodyTree, quaternion_to_matrix
 from memmlp.live.spaces import Space, space_of
 from memmlp.motion.body import (
     HEAD,
@@ -45,8 +49,39 @@ from memmlp.networks.window_model import WindowModel
 
 INPUTS = ("tracker_positions", "tracker_rotations")
 OUTPUTS = ("rotations", "positions", "joints")
+UNIT = 1e-4  # how far a quaternion's norm may be from 1
 OWN = {"seen": (1, 1), "positions": (1, 3, 3), "rotations": (1, 3, 3, 3)}
 """States beside the network's: whether there was a frame before, and its trackers in AMASS' world."""
+
+
+def as_they_are(rotations: Tensor) -> Tensor:
+    """Return matrices (..., 3, 3) as they are."""
+    return rotations
+
+
+def quaternions(rotations: Tensor) -> Tensor:
+    """Convert matrices (..., 3, 3) to unit quaternions (..., 4), xyzw, w not negative; accurate everywhere.
+
+    As `memmlp.motion.geometry.matrix_to_quaternion`, but of the four forms the well conditioned one is found
+    by comparing two at a time, which needs no computed index.
+    """
+    m = rotations.flatten(-2).split(1, -1)
+    xx, yy, zz = m[0], m[4], m[8]
+    wx, wy, wz = m[7] - m[5], m[2] - m[6], m[3] - m[1]
+    xy, xz, yz = m[1] + m[3], m[2] + m[6], m[5] + m[7]
+    pivots = [1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz]
+    ww, xx, yy, zz = pivots
+    rows = [wx, wy, wz, ww], [xx, xy, xz, wx], [xy, yy, yz, wy], [xz, yz, zz, wz]
+    largest, chosen = pivots[0], torch.cat(rows[0], -1)
+    for pivot, row in zip(pivots[1:], rows[1:], strict=True):
+        chosen = torch.where(pivot > largest, torch.cat(row, -1), chosen)
+        largest = torch.where(pivot > largest, pivot, largest)
+    chosen = chosen * torch.where(chosen[..., 3:] < 0, -1.0, 1.0)
+    return chosen / (chosen * chosen).sum(-1, keepdim=True).sqrt()
+
+
+FORMATS: dict[str, Callable[[Tensor], Tensor]] = {"matrix": as_they_are, "quaternion": quaternions}
+"""How rotations come out, by name."""
 
 
 class FullStep(nn.Module):
@@ -55,15 +90,21 @@ class FullStep(nn.Module):
     Args:
         model: the network, as it was trained or as its streaming graph.
         space: the frame of reference of what goes in and comes out.
+        rotated: makes what comes out of rotation matrices; one of FORMATS.
     """
 
     world: Tensor
     body: Tensor
     offsets: Tensor
 
-    def __init__(self, model: WindowModel | StreamingGraph, space: Space):
+    def __init__(
+        self,
+        model: WindowModel | StreamingGraph,
+        space: Space,
+        rotated: Callable[[Tensor], Tensor] = as_they_are,
+    ):
         super().__init__()
-        self.model = model
+        self.model, self.rotated = model, rotated
         self.names = list(model.initial_state(1))
         self.register_buffer("world", torch.tensor(space.world, dtype=torch.float32))
         self.register_buffer("body", torch.tensor(space.body, dtype=torch.float32))
@@ -105,7 +146,7 @@ class FullStep(nn.Module):
         joints = motion[:, POSITION].unflatten(-1, (N_JOINTS, 3))
         root = self.world.T @ local[:, :1] * self.body
         turned = torch.cat([root, local[:, 1:] * torch.outer(self.body, self.body)], 1)
-        return turned, positions @ self.world, joints @ self.world
+        return self.rotated(turned), positions @ self.world, joints @ self.world
 
     def reached(self, local: Tensor) -> Tensor:
         """Return positions (1, 22, 3) relative to the root, as `BodyTree.positions` computes them.
@@ -116,17 +157,26 @@ class FullStep(nn.Module):
         transforms = torch.cat([torch.cat([local, self.offsets], -1), bottom], -2)
         transforms = torch.cat([transforms, torch.eye(4).expand(1, 1, 4, 4)], 1)
         for ancestor in self.ancestors:
-            transforms = transforms[:, ancestor] @ transforms
+            transforms = transforms.index_select(1, ancestor) @ transforms
         return transforms[:, :N_JOINTS, :3, 3]
 
 
-def export_full(model: WindowModel | StreamingGraph, path: Path, run_id: str, space: str = "amass") -> None:
+def export_full(
+    model: WindowModel | StreamingGraph,
+    path: Path,
+    run_id: str,
+    space: str = "amass",
+    rotations: str = "matrix",
+    opset: int = NATIVE,
+) -> None:
     """Write the whole step, on the CPU in float32, as one ONNX file with its metadata.
 
     Raises:
-        InputError: for an unknown space.
+        InputError: for an unknown space or format of rotations, or an opset that it cannot be brought to.
     """
-    step = FullStep(model.cpu().eval(), space_of(space)).eval()
+    if rotations not in FORMATS:
+        raise InputError(f"rotations={rotations}: no such format; allowed: {', '.join(FORMATS)}")
+    step = FullStep(model.cpu().eval(), space_of(space), FORMATS[rotations]).eval()
     state = step.initial_state()
     names = [f"state.{name}" for name in state]
     save(
@@ -135,7 +185,8 @@ def export_full(model: WindowModel | StreamingGraph, path: Path, run_id: str, sp
         [*INPUTS, *names],
         [*OUTPUTS, *(f"{name}.next" for name in names)],
         path,
-        metadata(model, run_id) | {"scope": "full", "space": space},
+        metadata(model, run_id) | {"scope": "full", "space": space, "rotations": rotations},
+        opset,
     )
 
 
@@ -156,7 +207,7 @@ def full_parity(model: WindowModel, path: Path, clip: Tensor, space: str = "amas
     """Return the largest difference between torch and the file over a clip (N, 252).
 
     Each of them has its own history. Torch goes the way of evaluation: the features of the same trackers, the
-    network, and `Normalizer.pose`.
+    network, and `Normalizer.pose`. Quaternions are compared as the matrices that they stand for.
     """
     model, there, stream = model.cpu().eval(), space_of(space), OnnxStream(path)
     positions, rotations = trackers_of(clip[:, :SPARSE_DIM].cpu())
@@ -164,6 +215,11 @@ def full_parity(model: WindowModel, path: Path, clip: Tensor, space: str = "amas
     sparse = sparse_features(rotations, positions)
     made = [stream.step(*(part[index : index + 1] for part in given)) for index in range(len(positions))]
     found = [np.concatenate(parts) for parts in zip(*made[1:], strict=True)]
+    if found[0].shape[-1] == 4:
+        unit = np.abs(np.linalg.norm(found[0], axis=-1) - 1).max()
+        found[0] = quaternion_to_matrix(found[0].astype(np.float64))
+        if not unit <= UNIT:
+            return float("inf")
     expected = _expected(model.normalizer, in_torch(model, sparse), sparse, there)
     return float(np.max([np.abs(a - b).max() for a, b in zip(expected, found, strict=True)]))
 

@@ -34,16 +34,11 @@ def matrix_to_quaternion(matrix: Tensor) -> Tensor:
     wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
     xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
     # Four forms of the same quaternion (scaled); the one with the largest pivot is well conditioned.
-    forms = torch.stack(
-        [
-            torch.stack([1 + xx + yy + zz, wx, wy, wz], -1),
-            torch.stack([wx, 1 + xx - yy - zz, xy, xz], -1),
-            torch.stack([wy, xy, 1 - xx + yy - zz, yz], -1),
-            torch.stack([wz, xz, yz, 1 - xx - yy + zz], -1),
-        ],
-        -2,
-    )
-    pivot = forms.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    pivots = [1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz]
+    ww, xx, yy, zz = pivots
+    rows = [ww, wx, wy, wz], [wx, xx, xy, xz], [wy, xy, yy, yz], [wz, xz, yz, zz]
+    forms = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    pivot = torch.stack(pivots, -1).argmax(-1)
     index = pivot[..., None, None].expand(*pivot.shape, 1, 4)
     quaternion = F.normalize(forms.gather(-2, index).squeeze(-2), dim=-1)
     return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)

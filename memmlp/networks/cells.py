@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
@@ -47,10 +48,24 @@ class Cell(nn.Module):
         raise NotImplementedError
 
 
-def products(layer: nn.RNNBase, x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what a layer's gates get from an input (B, d) and from the hidden state (B, d)."""
-    of_input, of_hidden, input_bias, hidden_bias = layer.all_weights[0]
+def products(weights: Sequence[Tensor], x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what a layer's gates get from an input (B, n) and from the hidden state (B, d).
+
+    Args:
+        weights: the layer's weights and biases, in the order of `nn.RNNBase.all_weights`.
+        x: the input.
+        hidden: the hidden state.
+    """
+    of_input, of_hidden, input_bias, hidden_bias = weights
     return F.linear(x, of_input, input_bias), F.linear(hidden, of_hidden, hidden_bias)
+
+
+def gru_step(weights: Sequence[Tensor], x: Tensor, state: Tensor) -> Tensor:
+    """Return a GRU layer's state (B, d) after an input (B, n) at a state (B, d), in plain layers."""
+    entering, again = (part.chunk(3, -1) for part in products(weights, x, state))
+    reset, keep = (torch.sigmoid(entering[gate] + again[gate]) for gate in range(2))
+    new = torch.tanh(entering[2] + reset * again[2])
+    return new + keep * (state - new)
 
 
 class GRU(Cell):
@@ -67,10 +82,7 @@ class GRU(Cell):
 
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Take in one input (B, d) at a state (B, d); see Cell."""
-        entering, again = (part.chunk(3, -1) for part in products(self.layer, x, state))
-        reset, keep = (torch.sigmoid(entering[gate] + again[gate]) for gate in range(2))
-        new = torch.tanh(entering[2] + reset * again[2])
-        state = new + keep * (state - new)
+        state = gru_step(self.layer.all_weights[0], x, state)
         return state, state
 
 
@@ -92,7 +104,7 @@ class LSTM(Cell):
     def step(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Take in one input (B, d) at a state (B, 2 d); see Cell."""
         hidden, cell = state.chunk(2, -1)
-        entering, again = products(self.layer, x, hidden)
+        entering, again = products(self.layer.all_weights[0], x, hidden)
         enter, keep, new, show = (entering + again).chunk(4, -1)
         cell = torch.sigmoid(keep) * cell + torch.sigmoid(enter) * torch.tanh(new)
         hidden = torch.sigmoid(show) * torch.tanh(cell)

@@ -21,6 +21,7 @@ from memmlp.common.files import write_json
 from memmlp.common.progress import tell
 from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
+from memmlp.live.latency import measure as pose_latency
 from memmlp.motion.preparing.manifest import ClipRecord
 from memmlp.motion.preparing.source import Prepared
 from memmlp.pipeline.devices import described
@@ -246,7 +247,12 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared, name: str) -> N
         clips = [data.open(split).clips() for split in ("train", "test")]
         deployed = run.deployment(name)
         deployed.latency.unlink(missing_ok=True)  # it lacks a file and is made again, from the start
-        record = experiment.deployments[name].deploy(model, deployed, run.id, *clips)
+        deployment = experiment.deployments[name]
+        record = deployment.deploy(model, deployed, run.id, *clips)
+        record |= pose_latency(deployed.onnx, deployment.latency_steps)
+        for precision, path in (("int8", deployed.int8), ("fp16", deployed.half)):
+            if precision in record:
+                record[precision] |= pose_latency(path, deployment.latency_steps)
         deployed.finish(
             {"run": run.manifest["id"], "settings": deployment_settings(experiment.config), **record}
         )

@@ -19,6 +19,7 @@ class DeploymentFolder:
         folder: the folder.
         onnx: the float32 ONNX file.
         int8: the int8 ONNX file, where there is one.
+        half: the fp16 ONNX file, where there is one.
         latency: the record of what was measured; it is written last.
     """
 
@@ -26,6 +27,7 @@ class DeploymentFolder:
         self.folder = folder
         self.onnx = folder / "step.onnx"
         self.int8 = folder / "step.int8.onnx"
+        self.half = folder / "step.fp16.onnx"
         self.latency = folder / "latency.json"
 
     @property
@@ -42,13 +44,14 @@ class DeploymentFolder:
 
     def finish(self, record: Mapping[str, Any]) -> None:
         """Write what was measured, with the files' digests; this marks the deployment as complete."""
-        artifacts = {path.name: file_digest(path) for path in (self.onnx, self.int8) if path.exists()}
+        files = (self.onnx, self.int8, self.half)
+        artifacts = {path.name: file_digest(path) for path in files if path.exists()}
         made = {"made": now(), "made_by": environment(), "artifacts": artifacts}
         write_json(self.latency, {**record, **made})
 
     @property
     def record(self) -> dict[str, Any]:
-        """What was measured: sizes, times, int8's accuracy; empty if the run was not deployed."""
+        """What was measured: sizes, times, accuracy of less precision; empty if there is none."""
         return _current(read_json(self.latency))
 
     @property

@@ -61,6 +61,9 @@ SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term", "ref
 UNNAMED = {"optim": "adamw"}
 """The options of slots that runs have from before these were slots; their names do not count."""
 
+UNNAMED_OPSET = ("opset", 18)
+"""The opset of deployments from before it was a key; it does not count."""
+
 
 @dataclass(frozen=True)
 class Identity:
@@ -172,14 +175,15 @@ def deployment_name(settings: Mapping[str, Any]) -> str:
         "latency",
         *(f"graph.{name}" for name in ("streaming", "naive") if graph in (name, "auto")),
     ]
-    used += ["int8"] if settings.get("precision") == "int8" else []
     name = settings.get("precision", "fp32")
+    used += [name] if name != "fp32" else []
     return f"{name}-{_digest({'settings': settings, 'recipes': recipes(used)})}"
 
 
 def deployment_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings that a deployment's result follows from, beside the run and its data."""
-    return {key: _canonical(value) for key, value in config.get("export", {}).items()} | inference(config)
+    own = {key: _canonical(value) for key, value in config.get("export", {}).items()}
+    return {key: value for key, value in own.items() if (key, value) != UNNAMED_OPSET} | inference(config)
 
 
 def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:

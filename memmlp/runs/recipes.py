@@ -79,6 +79,7 @@ RECIPES: dict[str, int] = {
     "graph.streaming": 1,
     "graph.naive": 1,
     "int8": 1,
+    "fp16": 1,
     "latency": 1,
 }
 

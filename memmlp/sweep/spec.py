@@ -40,7 +40,7 @@ KEYS = (
 )  # fmt: skip
 ARM_KEYS = ("overrides", "branch", "against", "paper", "note")
 BASE = "base"  # the arm of a sweep that has only seeds
-COSTS = ("FLOPs", "MACs", "parameters", "size", "ms", "ratio", "FPS")
+COSTS = ("FLOPs", "MACs", "parameters", "size", "ms", "pose ms", "ratio", "FPS")
 """Metrics that are costs and no errors.
 
 Their units: GFLOP, GMAC, millions, MB, ms, multiples of the yardstick's time, and frames a second.

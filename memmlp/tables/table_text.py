@@ -11,7 +11,16 @@ from memmlp.statistics import Verdict
 from memmlp.sweep.spec import COSTS
 from memmlp.tables.table import Cell, Row, Table
 
-COST_UNITS = {"FLOPs": "G", "MACs": "G", "parameters": "M", "size": "MB", "ms": "", "ratio": "", "FPS": ""}
+COST_UNITS = {
+    "FLOPs": "G",
+    "MACs": "G",
+    "parameters": "M",
+    "size": "MB",
+    "ms": "",
+    "pose ms": "",
+    "ratio": "",
+    "FPS": "",
+}
 MISSING = "-"
 MINUS = "\N{MINUS SIGN}"
 ARROWS = {"lower": "↓", "higher": "↑"}
@@ -249,7 +258,7 @@ def paper_words(cell: Cell, metric: str) -> str:
     """Return the paper's value, its difference from the control, and whether it holds here."""
     if cell.paper is None:
         return MISSING
-    places = 1 if metric in ("ms", "FPS") else 2
+    places = 1 if metric in ("ms", "pose ms", "FPS") else 2
     value = f"{cell.paper:.{places}f}"
     if cell.paper_effect is None:
         return value

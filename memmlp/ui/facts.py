@@ -27,7 +27,8 @@ ACTING = {key.split(".")[0] for key in INFERENCE}
 TAIL = 1 << 14  # bytes at the end of a metrics log in which its last entries are looked for
 RATE = 5  # how many of its last training entries tell how fast a run is
 COSTS = {
-    "median_ms": "ms", "p95_ms": "ms", "ratio_to_yardstick": "", "parameters": "", "macs": "",
+    "median_ms": "ms", "p95_ms": "ms", "pose_median_ms": "ms", "ratio_to_yardstick": "",
+    "parameters": "", "macs": "",
     "onnx_bytes": "",
 }  # fmt: skip
 """What is shown of a deployment's costs, with units. Lower is better."""

@@ -14,13 +14,16 @@ import torch
 import wearer
 
 from memmlp.common.errors import InputError
+from memmlp.deploy.opsets import OPSETS, converted
 from memmlp.deploy.parity import TOLERANCE
 from memmlp.deploy.session import OnnxStream
-from memmlp.live.full_graph import export_full, full_parity, trackers_of
+from memmlp.live.full_graph import export_full, full_parity, quaternions, trackers_of
+from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.features import sparse_features
+from memmlp.motion.geometry import axis_angle_to_matrix
 from memmlp.networks.streaming import streaming
 
 pytestmark = pytest.mark.slow
@@ -39,6 +42,7 @@ def folder(network, tmp_path_factory) -> Path:
     """Export the whole way in Unity's space."""
     folder = tmp_path_factory.mktemp("full")
     export_full(streaming(network), folder / "unity.onnx", RUN, "unity")
+    assert exported.data_dependent(onnx.load(folder / "unity.onnx").graph) == set()
     return folder
 
 
@@ -61,11 +65,56 @@ def test_it_is_the_stream(name, network, folder: Path, step_files):
         full.reset()
 
 
-@pytest.mark.parametrize("name", ["agrol_mlp", "vae_hmd"])
-def test_baselines_have_it_too(name, tmp_path: Path):
-    network = tiny.baseline(name, depth=1)
-    export_full(network, tmp_path / "full.onnx", RUN, "unity")
-    assert full_parity(network, tmp_path / "full.onnx", PERSON.frames, "unity") <= TOLERANCE
+@pytest.mark.parametrize("name", ["agrol_mlp", "avatar_poser", "rpm"])
+def test_baselines_have_it_too(name: str, tmp_path: Path):
+    """As it was trained, too: without operators whose work depends on the data, and in every opset."""
+    network, file = exported.NETWORKS[name](), tmp_path / "full.onnx"
+    export_full(network, file, RUN, "unity")
+    native = onnx.load(file)
+    assert exported.data_dependent(native.graph) == set()
+    for opset in (15, 18, OPSETS[-1]):
+        onnx.save(converted(native, opset), file)
+        assert full_parity(network, file, PERSON.frames[:30], "unity") <= TOLERANCE
+
+
+def test_quaternions_come_out_on_demand(network, folder: Path):
+    """They are those of the live stream, up to the sign."""
+    file = folder / "quaternion.onnx"
+    export_full(streaming(network), file, RUN, "unity", "quaternion", opset=15)
+    assert full_parity(network, file, PERSON.frames, "unity") <= TOLERANCE
+    graph = onnx.load(file)
+    onnx.checker.check_model(graph, full_check=True)
+    (output,) = (output for output in graph.graph.output if output.name == "rotations")
+    assert [d.dim_value for d in output.type.tensor_type.shape.dim] == [1, 22, 4]
+    assert {p.key: p.value for p in graph.metadata_props}["rotations"] == "quaternion"
+    assert exported.data_dependent(graph.graph) == set()
+    matrices, quaternion = OnnxStream(folder / "unity.onnx"), OnnxStream(file)
+    space = SPACES["unity"]
+    trackers = space.positions_out(PERSON.positions), space.rotations_out(PERSON.rotations)
+    for frame in range(20):
+        given = [part[frame : frame + 1].astype(np.float32) for part in trackers]
+        expected = matrix_to_quaternion(matrices.step(*given)[0][0].astype(np.float64))
+        found = quaternion.step(*given)[0][0]
+        same = np.minimum(np.abs(found - expected).max(1), np.abs(found + expected).max(1))
+        assert same.max() < 1e-5
+
+
+def test_quaternions_are_exact_at_every_angle():
+    axes = np.random.default_rng(0).normal(size=(600, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    small = np.logspace(-12, -1, 200)
+    angles = np.concatenate([np.linspace(0, np.pi, 200), small, np.pi - small])
+    matrices = axis_angle_to_matrix(torch.tensor(axes * angles[:, None]))
+    found = quaternions(matrices).numpy()
+    expected = matrix_to_quaternion(matrices.numpy())
+    same = np.minimum(np.abs(found - expected).max(1), np.abs(found + expected).max(1))
+    assert same.max() < 1e-14
+    assert (found[:, 3] >= 0).all()
+
+
+def test_an_unknown_format_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match=r"rotations=euler.*matrix, quaternion"):
+        export_full(tiny.model(), tmp_path / "full.onnx", RUN, "unity", "euler")
 
 
 def test_parity_sees_a_difference(network, folder: Path):

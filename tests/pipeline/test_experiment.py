@@ -56,7 +56,7 @@ CHANGES: dict[str, str] = {
     "optim.validate_every": "1", "optim.log_every": "1",
     "evaluation.modes": "[stream]", "evaluation.batch": "1", "evaluation.ik": "off",
     "evaluation.ik_iterations": "3",
-    "export.graph": "naive", "export.precision": "int8", "export.latency_steps": "250",
+    "export.graph": "naive", "export.precision": "int8", "export.opset": "15", "export.latency_steps": "250",
     "tracking.mlflow.uri": "sqlite:///other.db", "tracking.wandb.project": "other",
 }  # fmt: skip
 
@@ -159,7 +159,13 @@ def deployed(experiment: Experiment, model: Any, clip: MotionDataset) -> list[An
             motion, state = network.advance(clip.frames[None, t : t + 1, :54], state, 1)
             motions.append(motion.tolist())
     settings = experiment.deployment
-    return [type(network).__name__, settings.precision, max(settings.latency_steps, 200), motions]
+    return [
+        type(network).__name__,
+        settings.precision,
+        settings.opset,
+        max(settings.latency_steps, 200),
+        motions,
+    ]
 
 
 def digest(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""`memmlp bench latency`: a step of each network as it was trained, as its streaming graph, and in int8."""
+"""`memmlp bench latency`: a step of each network as it was trained, as its stream, in fp16 and in int8."""
 
 from __future__ import annotations
 
@@ -32,12 +32,9 @@ MODELS: dict[str, tuple[str, ...]] = {
     "avatar_jlm": ("model=avatar_jlm",),
     "manikin_l": ("model=manikin_l",),
 }
-SLOW = (
-    "bodiffusion",
-    "avatar_jlm",
-    "manikin_l",
-)  # seconds a step and gigabytes of files: timed where they are asked for
-VARIANTS = ("naive", "streaming", "int8")
+SLOW = ("bodiffusion", "avatar_jlm", "manikin_l")
+"""Seconds a step, or gigabytes of files: timed where they are asked for."""
+VARIANTS = ("naive", "streaming", "fp16", "int8")
 
 
 @click.command("latency")
@@ -76,7 +73,8 @@ def latency(
 ) -> None:
     """Time a step of every network.
 
-    All run in ONNX Runtime, in turn in one process, on one thread. OVERRIDES are those of `memmlp train`; the
+    All run in ONNX Runtime, in turn in one process, on one thread; and of each a whole pose, from a sample of
+    the trackers to the joints. OVERRIDES are those of `memmlp train`; the
     default is profile=paper. Weights are random: they do not matter for the time. The ratio is to AvatarPoser
     as published, of each round's medians.
     """
@@ -114,6 +112,7 @@ def exported(
     from memmlp.common.progress import progress_bar
     from memmlp.config.build import untrained
     from memmlp.deploy.export import export
+    from memmlp.deploy.half import halve
     from memmlp.deploy.quantization import quantise
     from memmlp.networks.streaming import streaming
 
@@ -124,6 +123,7 @@ def exported(
         stream = streaming(model)
         export(model, paths["naive"], "random")
         export(stream, paths["streaming"], "random")
+        halve(paths["streaming"], paths["fp16"], stream.ends)
         quantise(paths["streaming"], paths["int8"], stream.ends, clips)
         for variant, path in paths.items():
             yield (name, variant), path
@@ -141,16 +141,19 @@ def calibration_clips() -> list[Any]:
 def timed(paths: dict[tuple[str, str], Path], rounds: int, steps: int) -> list[dict[str, Any]]:
     """Time all files in turn, and return a row for each.
 
-    A row has the median and 95th percentile in milliseconds, the ratio to AvatarPoser and its spread.
+    A row has the median and 95th percentile in milliseconds, the ratio to AvatarPoser and its spread, and the
+    median of a whole pose.
     """
     import numpy as np
 
     from memmlp.deploy.latency import interleaved
+    from memmlp.live.latency import measure
 
     seconds = interleaved(paths, rounds, steps)
     base = np.median(seconds[BASE], 1)
     return [
-        row(model, variant, times, np.median(times, 1) / base) for (model, variant), times in seconds.items()
+        row(model, variant, times, np.median(times, 1) / base) | measure(paths[model, variant], steps)
+        for (model, variant), times in seconds.items()
     ]
 
 
@@ -159,7 +162,7 @@ def row(model: str, variant: str, seconds: np.ndarray, ratios: np.ndarray) -> di
 
     Args:
         model: the model's name.
-        variant: "naive", "streaming" or "int8".
+        variant: one of VARIANTS.
         seconds: the time of each step (rounds, steps).
         ratios: each round's median over the median of `BASE` in that round (rounds,).
     """
@@ -186,6 +189,7 @@ def show(rows: list[dict[str, Any]], rounds: int) -> None:
         table.add_column(name, justify=side)  # type: ignore[arg-type]
     table.add_column("to AvatarPoser", justify="right")
     table.add_column("over rounds", justify="right")
+    table.add_column("whole pose ms", justify="right")
     for r in rows:
         table.add_row(
             r["model"],
@@ -194,6 +198,7 @@ def show(rows: list[dict[str, Any]], rounds: int) -> None:
             f"{r['p95_ms']:.2f}",
             f"{r['ratio_to_avatar_poser']:.2f}",
             f"{r['ratio_least']:.2f} to {r['ratio_most']:.2f}",
+            f"{r['pose_median_ms']:.2f}",
             end_section=r["variant"] == VARIANTS[-1],
         )
     Console().print(table)

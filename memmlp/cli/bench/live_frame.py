@@ -11,7 +11,7 @@ from memmlp.cli.options import outputs_option
 
 if TYPE_CHECKING:
     from memmlp.live.spaces import SpaceName
-    from memmlp.live.stream import RotationFormat, Stream
+    from memmlp.live.stream import RotationFormat
 
 
 @click.command("avatar")
@@ -53,6 +53,8 @@ def avatar(
 
     import numpy as np
 
+    from memmlp.deploy.session import OnnxStream
+    from memmlp.live.latency import alternate
     from memmlp.live.stream import Stream
     from memmlp.runs.lookup import find_run
 
@@ -62,46 +64,15 @@ def avatar(
         elif onnx is None:
             onnx = _random(overrides, Path(folder) / "step.onnx")
         stream = Stream(onnx, space=space, rotations=rotations)
-        medians = np.array(
-            [_alternate(stream, onnx, frames) for _ in range(rounds + 1)][1:]
-        )  # one to warm up
+        network = OnnxStream(onnx)
+        timed = [alternate(stream, network, frames) for _ in range(rounds + 1)][1:]  # one to warm up
+        medians = 1000 * np.median(timed, 1)
     ratios = medians[:, 1] / medians[:, 0]
     session, whole = np.median(medians, 0)
     click.echo(f"session.run  {session:7.3f} ms a frame")
     click.echo(f"Stream.step  {whole:7.3f} ms a frame")
     spread = f"{ratios.min():.3f} to {ratios.max():.3f} over {rounds} rounds of {frames} frames"
     click.echo(f"ratio {np.median(ratios):.3f} ({spread})")
-
-
-def _alternate(stream: Stream, onnx: Path, frames: int) -> tuple[float, float]:
-    """Time the session alone and the stream's step in turn, over random trackers.
-
-    Returns:
-        The median milliseconds of each.
-    """
-    import time
-
-    import numpy as np
-
-    from memmlp.deploy.session import OnnxStream
-    from memmlp.live.rotations import quaternion_to_matrix
-    from memmlp.motion.body import SPARSE_DIM
-
-    random = np.random.default_rng(0)
-    alone, seconds = OnnxStream(onnx), np.zeros((frames, 2))
-    sparse = random.standard_normal((frames, 1, SPARSE_DIM), np.float32)
-    quaternions = random.normal(size=(frames, 3, 4))
-    turns = quaternion_to_matrix(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True))
-    places = random.normal(size=(frames, 3, 3))
-    for index in range(frames):
-        start = time.perf_counter()
-        alone.step(sparse[index])
-        middle = time.perf_counter()
-        head, left, right = zip(places[index], turns[index], strict=True)
-        stream.step(head, left, right)
-        seconds[index] = middle - start, time.perf_counter() - middle
-    session, whole = 1000 * np.median(seconds, 0)
-    return float(session), float(whole)
 
 
 def _random(overrides: tuple[str, ...], path: Path) -> Path:

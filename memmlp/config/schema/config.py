@@ -64,6 +64,7 @@ from memmlp.config.schema.rules import (
     optional,
     own,
     positive,
+    standing,
     target,
 )
 from memmlp.config.schema.training import (
@@ -182,7 +183,8 @@ class ExportConfig:
 
     latency_steps: int = at_least(1)
     graph: str = one_of("auto", "streaming", "naive", "off")
-    precision: str = one_of("fp32", "int8")
+    precision: str = one_of("fp32", "int8", "fp16")
+    opset: int = standing(18, Within(15, 26))  # memmlp.deploy.opsets.OPSETS, without importing onnx
 
 
 @dataclass

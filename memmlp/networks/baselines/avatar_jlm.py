@@ -41,7 +41,8 @@ def joint_features(encoded: Tensor) -> Tensor:
     """Spread inputs (..., 54) over the joints (..., 22 x 18); joints without a tracker hold a constant."""
     trackers = tracker_features(encoded)
     unseen = torch.full_like(trackers[..., :1, :], UNSEEN)
-    rows = [trackers[..., [TRACKED.index(j)], :] if j in TRACKED else unseen for j in range(N_JOINTS)]
+    seen = dict(zip(TRACKED, trackers.split(1, -2), strict=True))
+    rows = [seen.get(joint, unseen) for joint in range(N_JOINTS)]
     return torch.cat(rows, -2).flatten(-2)
 
 

@@ -91,6 +91,7 @@ class AvatarPoser(WindowModel):
         wanted = sparse.shape[1] if newest is None else newest
         ends = torch.arange(inputs.shape[1] - wanted, inputs.shape[1], device=inputs.device)
         window = ends[:, None] + torch.arange(1 - self.frames, 1, device=inputs.device)
-        encoded = self.normalizer.encode_sparse(inputs, self.normalizer.origin(inputs))[:, window]
-        rotation = self.rotations(encoded.flatten(0, 1)).unflatten(0, (len(inputs), wanted))
+        encoded = self.normalizer.encode_sparse(inputs, self.normalizer.origin(inputs))
+        windows = encoded.index_select(1, window.flatten()).unflatten(1, window.shape)
+        rotation = self.rotations(windows.flatten(0, 1)).unflatten(0, (len(inputs), wanted))
         return self.normalizer.posed(rotation, inputs[:, -wanted:]), kept

@@ -9,6 +9,7 @@ Vectors and rotations of the four limbs stand side by side: left arm, right arm,
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -25,6 +26,7 @@ TWIST = (90.0, 90.0, 40.0, 40.0)
 """How far, in degrees, shoulders and hips may be twisted about their upper bone, to either side."""
 SKEW = ((0, 0, 0, 0, 0, -1, 0, 1, 0), (0, 0, 1, 0, 0, 0, -1, 0, 0), (0, -1, 0, 1, 0, 0, 0, 0, 0))
 """What each component of a vector adds to the 3 x 3 matrix of its cross product, row by row."""
+IDENTITY = ((1.0, 0, 0), (0, 1, 0), (0, 0, 1))
 STRAIGHT = 5e-4  # from 1, of the cosine of the least bend, 1.8 degrees: on a straighter limb rounding is seen
 OFFSET = 1e-3  # metres; which way a limb bends that is straighter than that follows from its axis of flexion
 
@@ -32,6 +34,11 @@ OFFSET = 1e-3  # metres; which way a limb bends that is straighter than that fol
 def dot(one: Tensor, other: Tensor) -> Tensor:
     """Return the products (..., 1) of vectors (..., 3)."""
     return (one * other).sum(-1, keepdim=True)
+
+
+def of_joints(joints: Tensor, which: Sequence[int], axis: int = -2) -> Tensor:
+    """Return what a tensor holds of some joints, which stand on the given axis."""
+    return joints.index_select(axis, torch.tensor(which, device=joints.device))
 
 
 def skew(vector: Tensor) -> Tensor:
@@ -51,13 +58,13 @@ def applied(rotation: Tensor, vector: Tensor) -> Tensor:
 
 def about(axis: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
     """Return the rotations (..., 3, 3) about unit axes (..., 3), of cosines and sines (..., 1) of angles."""
-    across, identity = skew(axis), torch.eye(3, dtype=axis.dtype, device=axis.device)
+    across, identity = skew(axis), axis.new_tensor(IDENTITY)
     return identity + sine[..., None] * across + (1 - cosine)[..., None] * (across @ across)
 
 
 def aligning(start: Tensor, goal: Tensor) -> Tensor:
     """Return the smallest rotations (..., 3, 3) that carry unit vectors (..., 3) to others."""
-    across, identity = skew(cross(start, goal)), torch.eye(3, dtype=goal.dtype, device=goal.device)
+    across, identity = skew(cross(start, goal)), goal.new_tensor(IDENTITY)
     return identity + across + across @ across / (1 + dot(start, goal)).clamp_min(1e-6)[..., None]
 
 
@@ -130,7 +137,7 @@ def flexed(upper: Tensor, lower: Tensor, axis: Tensor, reach: Tensor) -> Tensor:
 def twist(rotation: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
     """Return cosines and sines (..., 1) of how far rotations (..., 3, 3) turn about unit axes (..., 3)."""
     flat = rotation.flatten(-2)
-    turned, trace = flat @ flat.new_tensor(SKEW).T, flat @ torch.eye(3).to(flat).flatten()[:, None]
+    turned, trace = flat @ flat.new_tensor(SKEW).T, flat @ flat.new_tensor(IDENTITY).flatten()[:, None]
     both = torch.cat([trace - dot(axis, applied(rotation, axis)), dot(axis, turned)], -1)
     cosine, sine = F.normalize(both, dim=-1).split(1, -1)
     return cosine, sine
@@ -224,9 +231,9 @@ def solved(
     upper, lower, _ = bones(rest)
     away = end - base
     bent = flexed(*bones(rest), away.norm(dim=-1, keepdim=True))
-    back = turned[..., [PARENTS[joint] for joint in BASES], :, :].transpose(-1, -2)
+    back = of_joints(turned, [PARENTS[joint] for joint in BASES], -3).transpose(-1, -2)
     axis = F.normalize(away, dim=-1)
-    direction = bend_direction(axis, turned[..., list(BASES), :, 1], swivel)
+    direction = bend_direction(axis, of_joints(turned[..., 1], BASES), swivel)
     bases = back @ frame(axis, direction) @ chain_frame(bent, rest).transpose(-1, -2)
     bases = untwisting(bases, F.normalize(upper, dim=-1), applied(back, axis)) @ bases
     arms, shins = (back.transpose(-1, -2) @ bases @ bent).split(2, -3)

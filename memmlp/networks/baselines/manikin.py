@@ -37,9 +37,11 @@ from memmlp.networks.baselines.limb_solver import (
     ANKLES,
     BASES,
     ENDS,
+    IDENTITY,
     MIDDLES,
     TOES,
     middle_at,
+    of_joints,
     solved,
     swivels,
 )
@@ -96,7 +98,7 @@ class Parts(NamedTuple):
     def trunk(self) -> Tensor:
         """The local rotations (..., 22, 3, 3) of a body whose other joints are not turned."""
         found = sixd_to_matrix(self.sixd)
-        still = torch.eye(3, dtype=found.dtype, device=found.device).expand(found[..., 0, :, :].shape)
+        still = found.new_tensor(IDENTITY).expand(found[..., 0, :, :].shape)
         rows = [still] * N_JOINTS
         for joint, rotation in zip((ROOT, *KEPT), found.unbind(-3), strict=True):
             rows[joint] = rotation
@@ -118,7 +120,7 @@ class Parts(NamedTuple):
         local = solved(
             trunk,
             turned,
-            joints[..., list(BASES), :],
+            of_joints(joints, BASES),
             torch.cat([places[..., 1:, :], anchor + self.ankle], -2),
             F.normalize(self.swivel, dim=-1),
             trackers[..., 1:, :, :],

@@ -32,10 +32,10 @@ from memmlp.networks.streaming.baselines import (
     VAEHMDStream,
 )
 from memmlp.networks.streaming.bodiffusion import BoDiffusionStream
+from memmlp.networks.streaming.graph import StreamingGraph
 from memmlp.networks.streaming.mem_mlp import MemMLPStream
 from memmlp.networks.streaming.recurrent_poser import RecurrentPoserStream
 from memmlp.networks.streaming.refined import RefinedStream
-from memmlp.networks.streaming.ring import StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
 __all__ = ["StreamingGraph", "has_stream", "streaming"]

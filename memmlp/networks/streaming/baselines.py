@@ -25,12 +25,12 @@ from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.layers import MLPBlock
 from memmlp.networks.memory import State
 from memmlp.networks.stream_model import StreamModel
-from memmlp.networks.streaming.ring import Ring, StreamingGraph
+from memmlp.networks.streaming.graph import StreamingGraph, filled, slid
 from memmlp.networks.window_model import WindowModel
 
 
 class AvatarPoserStream(StreamingGraph):
-    """AvatarPoser's streaming graph; its encoder ignores the order of frames, so a ring's order will do."""
+    """AvatarPoser's streaming graph."""
 
     ends: tuple[str, ...] = ("model.embedding", "model.orientation", "model.rotation")
     model: AvatarPoser
@@ -45,7 +45,7 @@ class AvatarPoserStream(StreamingGraph):
         """Return zeros (T, 4 d): each frame's embedding and first query, key and value, side by side."""
         return {"first": torch.zeros(self.frames, 4 * self.model.embedding.out_features)}
 
-    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
         embedded = self.model.embedding(encoded)
@@ -54,15 +54,15 @@ class AvatarPoserStream(StreamingGraph):
         entering = torch.cat(
             [embedded, attention.query(embedded), attention.key(embedded), attention.value(embedded)], -1
         )
-        first = ring.put(state["first"], entering, entering)
+        first = slid(state["first"], entering, entering, fresh)
         h, query, key, value = first.chunk(4, -1)
         for layer, following in zip(earlier, self.layers[1:], strict=True):
             h = layer.finish(h, layer.attention.attend(query[None], key[None], value[None])[0])
             attention = following.attention
             query, key, value = attention.query(h), attention.key(h), attention.value(h)
-        attended = last.attention.attend(ring.newest(query)[None], key[None], value[None])[0]
-        newest = last.finish(ring.newest(h), attended)
-        return self.normalizer.posed(self.rotation(newest, encoded), sparse), {"first": first}
+        attended = last.attention.attend(query[-1:][None], key[None], value[None])[0]
+        features = last.finish(h[-1:], attended)
+        return self.normalizer.posed(self.rotation(features, encoded), sparse), {"first": first}
 
     def rotation(self, newest: Tensor, encoded: Tensor) -> Tensor:
         """Map the newest frame's feature (1, d) and inputs (1, 54) to its rotations (1, 132)."""
@@ -111,14 +111,13 @@ class EgoPoserStream(StreamingGraph):
         sizes = {"embedded": self.model.embedding.out_features, "places": PLACES}
         return {name: torch.zeros(self.frames - 1, size) for name, size in sizes.items()}
 
-    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
         local = beside_head(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
         place = places(local)
         entering = {"embedded": self.model.embedding(torch.cat([local, place], -1)), "places": place}
         window = {
-            name: torch.cat([torch.where(state["count"] > 0, state[name], frame), frame])
-            for name, frame in entering.items()
+            name: torch.cat([filled(state[name], frame, fresh), frame]) for name, frame in entering.items()
         }
         slow, fast = self.model.views(window["embedded"])
         first = F.linear(window["places"][:1], self.model.embedding.weight[:, SPARSE_DIM:])
@@ -128,12 +127,9 @@ class EgoPoserStream(StreamingGraph):
 
 
 class AGRoLStream(StreamingGraph):
-    """The base of the streaming graphs of AGRoL's networks; it carries the stem's outputs in order of time.
+    """The base of the streaming graphs of AGRoL's networks; it carries the stem's outputs."""
 
-    A ring would spare one copy of them, but turning the T x T matrices of 12 blocks to its order costs more.
-    """
-
-    ends: tuple[str, ...] = ("model.stem", "model.head")
+    ends = ("model.stem", "model.head")
     width: int
     blocks: list[MLPBlock]
 
@@ -141,10 +137,10 @@ class AGRoLStream(StreamingGraph):
         """Return zeros (T - 1, d): the stem's share of each earlier frame's inputs."""
         return {"stem": torch.zeros(self.frames - 1, self.width)}
 
-    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
         entering = self.entering(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
-        window = torch.cat([torch.where(state["count"] > 0, state["stem"], entering), entering])
+        window = torch.cat([filled(state["stem"], entering, fresh), entering])
         return self.normalizer.posed(self.rotation(window), sparse), {"stem": window[1:]}
 
     def entering(self, encoded: Tensor) -> Tensor:
@@ -233,7 +229,7 @@ class FrameStream(StreamingGraph):
         """Return the network's own state at a fresh start."""
         return self.model.initial_state(1)
 
-    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
         motion, kept = self.model.advance(sparse[None], state, 1)
         return motion[0], kept
@@ -245,7 +241,7 @@ class HMDPoserStream(FrameStream):
     ends = ("model.trackers", "model.hands", "model.others", "model.pose")
     model: HMDPoser
 
-    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
         features, kept = self.model.features(sparse[None], state)
         return self.normalizer.posed(self.model.pose(features[0]), sparse), kept
@@ -257,7 +253,7 @@ class VAEHMDStream(FrameStream):
     ends = ("model.encoder.stem", "model.decoder.head")
     model: VAEHMD
 
-    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) to world motion (1, 198); nothing is carried on."""
         mean = self.model.latent(sparse).chunk(2, -1)[0]
         return self.normalizer.posed(self.model.decoder(mean), sparse), {}
@@ -290,11 +286,11 @@ class AvatarJLMStream(StreamingGraph):
         """Return zeros (T - 1, 45 d): each earlier frame's tokens, without places."""
         return {"tokens": torch.zeros(self.frames - 1, self.model.joint_places.numel())}
 
-    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
         encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
         entering = self.model.tokens(encoded).flatten(1)
-        window = torch.cat([torch.where(state["count"] > 0, state["tokens"], entering), entering])
+        window = torch.cat([filled(state["tokens"], entering, fresh), entering])
         h = self.model.placed(window.unflatten(-1, (TOKENS, -1)))
         first = h[:, -1:]
         for index, layer in enumerate(self.layers[:-1]):

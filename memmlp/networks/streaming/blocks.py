@@ -1,59 +1,29 @@
-"""MLP blocks on windows held in a ring, their mixing over time turned to the ring's order."""
+"""MLP blocks of streaming graphs, on windows without a batch axis."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from memmlp.networks.layers import MLPBlock, PlainFusion, ResidualFusion, TimeMix
+from memmlp.networks.cells import gru_step
+from memmlp.networks.layers import MLPBlock, PlainFusion, ResidualFusion
 from memmlp.networks.memory import MemoryBlock
 from memmlp.networks.predictor import Branch
 
 Take = Callable[[Tensor], Tensor]
 
 
-class StreamStep(NamedTuple):
-    """What blocks need to know of a step beside the hidden state.
-
-    Attributes:
-        newest: takes the newest frame (1, size) of a window (T, size).
-        mixes: each block's mixing over time in the ring's order, weights (T, T) and biases (T, 1).
-        shares: what each memory block's feature adds to its linear layer, a window (T, d) each.
-    """
-
-    newest: Take
-    mixes: Sequence[tuple[Tensor, Tensor]]
-    shares: Sequence[Tensor]
+def newest(window: Tensor) -> Tensor:
+    """Return the newest frame (1, size) of a window (T, size)."""
+    return window[-1:]
 
 
-class Mixing(nn.Module):
-    """The time mixes of all blocks in a ring's order: frame t stands in slot (newest + 1 + t) mod T.
-
-    Both axes of a weight are repeated once, so that the weight in any turned order is a slice of the result.
-
-    Args:
-        mixes: the blocks' time mixes.
-    """
-
-    def __init__(self, mixes: Sequence[TimeMix]):
-        super().__init__()
-        self.frames = len(mixes[0].weight)
-        self.weight = nn.Parameter(torch.stack([mix.weight.repeat(2, 2) for mix in mixes]))
-        self.bias = nn.Parameter(torch.stack([mix.bias.repeat(2, 1) for mix in mixes]))
-
-    def forward(self, slot: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return each block's weights (T, T) and biases (T, 1) for the newest frame's slot (1,)."""
-        # Slot i holds frame (start + i) mod T: row and column i of the turned weight are that frame's.
-        start: Any = (self.frames - 1 - slot).squeeze().item()  # a symbol while it is exported
-        torch._check(start >= 0)
-        torch._check(start <= self.frames)
-        weights = self.weight.narrow(1, start, self.frames).narrow(2, start, self.frames).flatten(0, 1)
-        biases = self.bias.narrow(1, start, self.frames).flatten(0, 1)
-        return list(zip(weights.split(self.frames), biases.split(self.frames), strict=True))
+def whole(window: Tensor) -> Tensor:
+    """Return a window as it is."""
+    return window
 
 
 class Block(nn.Module):
@@ -61,21 +31,26 @@ class Block(nn.Module):
 
     Args:
         block: the network's block.
-        index: the index of its time mix among those of all blocks.
     """
 
-    def __init__(self, block: MLPBlock, index: int):
+    def __init__(self, block: MLPBlock):
         super().__init__()
-        self.index = index
-        self.time_norm, self.norm, self.linear = block.time_norm, block.norm, block.linear
+        self.time_norm, self.time_mix = block.time_norm, block.time_mix
+        self.norm, self.linear = block.norm, block.linear
 
-    def forward(self, h: Tensor, step: StreamStep, take: Take = lambda window: window) -> Tensor:
-        """Map (T, d) to what `take` selects of the block's output, without computing the rest."""
-        weight, bias = step.mixes[self.index]
-        h = take(h) + F.silu(torch.addmm(take(bias), take(weight), self.time_norm(h)))
-        return self.channels(h, step, take)
+    def forward(self, h: Tensor, shares: Sequence[Tensor], take: Take = whole) -> Tensor:
+        """Map (T, d) to what `take` selects of the block's output, without computing the rest.
 
-    def channels(self, h: Tensor, step: StreamStep, take: Take) -> Tensor:
+        Args:
+            h: the hidden state (T, d).
+            shares: what each memory block's feature adds to its linear layer, a window (T, d) each.
+            take: `whole` or `newest`.
+        """
+        mix = self.time_mix
+        h = take(h) + F.silu(torch.addmm(take(mix.bias), take(mix.weight), self.time_norm(h)))
+        return self.channels(h, shares, take)
+
+    def channels(self, h: Tensor, shares: Sequence[Tensor], take: Take) -> Tensor:
         """Apply the block's second half, which works frame by frame."""
         return h + F.silu(self.linear(self.norm(h)))
 
@@ -87,7 +62,6 @@ class SharedBlock(Block):
 
     Args:
         block: the network's block.
-        index: the index of its time mix among those of all blocks.
         share: the block's index among the memory blocks.
 
     Attributes:
@@ -96,8 +70,8 @@ class SharedBlock(Block):
 
     feature_part: nn.Linear
 
-    def __init__(self, block: MLPBlock, index: int, share: int):
-        super().__init__(block, index)
+    def __init__(self, block: MLPBlock, share: int):
+        super().__init__(block)
         self.share = share
         self.hidden = block.norm.normalized_shape[0]
 
@@ -114,25 +88,25 @@ class SharedBlock(Block):
 class ResidualBlock(SharedBlock):
     """The streaming form of ResidualFusion: h + f([h; z])."""
 
-    def __init__(self, block: ResidualFusion, index: int, share: int):
-        super().__init__(block, index, share)
+    def __init__(self, block: ResidualFusion, share: int):
+        super().__init__(block, share)
         self.linear = self.own(block.linear)
 
-    def channels(self, h: Tensor, step: StreamStep, take: Take) -> Tensor:
+    def channels(self, h: Tensor, shares: Sequence[Tensor], take: Take) -> Tensor:
         """Apply the block's second half, which works frame by frame."""
-        return h + F.silu(self.linear(self.norm(h)) + take(step.shares[self.share]))
+        return h + F.silu(self.linear(self.norm(h)) + take(shares[self.share]))
 
 
 class PlainBlock(SharedBlock):
     """The streaming form of PlainFusion: an MLP block, then Linear([h; z])."""
 
-    def __init__(self, block: PlainFusion, index: int, share: int):
-        super().__init__(block, index, share)
+    def __init__(self, block: PlainFusion, share: int):
+        super().__init__(block, share)
         self.merge = self.own(block.merge)
 
-    def channels(self, h: Tensor, step: StreamStep, take: Take) -> Tensor:
+    def channels(self, h: Tensor, shares: Sequence[Tensor], take: Take) -> Tensor:
         """Apply the block's second half and the merging layer, which work frame by frame."""
-        return self.merge(super().channels(h, step, take)) + take(step.shares[self.share])
+        return self.merge(super().channels(h, shares, take)) + take(shares[self.share])
 
 
 def part(layer: nn.Linear, inputs: slice, bias: Tensor | None) -> nn.Linear:
@@ -145,6 +119,26 @@ def part(layer: nn.Linear, inputs: slice, bias: Tensor | None) -> nn.Linear:
     return made
 
 
+class FrameGRU(nn.Module):
+    """GRU layers for one frame, in plain layers: not every runtime has a GRU.
+
+    Args:
+        gru: the layers, batch first.
+    """
+
+    def __init__(self, gru: nn.GRU):
+        super().__init__()
+        self.gru = gru
+
+    def forward(self, x: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Map an input (B, 1, n) and states (layers, B, d) to the output (B, 1, d) and the new states."""
+        h, after = x[:, 0], []
+        for weights, state in zip(self.gru.all_weights, hidden.unbind(), strict=True):
+            h = gru_step(weights, h, state)
+            after.append(h)
+        return h[:, None], torch.stack(after)
+
+
 class StreamedBranch(nn.Module):
     """A predictor's branch whose last block and linear layer compute the newest frame alone."""
 
@@ -152,25 +146,23 @@ class StreamedBranch(nn.Module):
         super().__init__()
         self.blocks, self.linear = nn.ModuleList(blocks), linear
 
-    def forward(self, h: Tensor, step: StreamStep, newest: int) -> Tensor:
-        """Map the window (T, d) to the newest frame's outputs (1, size); `newest` is always 1."""
+    def forward(self, h: Tensor, shares: Sequence[Tensor], count: int) -> Tensor:
+        """Map the window (T, d) to the newest frame's outputs (1, size); `count` is always 1."""
         *earlier, last = self.blocks
         for block in earlier:
-            h = block(h, step)
-        return self.linear(last(h, step, step.newest))
+            h = block(h, shares)
+        return self.linear(last(h, shares, newest))
 
 
 class Converter:
     """Turns a network's blocks into streaming ones, one after the other, and gathers what they share.
 
     Attributes:
-        mixes: the time mixes of all blocks so far.
         features: the feature modules of all memory blocks so far.
         shared: the streaming memory blocks so far.
     """
 
     def __init__(self) -> None:
-        self.mixes: list[TimeMix] = []
         self.features: list[nn.Module] = []
         self.shared: list[SharedBlock] = []
 
@@ -179,17 +171,15 @@ class Converter:
         if isinstance(source, MemoryBlock):
             return self._memory_block(source)
         assert isinstance(source, MLPBlock)
-        self.mixes.append(source.time_mix)
-        return Block(source, len(self.mixes) - 1)
+        return Block(source)
 
     def _memory_block(self, source: MemoryBlock) -> Block:
         kinds: dict[type[MLPBlock], type[SharedBlock]] = {
             ResidualFusion: ResidualBlock,
             PlainFusion: PlainBlock,
         }
-        self.mixes.append(source.fusion.time_mix)
         self.features.append(source.feature)
-        block = kinds[type(source.fusion)](source.fusion, len(self.mixes) - 1, len(self.shared))
+        block = kinds[type(source.fusion)](source.fusion, len(self.shared))
         self.shared.append(block)
         return block
 

@@ -19,9 +19,9 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import State
 from memmlp.networks.predictor import Branch
-from memmlp.networks.streaming.blocks import Converter, Mixing, StreamStep
+from memmlp.networks.streaming.blocks import Converter
+from memmlp.networks.streaming.graph import StreamingGraph, filled, slid
 from memmlp.networks.streaming.recall import recall
-from memmlp.networks.streaming.ring import Ring, StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
 Way = Callable[[Tensor, Tensor], Tensor]
@@ -100,7 +100,13 @@ def _apply(matrices: Tensor, offsets: Tensor, x: Tensor, origin: Tensor) -> Tens
 class MemMLPStream(StreamingGraph):
     """Mem-MLP's streaming graph."""
 
-    ends = ("coordinates", "stem", "predictor.rotation.linear", "predictor.position.linear")
+    ends = (
+        "coordinates",
+        "stem",
+        "recall.memory.recurrences",
+        "predictor.rotation.linear",
+        "predictor.position.linear",
+    )
 
     @classmethod
     def fits(cls, model: WindowModel) -> bool:
@@ -118,7 +124,6 @@ class MemMLPStream(StreamingGraph):
         for name, branch in list(model.predictor.named_children()):
             assert isinstance(branch, Branch)
             setattr(self.predictor, name, converter.branch(branch))
-        self.mixing = Mixing(converter.mixes)
         self.recall = recall(model.memory, converter.features, converter.shared)
         self.shares = [f"memory.{index}" for index in range(len(converter.shared))]
 
@@ -131,21 +136,20 @@ class MemMLPStream(StreamingGraph):
             **memory.initial_state(1),
         }
 
-    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
         memory = self.recall.memory
         origin = self.normalizer.origin(sparse)
         encoded = self.coordinates.encode(sparse, origin)
-        queue = torch.cat([torch.where(state["count"] > 0, state["sparse"], encoded), encoded[None]], 1)
+        queue = torch.cat([filled(state["sparse"], encoded, fresh), encoded[None]], 1)
         past = memory.recall(queue, state, 1)
         stem = self.stem(encoded)
-        kept = {"stem": ring.put(state["stem"], stem, stem)}
+        kept = {"stem": slid(state["stem"], stem, stem, fresh)}
         for name, share, before in zip(self.shares, *self.recall(past), strict=True):
-            kept[name] = ring.put(state[name], share, before)
+            kept[name] = slid(state[name], share, before, fresh)
         h, *shares = kept.values()
-        now = StreamStep(ring.newest, self.mixing(ring.slot), shares)
         for block in self.blocks:
-            h = block(h, now)
-        motion = self.predictor(h, now, sparse, self.normalizer, 1)
+            h = block(h, shares)
+        motion = self.predictor(h, shares, sparse, self.normalizer, 1)
         kept |= memory.remember(motion[None], past, state, 1) | {"sparse": queue[:, 1:]}
         return self.coordinates.decode(motion, origin), kept

@@ -20,7 +20,7 @@ from memmlp.networks.memory import (
     RecurrentMemory,
     VQMemory,
 )
-from memmlp.networks.streaming.blocks import SharedBlock
+from memmlp.networks.streaming.blocks import FrameGRU, SharedBlock
 from memmlp.networks.vqvae import VQVAE
 
 Pieces = Sequence[Tensor]
@@ -157,12 +157,17 @@ class FromRecurrence(Recall):
     """For recurrent memories, whose features before the first frame are zeros."""
 
     def gather(self, features: Sequence[Any]) -> None:
-        """Note the index of each block's recurrent layer."""
+        """Note the index of each block's recurrent layer, and write GRUs out."""
         self.layers = [feature.index for feature in features]
+        assert isinstance(self.memory, RecurrentMemory)
+        for recurrence in self.memory.recurrences:
+            if isinstance(recurrence.layer, nn.GRU):
+                recurrence.layer = FrameGRU(recurrence.layer)
 
     def feature(self, past: Recurred) -> Tensor:
         """Return the features (1, blocks, k) of the frame that enters."""
-        return past.features[:, self.layers, -1]
+        newest = past.features[:, :, -1]
+        return newest.index_select(1, torch.tensor(self.layers, device=newest.device))
 
     def before(self, first: Tensor) -> Tensor:
         """Return zeros, since the layers have seen nothing before the first frame."""

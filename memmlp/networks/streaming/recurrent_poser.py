@@ -7,7 +7,6 @@ from torch import Tensor
 from memmlp.networks.memory import State
 from memmlp.networks.recurrent_poser import RecurrentPoser
 from memmlp.networks.streaming.baselines import FrameStream
-from memmlp.networks.streaming.ring import Ring
 from memmlp.networks.window_model import WindowModel
 
 
@@ -26,6 +25,6 @@ class RecurrentPoserStream(FrameStream):
         self.model = model
         self.ends = ("model.stem", "model.head", *(f"model.blocks.{name}.mlp" for name in model.blocks))
 
-    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
         return self.model.step(sparse, state)

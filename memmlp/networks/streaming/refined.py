@@ -6,7 +6,8 @@ from torch import Tensor
 
 from memmlp.networks.memory import State
 from memmlp.networks.refiner import HIDDEN, Refined
-from memmlp.networks.streaming.ring import Ring, StreamingGraph
+from memmlp.networks.streaming.blocks import FrameGRU
+from memmlp.networks.streaming.graph import StreamingGraph
 from memmlp.networks.window_model import WindowModel
 
 
@@ -23,19 +24,20 @@ class RefinedStream(StreamingGraph):
     def __init__(self, model: Refined, graph: StreamingGraph):
         super().__init__(model)
         self.graph = graph
-        self.ends = (*(f"graph.{name}" for name in graph.ends), "model.head")
+        self.ends = (*(f"graph.{name}" for name in graph.ends), "model.layers", "model.head")
 
     def build(self, model: WindowModel) -> None:
         """Keep a copy of the refiner; of the network the graph has one."""
         assert isinstance(model, Refined)
-        self.model = model
+        self.model, self.hidden = model, model.initial_state(1)[HIDDEN]
+        setattr(model, "layers", FrameGRU(model.layers))  # noqa: B010  # of another class than the network's
 
     def windows(self) -> State:
         """Return what the network's graph carries, and the hidden states (1, depth, width): zeros."""
-        return {**self.graph.windows(), HIDDEN: self.model.initial_state(1)[HIDDEN]}
+        return {**self.graph.windows(), HIDDEN: self.hidden}
 
-    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
-        motion, kept = self.graph.step(sparse, state, ring)
+        motion, kept = self.graph.step(sparse, state, fresh)
         refined, hidden = self.model.refined(motion[None], sparse[None], state[HIDDEN])
         return refined[0], {**kept, HIDDEN: hidden}

@@ -3,7 +3,7 @@
 import { about } from './store.js';
 
 const COSTS = {
-  median_ms: 'latency', p95_ms: 'latency p95', ratio_to_yardstick: '× yardstick', parameters: 'parameters', macs: 'MACs',
+  median_ms: 'latency', p95_ms: 'latency p95', pose_median_ms: 'pose latency', ratio_to_yardstick: '× yardstick', parameters: 'parameters', macs: 'MACs',
   onnx_bytes: 'ONNX bytes',
 };
 

@@ -166,7 +166,7 @@ function latency(run) {
   const found = run.latency;
   if (found.median_ms === undefined) return null;
   const shown = [
-    ['median of a step', `${number(found.median_ms, 3)} ms`], ['p95', `${number(found.p95_ms, 3)} ms`], ['times the yardstick', number(found.ratio_to_yardstick, 2)],
+    ['median of a step', `${number(found.median_ms, 3)} ms`], ['p95', `${number(found.p95_ms, 3)} ms`], ['median of a whole pose', found.pose_median_ms === undefined ? undefined : `${number(found.pose_median_ms, 3)} ms`], ['times the yardstick', number(found.ratio_to_yardstick, 2)],
     ['parameters', number(found.parameters)], ['MACs of a step', number(found.step_macs ?? found.macs)], ['ONNX file', found.onnx_bytes ? bytes(found.onnx_bytes) : '–'],
     ['graph', found.graph], ['parity with torch', found.onnx_parity === undefined ? '–' : number(found.onnx_parity)], ['precision', found['settings.precision']],
   ];

@@ -1,9 +1,12 @@
-"""The interface of streaming graphs, and the ring in which they carry windows of frames."""
+"""The interface of streaming graphs, and how a frame enters the windows that they carry.
+
+A step has static shapes and no operation whose work depends on the data (no condition, no index that is
+computed), so that accelerators take all of it.
+"""
 
 from __future__ import annotations
 
 import copy
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -12,43 +15,30 @@ from memmlp.networks.memory import State
 from memmlp.networks.window_model import WindowModel
 
 
-class Ring(NamedTuple):
-    """Where frames stand in windows of T frames: they stay in place, and the newest overwrites the oldest.
+def filled(earlier: Tensor, first: Tensor, fresh: Tensor) -> Tensor:
+    """Return a window's earlier frames, in which at a fresh start the first frame stands for all of them.
 
-    This spares moving the whole window by one frame at every step.
+    They are zeros then, so that a sum does it: it needs no condition, which not every runtime has.
 
-    Attributes:
-        slot: index (1,) of the newest frame.
-        entered: indices that a step writes to: the newest frame's, and at a fresh start all of them.
+    Args:
+        earlier: the frames (n, size) that are carried.
+        first: what stands for them (1, size).
+        fresh: 1 at a fresh start and 0 after it (1,).
     """
+    return earlier + fresh * first
 
-    slot: Tensor
-    entered: Tensor
 
-    @classmethod
-    def at(cls, count: Tensor, frames: int) -> Ring:
-        """Return the ring of T = `frames` slots at a step, given the count (1,) before it (see `counted`)."""
-        slot = count.remainder(frames).long()
-        slots = torch.arange(frames, device=count.device)
-        return cls(slot, torch.nonzero((slots == slot) | (count == 0))[:, 0])
+def slid(window: Tensor, entering: Tensor, before: Tensor, fresh: Tensor) -> Tensor:
+    """Return a window (T, size) whose oldest frame has left and a new one (1, size) entered.
 
-    def put(self, window: Tensor, entering: Tensor, before: Tensor) -> Tensor:
-        """Put a frame (1, size) into a window (T, size); at a fresh start `before` goes into all others."""
-        window = _written(window, self.entered, before)
-        return window if before is entering else _written(window, self.slot, entering)
-
-    def newest(self, window: Tensor) -> Tensor:
-        """Return the newest frame (1, size) of a window (T, size)."""
-        return window.index_select(0, self.slot)
+    At a fresh start `before` (1, size) stands for the frames before it; see `filled`.
+    """
+    return torch.cat([filled(window[1:], before, fresh), entering])
 
 
 def counted(count: Tensor, frames: int) -> Tensor:
-    """Return the count after a step: 1 to `frames` and then 1 again, so that only a fresh start has 0."""
-    return count.remainder(frames) + 1
-
-
-def _written(window: Tensor, index: Tensor, frame: Tensor) -> Tensor:
-    return window.index_put((index,), frame.expand(index.shape[0], -1))
+    """Return the count (1,) of frames that were taken in, after a step; it stays at `frames`."""
+    return count.clamp_max(frames - 1) + 1
 
 
 class StreamingGraph(nn.Module):
@@ -109,11 +99,20 @@ class StreamingGraph(nn.Module):
         """
         # Parts of the state that are empty (a queue of no frames) are no inputs of the exported graph, so
         # they are taken out of the new state and put back from `windows` here.
-        ring = Ring.at(state["count"], self.frames)
-        motion, kept = self.step(sparse[0], self.windows() | state, ring)
+        fresh = 1 - state["count"].clamp_max(1)
+        motion, kept = self.step(sparse[0], self.windows() | state, fresh)
         kept["count"] = counted(state["count"], self.frames)
         return motion[None], {name: tensor for name, tensor in kept.items() if tensor.numel()}
 
-    def step(self, sparse: Tensor, state: State, ring: Ring) -> tuple[Tensor, State]:
-        """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
+    def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
+        """Take in one frame.
+
+        Args:
+            sparse: world inputs (1, 54).
+            state: what is carried, all zeros at a fresh start.
+            fresh: 1 at a fresh start and 0 after it (1,).
+
+        Returns:
+            World motion (1, 198), and what is carried on.
+        """
         raise NotImplementedError

@@ -1,0 +1,58 @@
+"""What a file of less precision costs in accuracy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from memmlp.common.progress import progress_bar
+from memmlp.deploy.parity import streamed
+from memmlp.deploy.session import OnnxStream
+from memmlp.evaluation.modes import rotations_report
+from memmlp.motion.normalizer import Normalizer
+
+MAX_GROWTH = 0.01  # relative
+"""Of MPJPE, up to which less precision may stand for float32."""
+
+TEST_FRAMES = 20_000  # accuracy is measured on at most this many
+
+
+def accuracy(path: Path, normalizer: Normalizer, clips: Sequence[Tensor]) -> dict[str, float]:
+    """Measure the rotation branch's metrics, streamed in ONNX Runtime: means over clips (N, 252).
+
+    At most 20,000 frames are streamed; where there are more, the same share of each clip.
+    """
+    stream, share = OnnxStream(path), min(1.0, TEST_FRAMES / sum(map(len, clips)))
+    rows = []
+    for clip in progress_bar(clips, "measuring"):
+        truth = clip[: max(int(share * len(clip)), 2)]
+        rows.append(rotations_report(normalizer, streamed(stream, truth), truth))
+    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+
+
+def compared(
+    exact: Path, other: Path, precision: str, normalizer: Normalizer, clips: Sequence[Tensor]
+) -> dict[str, Any]:
+    """Measure what less precision costs on test clips.
+
+    Args:
+        exact: the float32 file.
+        other: the same network in less precision.
+        precision: its name, "int8" or "fp16".
+        normalizer: the network's.
+        clips: frames (N, 252) of each clip.
+
+    Returns:
+        The metrics of both files, the relative growth of MPJPE and of Jitter, and whether the other file may
+        be the default.
+    """
+    before, after = (accuracy(path, normalizer, clips) for path in (exact, other))
+    growth, jitter = (after[name] / before[name] - 1 for name in ("MPJPE", "Jitter"))
+    allowed = growth <= MAX_GROWTH
+    return {
+        "fp32": before, precision: after, "growth": growth, "jitter_growth": jitter, "default": allowed,
+    }  # fmt: skip

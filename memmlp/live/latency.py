@@ -1,0 +1,56 @@
+"""How long a whole pose takes on a CPU: from a sample of the trackers to the joints in the caller's frame."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from memmlp.deploy.session import OnnxStream
+from memmlp.live.rotations import quaternion_to_matrix
+from memmlp.live.stream import Stream
+from memmlp.motion.body import SPARSE_DIM
+
+WARM_UP = 30  # samples before the timed ones
+LEAST = 200  # samples are timed, however few are asked for
+
+
+def measure(path: Path, steps: int) -> dict[str, float]:
+    """Time whole poses of an exported network on one thread: median and 95th percentile, in milliseconds.
+
+    A pose is a call of `Stream.step`: features, conversions and forward kinematics, with the network's step
+    among them.
+    """
+    seconds = alternate(Stream(path), None, WARM_UP + max(steps, LEAST))[WARM_UP:, 1]
+    return {
+        "pose_median_ms": 1000 * float(np.median(seconds)),
+        "pose_p95_ms": 1000 * float(np.percentile(seconds, 95)),
+    }
+
+
+def alternate(stream: Stream, network: OnnxStream | None, frames: int) -> np.ndarray:
+    """Time the network's step alone and the stream's in turn, over random trackers.
+
+    Args:
+        stream: the stream.
+        network: the network; None to time the stream alone.
+        frames: how many samples the trackers give.
+
+    Returns:
+        Seconds (frames, 2): of the network's step, and of the stream's.
+    """
+    random, seconds = np.random.default_rng(0), np.zeros((frames, 2))
+    sparse = random.standard_normal((frames, 1, SPARSE_DIM), np.float32)
+    quaternions = random.normal(size=(frames, 3, 4))
+    turns = quaternion_to_matrix(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True))
+    places = random.normal(size=(frames, 3, 3))
+    for index in range(frames):
+        start = time.perf_counter()
+        if network is not None:
+            network.step(sparse[index])
+        middle = time.perf_counter()
+        head, left, right = zip(places[index], turns[index], strict=True)
+        stream.step(head, left, right)
+        seconds[index] = middle - start, time.perf_counter() - middle
+    return seconds

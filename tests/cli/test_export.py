@@ -1,0 +1,92 @@
+"""`memmlp export`: what it refuses, and what it says of the operators that targets publish."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import onnx
+import pytest
+from conftest import Memmlp, one_line
+from onnx import TensorProto, helper
+
+from memmlp.runs.lookup import is_trained, list_runs
+
+
+def write(path: Path, *kinds: str, opset: int = 15) -> None:
+    """Write an ONNX file of operators, one after the other."""
+    names = ["x", *(f"h{index}" for index in range(1, len(kinds))), "y"]
+    value = helper.make_tensor_value_info
+    nodes = [helper.make_node(kind, [names[i]], [names[i + 1]]) for i, kind in enumerate(kinds)]
+    ends = [[value(name, TensorProto.FLOAT, [2])] for name in ("x", "y")]
+    graph = helper.make_graph(nodes, "graph", *ends)
+    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8)
+    onnx.save(made, path)
+
+
+def test_a_file_is_checked_without_a_run(memmlp: Memmlp, tmp_path: Path):
+    fine, other = tmp_path / "fine.onnx", tmp_path / "other.onnx"
+    write(fine, "Relu", "Sigmoid")
+    said = memmlp("export", str(fine), "--check", "unity", "--check", "tensorrt")
+    assert said.code == 0
+    assert said.out.startswith("fine.onnx: 2 nodes of 2 operators\nunity: ")
+    assert said.out.count("  all operators are published\n") == 2
+    assert "com.unity.ai.inference 2.4.0, 2025-10-22 (https://docs.unity3d.com" in said.out
+    write(other, "Relu", "Det", "Det", opset=18)
+    said = memmlp("export", str(other), "--check", "unity", "--check", "onnxruntime")
+    assert said.code == 1
+    assert "  opset 18: published are 7 to 15\n  Det (version 11), 2 nodes: not in the list\n" in said.out
+    assert "other.onnx: outside of what unity publishes" in said.err
+
+
+def test_web_is_all_of_its_backends(memmlp: Memmlp, tmp_path: Path):
+    write(tmp_path / "step.onnx", "Relu", "Sign")
+    said = memmlp("export", str(tmp_path / "step.onnx"), "--check", "web")
+    assert [line.partition(":")[0] for line in said.out.splitlines() if line.startswith("w")] == [
+        "wasm",
+        "webgpu",
+        "webnn",
+    ]
+    assert "Sign (version 13), 1 nodes: not in the list\n  so WebAssembly on the CPU" in said.out
+    assert "outside of what webgpu publishes" in said.err
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (["step.onnx"], "allowed with it is --check alone"),
+        (["step.onnx", "--check", "unity", "--out", "other.onnx"], "allowed with it is --check alone"),
+        (["none.onnx", "--check", "unity"], "none.onnx: no such file"),
+        (["0123"], "--out: is missing; it may be left out with --check alone"),
+        (["0123", "--out", "none/step.onnx"], "there is no folder none"),
+        (["0123", "--out", "a.onnx", "--rotations", "quaternion"], "allowed with --scope full"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(
+    memmlp: Memmlp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: list[str], words: str
+):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "step.onnx", "Relu")
+    one_line(memmlp("export", *line), words)
+    assert [path.name for path in tmp_path.iterdir()] == ["step.onnx"]
+
+
+@pytest.mark.slow
+def test_a_run_in_fp16_for_unity(home: Path, memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(home)
+    (run,) = (found.id for found in list_runs(Path("outputs")) if is_trained(found))
+    whole = ["--scope", "full", "--space", "unity", "--rotations", "quaternion", "--opset", "15"]
+    said = memmlp("export", run, "--out", "unity.onnx", *whole, "--precision", "fp16", "--check", "unity")
+    assert said.code == 0
+    assert "MPJPE" in said.out
+    model = onnx.load("unity.onnx")
+    onnx.checker.check_model(model, full_check=True)
+    assert [one.version for one in model.opset_import] == [15]
+    kinds = {tensor.data_type for tensor in model.graph.initializer}
+    assert {TensorProto.FLOAT, TensorProto.FLOAT16} <= kinds
+    shapes = {o.name: [d.dim_value for d in o.type.tensor_type.shape.dim] for o in model.graph.output}
+    assert shapes["rotations"] == [1, 22, 4]
+    one_line(memmlp("export", run, "--out", "a.onnx", *whole, "--precision", "int8"), "--scope network")
+    said = memmlp("export", run, "--check", "unity")
+    assert said.code == 1
+    assert f"{run}.onnx: outside of what unity publishes" in said.err
+    assert not list(home.glob("*export*"))

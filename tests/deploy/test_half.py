@@ -1,0 +1,65 @@
+"""fp16: the inner layers' products alone, near to float32; inputs, outputs and states stay float32."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import exported
+import numpy as np
+import onnx
+import pytest
+import tiny
+from onnx import TensorProto, numpy_helper
+
+from memmlp.common.errors import InputError
+from memmlp.deploy.export import export
+from memmlp.deploy.half import halve, halved
+from memmlp.deploy.parity import streamed
+from memmlp.deploy.quantization import inner_layers
+from memmlp.deploy.session import OnnxStream
+from memmlp.networks.streaming import streaming
+
+pytestmark = pytest.mark.slow
+
+CLIP = tiny.clip(40)
+
+
+@pytest.mark.parametrize("network", ["mem_mlp", "refined", "avatar_poser", "hmd_poser"])
+def test_the_products_of_inner_layers_are_fp16(step_files, tmp_path: Path, network: str):
+    source, path = step_files(network), tmp_path / "half.onnx"
+    ends = streaming(exported.NETWORKS[network]()).ends
+    halve(source, path, ends)
+    made, inner = onnx.load(path), set(inner_layers(onnx.load(source), ends))
+    onnx.checker.check_model(made, full_check=True)
+    kinds = {tensor.name: tensor.data_type for tensor in made.graph.initializer}
+    products = [node for node in made.graph.node if node.op_type in ("Gemm", "MatMul")]
+    halves = {node.name for node in products if kinds.get(node.input[1]) == TensorProto.FLOAT16}
+    assert halves == inner != set()
+    ends_of_file = (*made.graph.input, *made.graph.output)
+    assert {end.type.tensor_type.elem_type for end in ends_of_file} == {TensorProto.FLOAT}
+    assert path.stat().st_size < source.stat().st_size + 200 * len(made.graph.node)
+    apart = (streamed(OnnxStream(source), CLIP) - streamed(OnnxStream(path), CLIP)).abs()
+    assert 1e-7 < float(apart.mean()) < 1e-3
+
+
+def test_states_stay_float32(tmp_path: Path):
+    """What a recurrent cell adds up is below the resolution of sixteen bits."""
+    graph = streaming(tiny.recurrent_poser(cell="lru"))
+    export(graph, tmp_path / "step.onnx", "0" * 16)
+    halve(tmp_path / "step.onnx", tmp_path / "half.onnx", graph.ends)
+    made = onnx.shape_inference.infer_shapes(onnx.load(tmp_path / "half.onnx")).graph
+    types = {value.name: value.type.tensor_type.elem_type for value in made.value_info}
+    types |= {tensor.name: tensor.data_type for tensor in made.initializer}
+    sums = [node for node in made.node if node.op_type in ("Add", "Sub", "LayerNormalization", "Concat")]
+    assert len(sums) > 10
+    assert TensorProto.FLOAT16 not in {types.get(name) for node in sums for name in node.input}
+
+
+def test_weights_that_do_not_fit_are_refused(step_files):
+    model, ends = onnx.load(step_files("mem_mlp")), streaming(exported.NETWORKS["mem_mlp"]()).ends
+    (weight,) = (t for t in model.graph.initializer if t.name == "model.blocks.0.linear.weight")
+    values = numpy_helper.to_array(weight).copy()
+    values[0, 0] = 1e5
+    weight.CopyFrom(numpy_helper.from_array(values.astype(np.float32), weight.name))
+    with pytest.raises(InputError, match=r"blocks\.0\.linear\.weight: has weights beyond 65504"):
+        halved(model, ends)

@@ -1,0 +1,109 @@
+"""A step in every opset: checked, the same numbers, and no operator whose work depends on the data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import exported
+import numpy as np
+import onnx
+import pytest
+import tiny
+from onnx import ModelProto, TensorProto, helper, numpy_helper
+
+from memmlp.common.errors import InputError
+from memmlp.config.schema.config import ExportConfig
+from memmlp.deploy.opsets import NATIVE, OPSETS, converted
+from memmlp.deploy.parity import TOLERANCE, streamed
+from memmlp.deploy.session import OnnxStream
+
+CLIP = tiny.clip(20)
+
+
+def model(*nodes: onnx.NodeProto, **constants: np.ndarray) -> ModelProto:
+    """Make a graph from x (2, 4) to y."""
+    value = helper.make_tensor_value_info
+    ends = value("x", TensorProto.FLOAT, [2, 4]), value("y", TensorProto.FLOAT, ["rows", "columns"])
+    initializers = [numpy_helper.from_array(array, name) for name, array in constants.items()]
+    graph = helper.make_graph(nodes, "graph", ends[:1], ends[1:], initializers)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", NATIVE)], ir_version=10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("network", exported.NETWORKS)
+def test_a_step_computes_the_same_in_every_opset(
+    step_files: Callable[[str], Path], tmp_path: Path, network: str
+):
+    source, path = step_files(network), tmp_path / "step.onnx"
+    native = onnx.load(source)
+    expected = streamed(OnnxStream(source), CLIP)
+    for opset in OPSETS if network == "mem_mlp" else (15, 17, OPSETS[-1]):
+        made = converted(native, opset)
+        onnx.checker.check_model(made, full_check=True)
+        assert [(one.domain, one.version) for one in made.opset_import] == [("", opset)]
+        assert [p.value for p in made.metadata_props] == [p.value for p in native.metadata_props]
+        onnx.save(made, path)
+        assert float((streamed(OnnxStream(path), CLIP) - expected).abs().max()) <= TOLERANCE
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("network", exported.NETWORKS)
+def test_no_work_depends_on_the_data(step_files: Callable[[str], Path], network: str):
+    graph = onnx.load(step_files(network)).graph
+    assert exported.data_dependent(graph) == set()
+
+
+def test_data_dependent_operators_are_seen():
+    one = np.array([0], np.int64)
+    graph = model(
+        helper.make_node("NonZero", ["x"], ["found"]),
+        helper.make_node("Slice", ["x", "found", "one"], ["part"]),
+        helper.make_node("Slice", ["x", "one", "one"], ["y"]),
+        one=one,
+    ).graph
+    assert exported.data_dependent(graph) == {"NonZero", "Slice"}
+
+
+def test_older_opsets_have_other_operators():
+    graph = model(
+        helper.make_node("LayerNormalization", ["x", "scale", "bias"], ["normal"], epsilon=1e-3),
+        helper.make_node("Split", ["normal"], ["left", "right"], axis=1, num_outputs=2),
+        helper.make_node("ReduceL2", ["left", "axes"], ["length"], keepdims=1),
+        helper.make_node("Mul", ["right", "length"], ["y"]),
+        scale=np.full(4, 2, np.float32),
+        bias=np.ones(4, np.float32),
+        axes=np.array([1], np.int64),
+    )
+    x = np.arange(8, dtype=np.float32).reshape(2, 4) ** 2
+    expected = run(graph, x)
+    for opset in OPSETS:
+        np.testing.assert_allclose(run(converted(graph, opset), x), expected, rtol=1e-5)
+    kinds = {node.op_type for node in converted(graph, 16).graph.node}
+    assert "LayerNormalization" not in kinds
+    assert "LayerNormalization" in {node.op_type for node in converted(graph, 17).graph.node}
+    assert "axes" not in {tensor.name for tensor in converted(graph, 15).graph.initializer}
+
+
+def run(graph: ModelProto, x: np.ndarray) -> np.ndarray:
+    """Compute a graph's output by onnx' own reference."""
+    onnx.checker.check_model(graph, full_check=True)
+    return onnx.reference.ReferenceEvaluator(graph).run(None, {"x": x})[0]
+
+
+def test_what_cannot_be_brought_down_is_refused():
+    graph = model(helper.make_node("Mish", ["x"], ["y"]))
+    with pytest.raises(InputError, match="opset 15: has another Mish"):
+        converted(graph, 15)
+
+
+@pytest.mark.parametrize("opset", [14, 27])
+def test_other_opsets_are_refused(opset: int):
+    with pytest.raises(InputError, match=rf"opset {opset}: allowed is 15 to 26"):
+        converted(model(helper.make_node("Relu", ["x"], ["y"])), opset)
+
+
+def test_the_config_allows_the_same():
+    rule = ExportConfig.__dataclass_fields__["opset"].metadata["rule"]
+    assert (rule.low, rule.high) == (OPSETS[0], OPSETS[-1])
+    assert ExportConfig.__dataclass_fields__["opset"].default == NATIVE
