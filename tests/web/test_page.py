@@ -106,6 +106,8 @@ def t_pose(site: Made) -> list[dict[str, Any]]:
 def worn(browser: Browser, site: Made) -> dict[str, Any]:
     """Enter VR, calibrate in T-pose, move as the clip does, leave, and save the recording."""
     go(browser, "wear", f"{SITE}.wear == 'ready'")
+    height = json.loads((site.folder / "site.json").read_text())["networks"][0]["body"]["height"]
+    browser.value(f"document.querySelector('#height').value = {100 * height}")
     browser.value("document.querySelector('#record').click()")
     browser.value("document.querySelector('#immersive-vr').click()")
     browser.wait("window.headset.session && Number(document.querySelector('#frames').textContent) > 0")
@@ -118,7 +120,7 @@ def worn(browser: Browser, site: Made) -> dict[str, Any]:
     browser.resolved(f"headset.play({json.dumps(joints())}, offsets)")
     browser.resolved("headset.session.end()")
     browser.value("document.querySelector('#save').click()")
-    return json.loads(browser.wait("headset.saved"))
+    return json.loads(browser.wait("headset.saved")) | {"worn": browser.value("offsets")}
 
 
 def check_wearer(recording: dict[str, Any], site: Made) -> None:
@@ -128,8 +130,13 @@ def check_wearer(recording: dict[str, Any], site: Made) -> None:
     begun = recording["samples"].index(calibrated[0])
     offsets = Offsets(*(calibrated[0]["calibrated"][key] for key in ("positions", "rotations")))
     stream, apart = Stream(site.step, space="openxr", height=calibrated[0]["height"]), []
+    worn = recording[
+        "worn"
+    ]  # how the devices sat on the network's own body, which is laid as near as it can be
+    np.testing.assert_allclose(offsets.rotations, worn["rotations"], atol=1e-5)
+    np.testing.assert_allclose(offsets.positions[0], 2 / 3 * np.array(worn["positions"][0]), atol=1e-5)
     found = stream.calibrate(*given(recording["samples"][begun - 1]["trackers"]))
-    np.testing.assert_allclose(found.positions, offsets.positions, atol=1e-3)  # a sample beside it
+    np.testing.assert_allclose(found.positions, offsets.positions, atol=1e-5)
     stream.offsets = matrices(offsets)
     for sample in recording["samples"][begun + 1 :]:
         pose = stream.step(*given(sample["trackers"]), time=sample["time"])
@@ -166,7 +173,8 @@ def check_bench(browser: Browser, file: Path) -> None:
     go(browser, "bench", f"{SITE}.bench == 'ready'")
     browser.value("document.querySelector('#device').value = 'Test headset'")
     browser.value("document.querySelector('#start').click()")
-    browser.wait(f"{SITE}.bench == 'done'")
+    browser.wait(f"{SITE}.bench == 'done' || document.querySelector('#start').textContent == 'Start'")
+    assert "Measured 8 rows" in browser.value("document.querySelector('#progress').textContent")
     browser.value("document.querySelector('#copy').click()")
     file.write_text(browser.wait("window.copied"))
     measured = read(file)

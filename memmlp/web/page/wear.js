@@ -26,7 +26,7 @@ class Wear {
     Object.assign(this, { page, site, network: site.networks[0], worn: null });
     this.canvas = h('canvas', { 'aria-label': 'What is seen in the mirror' });
     this.trouble = h('p', { class: 'trouble' }, 'Loading the network.');
-    this.height = h('input', { type: 'number', id: 'height', min: 100, max: 230, placeholder: 'by headset' });
+    this.height = h('input', { type: 'number', id: 'height', min: 100, max: 230, step: 'any', placeholder: 'by headset' });
     this.record = h('input', { type: 'checkbox', id: 'record' });
     this.save = h('button', { type: 'button', id: 'save', hidden: true, onclick: () => this.saved() }, 'Save recording');
     this.buttons = Object.entries(MODES).map(([mode, name]) =>
