@@ -24,7 +24,7 @@ version = release = memmlp.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode",
               "sphinx_copybutton", "sphinx_design"]  # fmt: skip
-exclude_patterns = ["results/templates"]
+exclude_patterns = ["results/templates", "examples"]
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
 html_theme = "furo"

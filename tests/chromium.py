@@ -80,6 +80,16 @@ class Browser:
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
+    def resolved(self, expression: str) -> Any:
+        """What a promise on the page resolves to."""
+        result = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in result, result
+        return result["result"].get("value")
+
+    def before(self, script: str) -> None:
+        """Run a script on every page before its own."""
+        self.call("Page.addScriptToEvaluateOnNewDocument", source=script)
+
     def wait(self, expression: str) -> Any:
         """The first value of an expression that is true."""
         return until(lambda: self.value(expression), f"{expression}; {self.errors}", self.process)

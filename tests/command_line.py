@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -45,6 +46,12 @@ def exit_code(arguments: Sequence[str]) -> int:
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     return 0
+
+
+def in_folder(folder: Path, *arguments: str) -> None:
+    """What `processes.forked` does for a command line in that folder."""
+    os.chdir(folder)
+    sys.exit(exit_code(arguments))
 
 
 def run_apart(folder: Path, *arguments: str, code: int = 0) -> str:

@@ -59,6 +59,7 @@ from memmlp.training.losses import (
     Manual,
     MotionLoss,
     NoHand,
+    OwnLoss,
     Terms,
     TermsLoss,
     Uncertainty,
@@ -401,6 +402,9 @@ CASES: dict[str, Callable[[], Numbers]] = {
         f"{anchor} {name}": value
         for anchor in ("pelvis", "head")
         for name, value in loss(partial(AvatarPoserLoss, anchor=anchor)).items()
+    },
+    "loss.own": lambda: {
+        "total": float(OwnLoss()(*(torch.ones(1, 1, n) for n in (198, 198, 54)), tiny.normalizer())[0])
     },
     "loss.terms": lambda: {
         f"{error} {name}": value

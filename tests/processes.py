@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -17,6 +18,7 @@ T = TypeVar("T")
 MARK = "MEMMLP_TESTS"
 PATIENCE = 900.0  # seconds until a wait fails: nothing comes near, on a machine with much other work either
 PROC = Path("/proc")
+SERVANTS = (b"multiprocessing.resource_tracker", b"multiprocessing.forkserver")  # they end with this process
 
 
 def mark() -> None:
@@ -31,14 +33,15 @@ def mark() -> None:
 def marked() -> list[int]:
     """The numbers of the living processes with this process' mark, without itself.
 
-    None where there is no /proc. The resource tracker of multiprocessing ends with this process.
+    None where there is no /proc.
     """
     wanted = f"{MARK}={os.environ[MARK]}".encode()
     found = []
     for folder in PROC.glob("[0-9]*"):
         with contextlib.suppress(OSError):  # it has ended, or is somebody else's
             begins = any(entry.startswith(wanted) for entry in (folder / "environ").read_bytes().split(b"\0"))
-            if begins and b"resource_tracker" not in (folder / "cmdline").read_bytes():
+            command = (folder / "cmdline").read_bytes()
+            if begins and not any(name in command for name in SERVANTS):
                 found.append(int(folder.name))
     return [pid for pid in found if pid != os.getpid()]
 
@@ -64,6 +67,66 @@ def started(line: Sequence[str], **options: Any) -> Iterator[subprocess.Popen]:
             process.kill()
 
 
+class Forked:
+    """A process that calls a function, with what tests need of `subprocess.Popen`, and says nothing.
+
+    It is forked off a server that has imported torch and memmlp once, which takes seconds of CPU time.
+    """
+
+    def __init__(self, work: Callable[..., object], *arguments: Any, **environment: str):
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload(["memmlp.config.build", "memmlp.pipeline.run_stages", "torch.onnx"])
+        self._process = context.Process(target=_quietly, args=(environment, work, arguments))
+        self._process.start()
+
+    @property
+    def returncode(self) -> int | None:
+        """The exit code, negative where a signal ended the process; None while it lives."""
+        return self._process.exitcode
+
+    def poll(self) -> int | None:
+        """As `returncode`."""
+        return self.returncode
+
+    def kill(self) -> None:
+        """Send SIGKILL."""
+        self._process.kill()
+
+    def wait(self, timeout: float = PATIENCE) -> int | None:
+        """Return the exit code once the process has ended."""
+        self._process.join(timeout)
+        return self.returncode
+
+
+def _quietly(environment: dict[str, str], work: Callable[..., object], arguments: Sequence[Any]) -> None:
+    os.environ.update(environment)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(nowhere, stream)
+    work(*arguments)
+
+
+@contextlib.contextmanager
+def forked(work: Callable[..., object], *arguments: Any, **environment: str) -> Iterator[Forked]:
+    """A process that calls a function of a module of the tests, killed at the end if it has not ended."""
+    process = Forked(work, *arguments, **environment)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+@contextlib.contextmanager
+def hearing_interrupts() -> Iterator[None]:
+    """As from a terminal: processes started herein hear SIGINT, where this one ignores it (nohup, or `&`)."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 @contextlib.contextmanager
 def ignoring_interrupts() -> Iterator[None]:
     """As in what nohup started: processes started herein ignore SIGINT, if they do nothing about it."""
@@ -79,7 +142,7 @@ def finished(line: Sequence[str], **options: Any) -> subprocess.CompletedProcess
     return subprocess.run(line, capture_output=True, text=True, check=False, timeout=PATIENCE, **options)
 
 
-def until(condition: Callable[[], T], what: str, process: subprocess.Popen | None = None) -> T:
+def until(condition: Callable[[], T], what: str, process: subprocess.Popen | Forked | None = None) -> T:
     """The first true value of a condition; fails where `process`, if one is given, ends without it."""
     end = time.monotonic() + PATIENCE
     while True:
@@ -88,4 +151,4 @@ def until(condition: Callable[[], T], what: str, process: subprocess.Popen | Non
             return value
         assert not ended, f"the process ended with {process.returncode} before {what}"
         assert time.monotonic() < end, f"not within {PATIENCE:.0f} s: {what}"
-        time.sleep(0.01)
+        time.sleep(0.03)

@@ -1,20 +1,16 @@
-"""A process of several that train the tests' tasks together: shared_training.py FOLDER TASK... [die=TASK]
-
-Each task is trained in FOLDER/TASK, from the checkpoint that is there. In the one that is named last as
-die=TASK the second process is killed on the way.
-"""
+"""Trainings that tests have done by processes of their own."""
 
 from __future__ import annotations
 
 import os
 import signal
-import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
-from tiny_tasks import OPTIM, TASKS
+import torch
+from tiny_tasks import OPTIM, TASKS, motion_task
 
 from memmlp.common import parallel
 from memmlp.runs.run import Run
@@ -46,7 +42,12 @@ def precise(name: str) -> TrainingTask:
     return task
 
 
-def main(folder: Path, names: list[str]) -> None:
+def together(folder: Path, *names: str) -> None:
+    """Train tasks in this process, one of several.
+
+    Each task is trained in FOLDER/TASK, from the checkpoint that is there. In the one that is named last as
+    die=TASK the second process is killed on the way.
+    """
     parallel.connect("cpu")
     for word in names:
         name = word.removeprefix("die=")
@@ -67,5 +68,11 @@ def dying(step: Callable, die: Callable[[], object]) -> Callable:
     return last
 
 
-if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2:])
+def alone(folder: Path) -> Run:
+    """Bring a run of 200 steps to its end."""
+    torch.set_num_threads(1)
+    optim = replace(OPTIM, steps=200, checkpoint_every=7)
+    task, run = motion_task(optim=optim), Run(folder)
+    run.folder.mkdir(exist_ok=True)
+    train(task, optim, run, 0, "whole")
+    return run

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+import runpy
 import shlex
 import tomllib
 from pathlib import Path
@@ -66,6 +67,8 @@ def checks(text: str) -> None:
         targets = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
         assert targets
         assert {word for word in rest if "=" not in word} <= set(targets[1].split())
+    elif any(word.startswith("docs/") for word in rest) and program in ("python", "node", "blender", "cmake"):
+        runs_example(rest)
     elif program == "dask":
         command = importlib.import_module(f"distributed.cli.dask_{rest[0]}").main
         command.make_context("dask", rest[1:])  # raises for an option that there is not
@@ -74,7 +77,24 @@ def checks(text: str) -> None:
         given = [words[at + 1].partition("=")[0] for at, word in enumerate(words) if word == "--build-arg"]
         assert set(given) <= set(known)
     else:
-        assert program in ("git", "cd", "source") or words[:2] == ["pip", "install"], text
+        known = words[:2] in INSTALLS or words[:3] == SERVER
+        assert known or program in ("git", "cd", "source", "build/full_body"), text
+
+
+INSTALLS = (["pip", "install"], ["npm", "install"], ["cmake", "--build"])
+SERVER = ["python", "-m", "http.server"]
+
+
+def runs_example(words: list[str]) -> None:
+    """Refuse words of a script of docs/ that is not there, or does not take them; output may go to a file."""
+    words = words[: words.index(">")] if ">" in words else words
+    at = next(at for at, word in enumerate(words) if word.startswith("docs/"))
+    script = ROOT / words[at]
+    assert script.exists(), script
+    if parser := script.suffix == ".py" and runpy.run_path(str(script)).get("parser"):
+        made = parser()
+        made.exit_on_error = False
+        assert made.parse_known_args([word for word in words[at + 1 :] if word != "--"])[1] == []
 
 
 @pytest.mark.slow
@@ -93,6 +113,8 @@ def test_what_is_wrong_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         "memmlp sweep 14 memory.shift=day", "memmlp sweep 99", "memmlp export RUN --opset 9",
         "memmlp runs lost", "memmlp table 14 --format doc", "memmlp tune search.n_trial=3", "memmlp live RUN --udp many",
         "memmlp sweep 14 executor=slurm slurm.nodes=3", "make everything", "docker build --build-arg GPU=1 .",
+        "python docs/examples/none.py", "python docs/examples/trackers.py a.npz --out b --space mars",
+        "python docs/examples/vmc/receive.py --prt 1", "node docs/examples/none.mjs",
     ):  # fmt: skip
         with pytest.raises(Exception, match=r"\S"):
             checks(wrong)

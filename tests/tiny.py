@@ -17,6 +17,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP
 from memmlp.networks.baselines.avatar_jlm import AvatarJLM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
+from memmlp.networks.baselines.bodiffusion import BoDiffusion
 from memmlp.networks.baselines.ego_poser import EgoPoser
 from memmlp.networks.baselines.hmd_poser import HMDPoser
 from memmlp.networks.baselines.manikin import ManikinL, ManikinS
@@ -29,7 +30,7 @@ from memmlp.networks.recurrent_poser import RecurrentPoser
 from memmlp.networks.refiner import Refined
 from memmlp.networks.vqvae import VQVAE
 from memmlp.networks.window_model import WindowModel
-from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, TermsLoss
+from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, OwnLoss, TermsLoss
 
 SIZES = {"hidden": 16, "frames": 7}
 DEPTH = 4
@@ -106,6 +107,10 @@ BASELINES: dict[str, Callable[..., WindowModel]] = {
     "agrol_diffusion": partial(
         AGRoLDiffusion, frames=7, width=16, depth=2, diffusion_steps=50, sampling_steps=3, noise_seed=0
     ),
+    "bodiffusion": partial(
+        BoDiffusion, frames=7, width=48, depth=2, heads=3, diffusion_steps=50, sampling_steps=3, noise_seed=0,
+        noise=1.0, bound=1.0, offline=False,
+    ),
     "avatar_poser": partial(AvatarPoser, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
     "ego_poser": partial(EgoPoser, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
     "hmd_poser": partial(
@@ -131,6 +136,7 @@ WINDOWLESS = ["hmd_poser", "vae_hmd", "rpm"]
 BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
     "agrol_mlp": AGRoLLoss,
     "agrol_diffusion": AGRoLLoss,
+    "bodiffusion": OwnLoss,
     "avatar_poser": AvatarPoserLoss,
     "ego_poser": partial(TermsLoss, orientation=0.02, rotation=1.0, position=1.0),
     "hmd_poser": partial(

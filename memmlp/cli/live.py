@@ -3,20 +3,34 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
+from ipaddress import IPv4Network
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from memmlp.cli.options import Finite, outputs_option, page_options, plugins_option
+from memmlp.cli.options import (
+    PORT,
+    Finite,
+    Program,
+    Sender,
+    host_option,
+    outputs_option,
+    page_options,
+    plugins_option,
+    token_option,
+)
 
 if TYPE_CHECKING:
-    import numpy as np
-
+    from memmlp.live.calibration import Calibration
+    from memmlp.live.outputs.output import Output, Outputs
+    from memmlp.live.player.server import File
     from memmlp.live.player.sources import ClipSource, PoseSource, TrackedClip
     from memmlp.live.spaces import SpaceName
+    from memmlp.live.stream import Stream
 
-PORT = click.IntRange(1, 65535)
+OWN = "own"  # the avatar that is the project's own
 
 
 @click.command("live")
@@ -29,13 +43,20 @@ PORT = click.IntRange(1, 65535)
     "--udp",
     type=PORT,
     metavar="PORT",
-    help="Take tracker poses as JSON packets at this UDP port of 127.0.0.1, in place of a clip.",
+    help="Take tracker poses as JSON packets at this UDP port, in place of a clip.",
 )
 @click.option(
     "--osc",
     type=PORT,
     metavar="PORT",
-    help="Take tracker poses as OSC bundles at this UDP port of 127.0.0.1, in place of a clip.",
+    help="Take tracker poses as OSC bundles at this UDP port, in place of a clip.",
+)
+@click.option(
+    "--from",
+    "senders",
+    type=Sender(),
+    multiple=True,
+    help="Take packets of this other machine, too. May be given several times.  [default: this machine's]",
 )
 @click.option(
     "--space", default="amass", show_default=True, type=click.Choice(["amass", "openxr", "unity"]),
@@ -48,45 +69,79 @@ PORT = click.IntRange(1, 65535)
     type=Finite(10, 1000),
     help="How many samples of a clip are played a second, Hz.",
 )
+@click.option(
+    "--height",
+    type=Finite(50, 250),
+    metavar="CM",
+    help="Body height of who wears the trackers, cm.  [default: that of the network's body]",
+)
+@click.option(
+    "--floor", type=Finite(-10_000, 10_000), metavar="CM", help="Height of the floor, cm.  [default: 0]"
+)
+@click.option(
+    "--calibration",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Begin with what this JSON file knows of the wearer, and save to it what the page changes.",
+)
+@click.option(
+    "--vmc",
+    type=Program(),
+    multiple=True,
+    help="Send the body's bones there by the VMC protocol; port 39539 by default. Several are allowed.",
+)
+@click.option(
+    "--vrchat",
+    type=Program(),
+    multiple=True,
+    help="Send trackers to VRChat there; port 9000 by default. Several are allowed.",
+)
+@click.option(
+    "--record",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    multiple=True,
+    help="Record to a new file, .npz, .bvh or .glb, which is written at the end. Several are allowed.",
+)
+@click.option(
+    "--avatar",
+    is_flag=False,
+    flag_value=OWN,
+    metavar="[FILE.vrm]",
+    help="Show a VRM avatar on the page: this one, or one of this project's own.",
+)
+@click.option(
+    "--save-avatar",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.vrm",
+    help="Write this project's own avatar with the network's body, and end.",
+)
 @page_options(port=8765)
+@host_option
+@token_option
 @click.option(
     "--send", is_flag=True, help="Send the clip once, to the port of --udp or --osc, and show no page."
 )
 @plugins_option
 @outputs_option
-def live(
-    network: str,
-    clip: str | None,
-    udp: int | None,
-    osc: int | None,
-    space: SpaceName,
-    hz: float,
-    port: int,
-    no_browser: bool,
-    send: bool,
-    outputs: Path,
-) -> None:
+def live(network: str, send: bool, save_avatar: Path | None, **options: Any) -> None:
     """Show a finished run (id, its beginning, or folder) or an ONNX file live, on a page of this machine.
 
-    It is fed a clip in real time, over and over, or tracker poses that arrive as packets.
-    Their format is in docs/guides/live.md. Ctrl-C ends it.
+    It is fed a clip in real time, over and over, or tracker poses that arrive as packets. The body goes to
+    the page, and to other programs and files where they are asked for (docs/guides/live.md). Ctrl-C ends it.
     """
-    from memmlp.common.errors import InputError
-    from memmlp.live.player.packets import needs_osc
+    from memmlp.common.ending import termination_interrupts
 
-    ports = [number for number in (udp, osc) if number is not None]
-    if len(ports) > 1 or (ports and clip is not None and not send):
-        raise InputError("--clip, --udp, --osc: more than one source; allowed is one of them")
-    if send and not ports:
-        raise InputError("--send: has no port; allowed is --udp PORT or --osc PORT")
-    if osc is not None:
-        needs_osc()
-    feed = Feed(network, clip, udp, osc, space, hz, outputs)
-    with contextlib.suppress(KeyboardInterrupt):
-        if send:
+    feed = Feed(network=network, **{key: options.pop(key) for key in FED})
+    room = Room(**options)
+    check_options(feed, room, send)
+    with contextlib.suppress(KeyboardInterrupt), termination_interrupts():
+        if save_avatar is not None:
+            avatar_saved(feed, save_avatar)
+        elif send:
             sent(feed)
         else:
-            watched(feed, port, no_browser)
+            watched(feed, room)
 
 
 class Feed(NamedTuple):
@@ -96,9 +151,60 @@ class Feed(NamedTuple):
     clip: str | None
     udp: int | None
     osc: int | None
+    senders: tuple[IPv4Network, ...]
     space: SpaceName
     hz: float
     outputs: Path
+
+
+FED = Feed._fields[1:]
+
+
+class Room(NamedTuple):
+    """What the command's options say of the wearer, and of where the body goes."""
+
+    height: float | None
+    floor: float | None
+    calibration: Path | None
+    vmc: tuple[tuple[str, int | None], ...]
+    vrchat: tuple[tuple[str, int | None], ...]
+    record: tuple[Path, ...]
+    avatar: str | None
+    port: int
+    host: str
+    token: str | None
+    no_browser: bool
+
+
+def check_options(feed: Feed, room: Room, send: bool) -> None:
+    """Raise InputError for options that contradict each other, or need what is not installed."""
+    from memmlp.common.access import check_token
+    from memmlp.common.errors import InputError
+    from memmlp.live.player.packets import needs_osc
+
+    ports = [number for number in (feed.udp, feed.osc) if number is not None]
+    if len(ports) > 1 or (ports and feed.clip is not None and not send):
+        raise InputError("--clip, --udp, --osc: more than one source; allowed is one of them")
+    if send and not ports:
+        raise InputError("--send: has no port; allowed is --udp PORT or --osc PORT")
+    worn = {
+        "--height": room.height is not None, "--floor": room.floor is not None,
+        "--calibration": room.calibration is not None, "--from": bool(feed.senders),
+    }  # fmt: skip
+    if (alone := [name for name, given in worn.items() if given]) and (send or not ports):
+        raise InputError(
+            f"{alone[0]}: goes with --udp PORT or --osc PORT, whose packets somebody's devices send"
+        )
+    if send and (room.vmc or room.vrchat or room.record or room.avatar):
+        raise InputError(
+            "--send: sends a clip's trackers alone; allowed with it is no --vmc, --vrchat or --record"
+        )
+    if feed.osc is not None:
+        needs_osc()
+    for option, programs in (("--vmc", room.vmc), ("--vrchat", room.vrchat)):
+        if programs:
+            needs_osc(option, "the page, and --record")
+    check_token(room.host, room.token)
 
 
 def source_of(feed: Feed) -> PoseSource:
@@ -107,9 +213,9 @@ def source_of(feed: Feed) -> PoseSource:
     from memmlp.live.player.sources import PacketSource
 
     if feed.udp is not None:
-        return PacketSource("UDP", feed.udp, from_json, feed.space)
+        return PacketSource("UDP", feed.udp, from_json, feed.space, feed.senders, noted)
     if feed.osc is not None:
-        return PacketSource("OSC", feed.osc, from_osc, feed.space)
+        return PacketSource("OSC", feed.osc, from_osc, feed.space, feed.senders, noted)
     return clip_source(feed)
 
 
@@ -127,7 +233,7 @@ def clip_of(feed: Feed) -> TrackedClip:
         InputError: for a test clip where the network is an ONNX file, which has none, or an unknown name.
     """
     from memmlp.common.errors import InputError
-    from memmlp.live.player.sources import TrackedClip
+    from memmlp.live.player.sources import TrackedClip, npz_frames
 
     if feed.clip is not None and feed.clip.endswith(".npz"):
         return TrackedClip(Path(feed.clip).stem, npz_frames(Path(feed.clip)))
@@ -140,30 +246,6 @@ def clip_of(feed: Feed) -> TrackedClip:
     test = open_run(feed.outputs, feed.network).test
     index = 0 if feed.clip is None else clip_index(test, feed.clip)
     return TrackedClip(test.names[index], test.clip(index).numpy())
-
-
-def npz_frames(path: Path) -> np.ndarray:
-    """Return the frames (N, 252) of an AMASS npz, resampled to 60 Hz, on the built-in body.
-
-    Raises:
-        InputError: for a clip of fewer than 3 frames at 60 Hz.
-    """
-    import torch
-
-    from memmlp.common.errors import InputError
-    from memmlp.motion.body import builtin_rest_joints
-    from memmlp.motion.clip import resample
-    from memmlp.motion.features import motion_frames
-    from memmlp.motion.formats.npz import read_clip
-    from memmlp.motion.plausible import check_plausible
-
-    recorded = read_clip(path, path.stem)
-    check_plausible(path, recorded)
-    clip, _ = resample(recorded)
-    if len(clip) < 3:
-        raise InputError(f"{path}: {len(clip)} frames at 60 Hz; allowed are 3 or more")
-    tensors = (torch.tensor(part) for part in (clip.poses, clip.trans, builtin_rest_joints()))
-    return motion_frames(*tensors).numpy()
 
 
 def sent(feed: Feed) -> None:
@@ -179,26 +261,117 @@ def sent(feed: Feed) -> None:
     click.echo(f"{send(source, port, pack, space_of(feed.space))} packets sent")
 
 
-def watched(feed: Feed, port: int, no_browser: bool) -> None:
-    """Play the source through the network and serve the page until Ctrl-C."""
+def watched(feed: Feed, room: Room) -> None:
+    """Play the source through the network to the outputs, and serve the page, until Ctrl-C."""
     import threading
     import webbrowser
 
-    from memmlp.live.player.play import greeting, play
+    from memmlp.common.ending import closed_in_peace
+    from memmlp.live.player.fitting import Fitting
+    from memmlp.live.player.play import greeting, play, with_avatar
     from memmlp.live.player.server import Hub, Server
-    from memmlp.live.stream import Stream
-    from memmlp.runs.lookup import find_run
 
     with contextlib.closing(source_of(feed)) as source:
-        if feed.network.endswith(".onnx"):
-            file, name = Path(feed.network), Path(feed.network).name
-        else:
-            run = find_run(feed.outputs, feed.network)
-            file, name = run.preferred_onnx, f"run {run.id[:8]}"
-        stream = Stream(file, space=source.space)
-        hub = Hub(greeting(source, name))
-        with Server(hub, port) as server:
+        stream, name = opened(feed, source.space, room)
+        files = page_files(room.avatar, stream)
+        outputs = outputs_of(room, stream)
+        words = greeting(source, name, outputs)
+        hub = Hub(with_avatar(words, stream.rest) if room.avatar else words)
+        fitting = Fitting(stream, source.space, room.calibration, hub.tell) if source.worn else None
+        ask = fitting.ask if fitting else None
+        with closed_in_peace(outputs), Server(hub, room.port, room.host, room.token, files, ask) as server:
             click.echo(f"{server.url}  {source.name}; Ctrl-C ends")
-            if not no_browser:
+            for output in outputs.outputs:
+                click.echo(f"  to {output.name}")
+            if not room.no_browser:
                 webbrowser.open(server.url)
-            play(stream, source, hub.publish, threading.Event())
+            stopped = threading.Event()
+            play(stream, source, hub.publish, stopped, outputs, fitting, room.avatar is not None)
+
+
+def opened(feed: Feed, space: SpaceName, room: Room) -> tuple[Stream, str]:
+    """Return the stream of the network, fitted to its wearer, and the network's name."""
+    from memmlp.live.stream import Stream
+
+    file, name = network_file(feed)
+    stream = Stream(file, space=space)
+    known = known_of(room, space, stream)
+    stream.offsets = known.offsets
+    stream.fit(known.height, known.floor)
+    return stream, name
+
+
+def network_file(feed: Feed) -> tuple[Path, str]:
+    """Return the ONNX file of the network, and its name."""
+    from memmlp.runs.lookup import find_run
+
+    if feed.network.endswith(".onnx"):
+        return Path(feed.network), Path(feed.network).name
+    run = find_run(feed.outputs, feed.network)
+    return run.preferred_onnx, f"run {run.id[:8]}"
+
+
+def known_of(room: Room, space: SpaceName, stream: Stream) -> Calibration:
+    """Return what is known of the wearer: by the file of --calibration, and by the options before it."""
+    from memmlp.live.calibration import Calibration, read_calibration
+    from memmlp.live.wearer import stature
+
+    body = stature(stream.network.skeleton)
+    known = Calibration(space, body)
+    if room.calibration is not None and room.calibration.exists():
+        known = read_calibration(room.calibration, space, body)
+    height = known.height if room.height is None else room.height / 100
+    floor = known.floor if room.floor is None else room.floor / 100
+    if known.offsets is not None and abs((height or body) - (known.height or body)) > 0.005:
+        was = 100 * (known.height or body)
+        noted(f"{room.calibration}: its calibration is of a height of {was:.0f} cm; calibrate again")
+    return Calibration(space, body, known.offsets, height, floor)
+
+
+def outputs_of(room: Room, stream: Stream) -> Outputs:
+    """Return the outputs that the options name."""
+    from memmlp.live.outputs import vmc, vrchat
+    from memmlp.live.outputs.osc import Receiver
+    from memmlp.live.outputs.output import Outputs
+    from memmlp.live.outputs.recording import Recording
+
+    found: list[Output] = [vmc.VMC(Receiver(host, port or vmc.PORT, "--vmc")) for host, port in room.vmc]
+    found += [vrchat.VRChat(Receiver(host, port or vrchat.PORT, "--vrchat")) for host, port in room.vrchat]
+    if room.record:
+        network = stream.network
+        found.append(Recording(room.record, network.skeleton.rest, network.fps, noted))
+    return Outputs(found, noted)
+
+
+def page_files(avatar: str | None, stream: Stream) -> Mapping[str, File]:
+    """Return the files of the page, with those of an avatar where one is asked for."""
+    from memmlp.live.player.server import FILES
+
+    if avatar is None:
+        return FILES
+    from memmlp.live.player.avatar import avatar_files, mannequin_vrm, read_vrm
+
+    return avatar_files(mannequin_vrm(stream.rest) if avatar == OWN else read_vrm(Path(avatar)))
+
+
+def avatar_saved(feed: Feed, path: Path) -> None:
+    """Write this project's own avatar with the network's body."""
+    from memmlp.common.errors import InputError
+    from memmlp.live.exported import ExportedNetwork
+    from memmlp.motion.formats.vrm import write_vrm
+
+    if path.suffix.lower() != ".vrm":
+        raise InputError(f"--save-avatar {path}: no such kind of file; allowed: .vrm")
+    if path.exists():
+        raise InputError(f"--save-avatar {path}: is there already; allowed is a new file")
+    file, _ = network_file(feed)
+    try:
+        write_vrm(path, ExportedNetwork(file).skeleton.rest)
+    except OSError as error:
+        raise InputError(f"--save-avatar {path}: cannot be written ({error.strerror})") from error
+    click.echo(f"{path}: an avatar of VRM 1.0, which anybody may use (CC0)")
+
+
+def noted(line: str) -> None:
+    """Tell a line that is no result."""
+    click.echo(line, err=True)

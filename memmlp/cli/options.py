@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from ipaddress import IPv4Network
 from pathlib import Path
 from typing import Any
 
 import click
 
 Command = Callable[..., Any]
+PORT = click.IntRange(1, 65535)
 PATH = click.Path(path_type=Path)
 
 
@@ -46,6 +48,37 @@ device_option = click.option(
     help="Device to compute on; auto takes a GPU of CUDA where there is one.",
 )
 
+
+class Program(click.ParamType):
+    """Where another program takes datagrams: HOST, or HOST:PORT."""
+
+    name = "HOST[:PORT]"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return host and port; None for a port that was not given."""
+        if isinstance(value, tuple):
+            return value
+        host, colon, port = value.rpartition(":")
+        if (
+            not colon or value.endswith("]") or ("]" not in value and ":" in host)
+        ):  # a name, or an IPv6 address
+            return value.strip("[]"), None
+        return host.strip("[]"), PORT.convert(port, param, ctx)
+
+
+class Sender(click.ParamType):
+    """An IPv4 address, or a network of them, as 192.168.1.0/24."""
+
+    name = "ADDRESS"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the network."""
+        try:
+            return IPv4Network(value, strict=False)
+        except ValueError as error:
+            self.fail(f"{value}: {error}; allowed is an IPv4 address, or a network as 192.168.1.0/24")
+
+
 outputs_option = click.option(
     "--outputs",
     type=PATH,
@@ -69,6 +102,17 @@ def page_options(port: int) -> Callable[[Command], Command]:
         click.option("--no-browser", is_flag=True, help="Print the page's address, and open no browser."),
     )
     return lambda command: options[0](options[1](command))
+
+
+host_option = click.option(
+    "--host",
+    default="127.0.0.1",
+    show_default=True,
+    help="Address to serve at. At another one than this machine's own, every request needs the token.",
+)
+token_option = click.option(
+    "--token", help="The token at another address.  [default: a new one, which is printed]"
+)
 
 
 def _use(ctx: click.Context, param: click.Parameter, value: str | None) -> None:

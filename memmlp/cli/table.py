@@ -58,6 +58,13 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
     help="Source whose test clips are shown, where the data has several.  [default: all together]",
 )
 @click.option(
+    "--add",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Show also what a browser measured: a file of the bench of memmlp web. For Table 17; repeatable.",
+)
+@click.option(
     "--plan", is_flag=True, help="Show how many seeds it would take to see the paper's effects on this data."
 )
 @config_dir_option
@@ -71,6 +78,7 @@ def table(
     mode: str,
     branch: str | None,
     source: str | None,
+    add: tuple[Path, ...],
     plan: bool,
     outputs: Path,
 ) -> None:
@@ -78,16 +86,18 @@ def table(
 
     OVERRIDES are those that the sweep was run with; they find its runs again.
     """
+    from memmlp.tables import browser_rows
     from memmlp.tables.measured_run import load
 
-    if plan and (form or out):
-        raise InputError("--plan: goes to the screen alone, without --format and --out")
+    if plan and (form or out or add):
+        raise InputError("--plan: goes to the screen alone, without --format, --out and --add")
+    measured = [browser_rows.read(path) for path in add]
     with _uncollected():
         found = gathered([name], overrides, outputs, SHOWN_MODES[mode], functools.cache(load), branch, source)
     if plan:
         plans_on_screen(found, SHOWN_MODES[mode])
         return
-    tables = [one.table for one in found]
+    tables = [functools.reduce(browser_rows.with_rows, measured, one.table) for one in found]
     if form is None and out is None:
         on_screen(tables)
         return

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from memmlp.cli.options import outputs_option, page_options, plugins_option
+from memmlp.cli.options import host_option, outputs_option, page_options, plugins_option, token_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,13 +20,8 @@ if TYPE_CHECKING:
 
 @click.command("ui")
 @page_options(port=8787)
-@click.option(
-    "--host",
-    default="127.0.0.1",
-    show_default=True,
-    help="Address to serve at. At another one than this machine's own, every request needs the token.",
-)
-@click.option("--token", help="The token at another address.  [default: a new one, which is printed]")
+@host_option
+@token_option
 @plugins_option
 @outputs_option
 def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path) -> None:
@@ -36,14 +31,11 @@ def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path)
     """
     import webbrowser
 
-    from memmlp.common.errors import InputError
+    from memmlp.common.access import check_token
     from memmlp.ui.answers import Answers
-    from memmlp.ui.server import Server, loopback
+    from memmlp.ui.server import Server
 
-    if token is not None and loopback(host):
-        raise InputError("--token: goes with --host; this machine's own address needs none")
-    if token is not None and len(token) < 16:
-        raise InputError(f"--token: {len(token)} characters; allowed are 16 or more")
+    check_token(host, token)
     with (
         Server(Answers(outputs, predict), port, host, token) as server,
         contextlib.suppress(KeyboardInterrupt),

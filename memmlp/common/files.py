@@ -10,10 +10,10 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from memmlp.common.fences import publish, temporary
 
@@ -39,7 +39,16 @@ def plain(value: Any) -> Any:
 
 
 def atomic_write(path: Path, content: bytes | str) -> None:
-    """Write a file whole or not at all, even if the machine stops: temporary file, fsync, rename.
+    """Write a file whole or not at all, as `atomic_file` does."""
+    with atomic_file(path) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
+@contextlib.contextmanager
+def atomic_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a file to write that is there whole or not at all, even if the machine stops.
+
+    It is a temporary file, which is synced and renamed at the end.
 
     Raises:
         LeaseLost: if this process held the file's folder and has lost it (memmlp.common.fences).
@@ -47,7 +56,7 @@ def atomic_write(path: Path, content: bytes | str) -> None:
     unfinished = temporary(path)
     try:
         with open(unfinished, "wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
+            yield file
             file.flush()
             os.fsync(file.fileno())
         publish(unfinished, path)

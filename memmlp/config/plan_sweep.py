@@ -1,7 +1,7 @@
 """Make the plan of a sweep file: every arm is composed, checked and given its run's identity.
 
-Composing takes a moment for each arm. So a plan is kept, and used again as long as the sweep, the configs,
-the code and the data are unchanged.
+Composing takes a moment for each arm. So the plan of a sweep that was started is kept, and used again as long
+as the sweep, the configs, the code and the data are unchanged.
 """
 
 from __future__ import annotations
@@ -68,6 +68,8 @@ def sweep_folder(sweep: Sweep, outputs: Path) -> Path:
 def planned(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
     """Return the plan of a sweep, the kept one where it still holds.
 
+    A look at a sweep that was never started leaves nothing in the outputs.
+
     Args:
         sweep: the sweep with the command line's overrides.
         outputs: the folder of runs and caches.
@@ -78,6 +80,8 @@ def planned(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
         InputError: naming arm and key, where a config is wrong.
     """
     path = sweep_folder(sweep, outputs) / "planned.json"
+    if not prepare and not path.parent.is_dir():
+        return _plan(sweep, outputs, prepare)[0]
     stamp = _stamp(sweep, outputs)
     keep(sweep, path.parent)
     kept = read_json(path)

@@ -23,6 +23,8 @@ from memmlp.runs.identity import SLOTS, chosen, flatten, trained_by
 KINDS = {"vqvae": "VQ-VAE"}
 MOST = 6  # words
 BETWEEN = " · "
+OF_MODELS = ("ema",)
+"""Keys of a profile that a model sets; another value is seen where it is read."""
 
 
 def readable_name(kind: str, config: Mapping[str, Any]) -> str:
@@ -37,7 +39,7 @@ def readable_name(kind: str, config: Mapping[str, Any]) -> str:
     """
     words = [KINDS[kind]] if kind in KINDS else []
     try:
-        words += [*_profile(config.get("profile") or {}), *_differences(config)]
+        words += [*_profile(_sizes(config)), *_differences(config)]
     except (HydraException, OmegaConfBaseException):  # a name is no reason to stop a run
         words.append("own config")
     if len(words) > MOST:
@@ -48,7 +50,7 @@ def readable_name(kind: str, config: Mapping[str, Any]) -> str:
 
 def _differences(config: Mapping[str, Any]) -> Iterator[str]:
     """Yield the words for slots and keys that are not as `memmlp train` has them without overrides."""
-    profile = tuple(f"profile.{k}={_word(v)}" for k, v in (config.get("profile") or {}).items())
+    profile = tuple(f"profile.{k}={_word(v)}" for k, v in _sizes(config).items())
     model = _option(config, "model")
     chosen = (f"model={model}",) if _shipped("model", model) else ()
     default = _default((*profile, *chosen))
@@ -68,7 +70,9 @@ def _differences(config: Mapping[str, Any]) -> Iterator[str]:
 def _keys(config: Mapping[str, Any], default: Mapping[str, Any], foreign: list[str]) -> Iterator[str]:
     """Yield words for the keys that have another value than by default; a component of one's own has none."""
     own, usual = flatten(config), {"data.weighting": "frames"} | flatten(default)
-    for key in trained_by(config):
+    for key in dict.fromkeys(
+        [*trained_by(config), *trained_by(default)]
+    ):  # either may count it where it is set
         slot, _, last = key.partition(".")
         if slot in foreign or last in ("name", "_target_", "_partial_") or key in ("seed", "vqvae.seed"):
             continue
@@ -108,6 +112,11 @@ def _default(overrides: tuple[str, ...]) -> dict[str, Any]:
         key: OmegaConf.to_container(group, resolve=True) if OmegaConf.is_config(group) else group
         for key, group in groups.items()
     }
+
+
+def _sizes(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a config's profile without what its model has set there."""
+    return {key: value for key, value in (config.get("profile") or {}).items() if key not in OF_MODELS}
 
 
 def _profile(config: Mapping[str, Any]) -> Iterator[str]:

@@ -130,7 +130,16 @@ def macs(model: WindowModel | StreamingGraph) -> int:
 
 
 def yardstick_session() -> onnxruntime.InferenceSession:
-    """Make the yardstick for comparing machines: a fixed stack of matrix products and ReLUs."""
+    """Open the yardstick for comparing machines, on one thread."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    return onnxruntime.InferenceSession(
+        yardstick().SerializeToString(), options, providers=["CPUExecutionProvider"]
+    )
+
+
+def yardstick() -> onnx.ModelProto:
+    """Make the yardstick: a fixed stack of matrix products and ReLUs."""
     rows, width, layers = YARDSTICK_SHAPE
     weight = np.random.default_rng(0).standard_normal((width, width), np.float32) / np.sqrt(width)
     nodes, name = [], "input"
@@ -146,12 +155,7 @@ def yardstick_session() -> onnxruntime.InferenceSession:
         [value(name, TensorProto.FLOAT, [rows, width])],
         [onnx.numpy_helper.from_array(weight.astype(np.float32), "weight")],
     )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    return onnxruntime.InferenceSession(
-        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
-    )
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
 
 
 def _milliseconds(prefix: str, seconds: list[float]) -> dict[str, float]:

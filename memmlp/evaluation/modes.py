@@ -4,7 +4,8 @@
 `window` is AGRoL's: non-overlapping windows whose T frames all count; the tail window is shifted back and its
 overlap dropped. A network that recalls the window which ended one frame before is led through each window
 frame by frame, so that it recalls what it was trained on: in one call it would get the window of T frames
-ago. Its result for a window is the last call's output. A network without a window is a stream in both.
+ago. Its result for a window is the last call's output. A network without a window is a stream in both. One
+that makes the windows of a clip together (`WindowModel.joint`) gets the whole clip, and is no stream.
 """
 
 from __future__ import annotations
@@ -42,11 +43,18 @@ class Evaluable(Protocol):
     def windowless(self) -> bool:
         """Whether the network has no window, so that both modes are the stream."""
 
+    @property
+    def joint(self) -> bool:
+        """Whether window mode makes all windows of a clip together, by `whole`."""
+
     def initial_state(self, batch: int = 1) -> State:
         """Return the state of a fresh start."""
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Map new inputs (B, n, 54) to motion (B, newest or T, 198) in the world, and the new state."""
+
+    def whole(self, sparse: Tensor) -> Tensor:
+        """Map the inputs of a clip (N, 54), N >= T, to its motion (N, 198) in the world."""
 
 
 def stream(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
@@ -58,6 +66,8 @@ def window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
     """Predict the world motion (N, 198) of clips (N, 252), by non-overlapping windows."""
     if network.windowless:
         return stream(network, clips)
+    if network.joint:
+        return clip_by_clip(network, clips)
     if 0 < network.shift < network.frames:
         return frame_by_frame(network, clips, network.frames)
     return window_by_window(network, clips)
@@ -103,6 +113,14 @@ def window_by_window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor
         for i, b, result in zip(order, begin, output, strict=True):
             motion[i][start : b + size] = result[start - b :]  # the tail window begins at b < start
     return [whole[-len(clip) :] for whole, clip in zip(motion, clips, strict=True)]
+
+
+@torch.no_grad()
+def clip_by_clip(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor]:
+    """Predict the motion (N, 198) of clips (N, 252), each as a whole."""
+    inputs = [_at_least(clip[:, :SPARSE_DIM], network.frames) for clip in clips]
+    motions = [network.whole(sparse) for sparse in progress_bar(inputs, "windows together", unit="clips")]
+    return [motion[-len(clip) :] for motion, clip in zip(motions, clips, strict=True)]
 
 
 MODE_FUNCTIONS: dict[str, Callable[[Evaluable, Sequence[Tensor]], list[Tensor]]] = {

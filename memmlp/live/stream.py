@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from memmlp.live.exported import ExportedNetwork
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
 from memmlp.live.spaces import SpaceName, space_of
 from memmlp.live.trackers import TRACKERS, Features, Lost, TrackerFrames, t_pose
+from memmlp.live.wearer import wearer
 from memmlp.runs.run import Run
 
 if TYPE_CHECKING:
@@ -95,8 +97,14 @@ class Stream:
         space: the frame of reference of what goes in and comes out: amass, openxr or unity.
         rotations: what rotations come out as: matrix or quaternion (xyzw).
         offsets: the offsets of the joints from the devices; None for none.
+        height: the wearer's body height, metres; None for that of the network's body.
+        floor: the height of the floor in the space, metres.
         ik: inverse kinematics towards the position branch (`memmlp.evaluation.ik.LBFGS()`), which needs
             torch; None for none.
+
+    Attributes:
+        wearer: height and floor (`memmlp.live.wearer`), as `fit` sets them.
+        network_seconds: how long the network itself took in the last `step`.
 
     Raises:
         InputError: for any other argument, in one line.
@@ -109,6 +117,8 @@ class Stream:
         space: SpaceName = "amass",
         rotations: RotationFormat = "matrix",
         offsets: Offsets | None = None,
+        height: float | None = None,
+        floor: float = 0.0,
         ik: LBFGS | None = None,
     ):
         self.space = space_of(space)
@@ -118,12 +128,28 @@ class Stream:
         if ik is not None and "position" not in self.network.branches:
             raise InputError(f"ik: {self.network.path} has no position branch to fit to; allowed is ik=None")
         self.offsets = None if offsets is None else checked_offsets(offsets)
+        self.wearer = wearer(self.network.skeleton, height, floor)
+        self.network_seconds = 0.0
         self.solve = None if ik is None else Solver(ik, self.network.skeleton.rest)
         self._output = OUTPUTS[rotations]
         self._trackers = TrackerFrames(self.network.skeleton, self.network.fps)
         self._features = Features()
         self._sparse = self.network.sparse[0]
         self._last: Pose | None = None
+
+    @property
+    def rest(self) -> np.ndarray:
+        """The wearer's joints in the rest pose (22, 3), metres, SMPL's body frame."""
+        return self.network.skeleton.rest / self.wearer.scale
+
+    def fit(self, height: float | None = None, floor: float = 0.0) -> None:
+        """Take another body height (metres; None for the network's) and floor (metres), and begin anew.
+
+        Raises:
+            InputError: for no height of a person, or no floor.
+        """
+        self.wearer = wearer(self.network.skeleton, height, floor)
+        self.reset()
 
     def reset(self) -> None:
         """Begin anew: the next sample is the first."""
@@ -151,9 +177,9 @@ class Stream:
         if self.offsets is not None:
             positions = positions + (rotations @ self.offsets.positions[:, :, None])[..., 0]
             rotations = rotations @ self.offsets.rotations
-        space = self.space
+        self.network_seconds = 0.0
         frames, restarted = self._trackers.take(
-            time, space.positions_in(positions), space.rotations_in(rotations), lost
+            time, self._positions_in(positions), self.space.rotations_in(rotations), lost
         )
         if not frames:
             return self._again(lost)
@@ -162,10 +188,12 @@ class Stream:
         for frame in frames:
             first = self._features.last is None
             self._features.write(frame, self._sparse)
+            began = perf_counter()
             if first:  # it has no velocity, so it is shown but kept out of the past, as in training
                 self.network.peek()
             else:
                 self.network.advance()
+            self.network_seconds += perf_counter() - began
         self._last = self._pose(frames[-1].time, frames[-1].positions[0], _names(lost), restarted)
         return self._last
 
@@ -173,9 +201,9 @@ class Stream:
         """Learn the offsets from a person who stands upright in T-pose, and use them from now on.
 
         The line from the right to the left tracker tells which way the person looks, and so every joint's
-        rotation is known. The joints' positions are those of the network's body in that pose, placed as near
-        to the devices as possible (least squares). So a person of other proportions moves a body with the
-        network's proportions.
+        rotation is known. The joints' positions are those of the network's body in that pose, at the wearer's
+        height, placed as near to the devices as possible (least squares). So a person of other proportions
+        moves a body with the network's proportions.
 
         Args:
             head, left, right: the devices' poses, as in `step`.
@@ -189,18 +217,26 @@ class Stream:
         positions, rotations, lost = read_trackers((head, left, right))
         if any(lost):
             raise InputError(f"calibrate: no pose of {', '.join(_names(lost))}; all three are needed")
-        world = self.space.positions_in(positions)
+        world = self._positions_in(positions)
         across = world[1] - world[2]
         if np.hypot(*across[:2]) < 0.1:
             raise InputError("calibrate: the hands are not apart; allowed is a T-pose, the arms to the sides")
         pose = t_pose(self.network.skeleton, world[0], float(np.arctan2(across[1], across[0])))
         joints = pose.positions + (world - pose.positions).mean(0)
         inverse = rotations.swapaxes(1, 2)
-        away = self.space.positions_out(joints) - positions
+        away = self._positions_out(joints) - positions
         turned = inverse @ self.space.rotations_out(pose.rotations)
         self.offsets = Offsets((inverse @ away[:, :, None])[..., 0], turned)
         self.reset()
         return self.offsets
+
+    def _positions_in(self, positions: np.ndarray) -> np.ndarray:
+        """Bring the wearer's positions (..., 3) from the caller's space to the network's world."""
+        return self.wearer.positions_in(self.space.positions_in(positions))
+
+    def _positions_out(self, positions: np.ndarray) -> np.ndarray:
+        """Bring positions (..., 3) from the network's world to the wearer's, in the caller's space."""
+        return self.space.positions_out(self.wearer.positions_out(positions))
 
     def _restart(self) -> None:
         self.network.reset()
@@ -219,8 +255,8 @@ class Stream:
         if self.solve is not None:
             sixd = self.solve(sixd, network.position, self._sparse)
         local = sixd_to_matrix(sixd)
-        positions = space.positions_out(network.skeleton.positions(local) + head)
-        branch = space.positions_out(network.position)
+        positions = self._positions_out(network.skeleton.positions(local) + head)
+        branch = self._positions_out(network.position)
         return Pose(time, positions, self._output(space.pose_out(local)), branch, held, True, restarted)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from memmlp.common.errors import InputError
 from memmlp.motion.body import FPS, N_JOINTS
 
 FRAME_RATE_RANGE = (1.0, 1000.0)
+PART = 3600  # frames of a long clip that are worked on at a time
 RATE_TOLERANCE = 1e-4  # relative: 59.94 is not 60, and 120.0005 (a BVH's frame time of .0083333) is 120
 
 
@@ -45,6 +47,12 @@ class Clip:
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    def parts(self, frames: int = PART) -> Iterator[Clip]:
+        """Yield the clip in parts of at most so many frames, one after the other."""
+        for start in range(0, len(self), frames):
+            part = slice(start, start + frames)
+            yield replace(self, poses=self.poses[part], trans=self.trans[part])
 
 
 def resample(clip: Clip, fps: float = FPS) -> tuple[Clip, str]:

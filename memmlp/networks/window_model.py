@@ -53,6 +53,11 @@ class WindowModel(nn.Module):
         return True
 
     @property
+    def joint(self) -> bool:
+        """Whether window mode makes all windows of a clip together, by `whole`, and they may overlap."""
+        return False
+
+    @property
     def length(self) -> int:
         """How many past frames of inputs the buffer holds; the last one directly precedes the new ones."""
         return self.frames - 1
@@ -102,6 +107,10 @@ class WindowModel(nn.Module):
             Motion (B, newest, 198) in the world, of the frames that end with the newest one, and the new
             state.
         """
+        raise NotImplementedError
+
+    def whole(self, sparse: Tensor) -> Tensor:
+        """Map the world inputs (N, 54) of a clip, N >= T, to its world motion (N, 198); see `joint`."""
         raise NotImplementedError
 
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import json
-import secrets
 import threading
 import time
 import urllib.parse
 from collections.abc import Callable, Mapping
-from http.cookies import CookieError, SimpleCookie
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from ipaddress import ip_address
 from typing import Any
 
+from memmlp.common.access import LOCAL, Access
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain
 from memmlp.runs.identity import ID
@@ -25,8 +23,6 @@ from memmlp.ui import pages
 from memmlp.ui.answers import Answers
 
 QUIET = 15.0  # seconds without news after which a comment shows that the connection lives
-LOCAL = ("127.0.0.1", "localhost")
-COOKIE = "memmlp_token"
 
 
 class Watch:
@@ -76,45 +72,17 @@ class Handler(BaseHTTPRequestHandler):
         with contextlib.suppress(ConnectionError, TimeoutError):  # raised when the page was closed
             url = urllib.parse.urlsplit(self.path)
             query = dict(urllib.parse.parse_qsl(url.query))
-            if not self._allowed(query):
+            access, port = self.server.access, self.server.server_port
+            if not access.allows(self.path, self.headers, port):
                 self._send(
                     403,
                     "text/plain; charset=utf-8",
                     b"not allowed; open the address that memmlp ui printed\n",
                 )
             elif "token" in query:
-                self._settle(query["token"])
+                self._send(303, "text/plain", b"", access.settled(query["token"], port))
             else:
                 self._route(urllib.parse.unquote(url.path).lstrip("/"), query)
-
-    def _allowed(self, query: Mapping[str, str]) -> bool:
-        """Return whether a request may be answered: by its host, where it comes from, and its token."""
-        if self.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
-            return self.headers.get("Sec-Fetch-Mode") == "navigate" and self.path.partition("?")[0] == "/"
-        if self.server.token is None:  # another name that leads here is DNS rebinding
-            return self._host() in (
-                *LOCAL,
-                self.server.server_name,
-            )
-        return secrets.compare_digest(
-            (query.get("token") or self._cookie()).encode(), self.server.token.encode()
-        )
-
-    def _host(self) -> str:
-        return self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
-
-    def _cookie(self) -> str:
-        try:
-            found = SimpleCookie(self.headers.get("Cookie", "")).get(f"{COOKIE}_{self.server.server_port}")
-        except CookieError:
-            return ""
-        return urllib.parse.unquote(found.value) if found else ""
-
-    def _settle(self, token: str) -> None:
-        """Put the token of the address into a cookie, so that it stands in no history."""
-        named = f"{COOKIE}_{self.server.server_port}={urllib.parse.quote(token)}"
-        cookie = f"{named}; HttpOnly; SameSite=Strict; Path=/"
-        self._send(303, "text/plain", b"", {"Location": "/", "Set-Cookie": cookie})
 
     def _route(self, name: str, query: Mapping[str, str]) -> None:
         if name in ("", *pages.FILES):
@@ -226,7 +194,7 @@ class Server(ThreadingHTTPServer):
         self, answers: Answers, port: int, host: str = LOCAL[0], token: str | None = None, every: float = 1.0
     ):
         self.answers, self.policy = answers, pages.policy()
-        self.token = None if loopback(host) else token or secrets.token_urlsafe(24)
+        self.access = Access(host, token)
         self.watch = Watch(answers.look, every)
         try:
             super().__init__((host, port), Handler)
@@ -244,8 +212,7 @@ class Server(ThreadingHTTPServer):
     @property
     def url(self) -> str:
         """The page's address, with the token where one is needed."""
-        ending = f"?token={urllib.parse.quote(self.token)}" if self.token else ""
-        return f"http://{self.server_name}:{self.server_port}/{ending}"
+        return self.access.url(self.server_name, self.server_port)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore the error, for what one page breaks off does not concern the others."""
@@ -266,11 +233,3 @@ class Server(ThreadingHTTPServer):
             thread.join()
         self.server_close()
         self.answers.close()
-
-
-def loopback(host: str) -> bool:
-    """Return whether an address is 127.0.0.1 or localhost, at which nobody else can reach this machine."""
-    try:
-        return host == "localhost" or (ip_address(host).is_loopback and ip_address(host).version == 4)
-    except ValueError:
-        return False

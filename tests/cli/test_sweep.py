@@ -185,6 +185,14 @@ def test_a_plan_is_kept_until_the_data_changes(home: Path, monkeypatch: pytest.M
     assert orphans(chosen, planned(chosen, outputs)) == []
 
 
+def test_a_look_at_a_sweep_that_was_never_started_leaves_nothing(home: Path):
+    folders = sorted((home / "outputs" / "sweeps").iterdir())
+    assert "waiting" in command(home, "seed=7", "--status")
+    command(home, "seed=7", "--dry-run")
+    assert "0/1" in run(home, "table", "trial.yaml", *TINY, "seed=7")
+    assert sorted((home / "outputs" / "sweeps").iterdir()) == folders
+
+
 @pytest.mark.slow
 def test_an_interrupted_sweep_ends_its_workers_and_goes_on_later(tmp_path: Path):
     write(tmp_path, {"none": ["memory=none"]})

@@ -7,13 +7,14 @@ from pathlib import Path
 
 import pytest
 from conftest import Memmlp, one_line
+from hydra import compose, version
 from omegaconf import DictConfig, OmegaConf
 from processes import finished
 
 from memmlp.common.errors import InputError
 from memmlp.config import schema
 from memmlp.config.build import build_experiment
-from memmlp.config.compose import composed
+from memmlp.config.compose import VERSION_BASE, _hydra, composed, parse, preflight
 from memmlp.config.packaged import packaged
 from memmlp.runs.identity import NEUTRAL, flatten
 
@@ -36,6 +37,7 @@ def needed(tmp_path: Path) -> dict[str, list[str]]:
         "predictor=rotation_only": ["hand=fk"],
         "loss=agrol": ["model=agrol_mlp"],
         "loss=avatar_poser": ["model=avatar_poser"],
+        "loss=own": ["model=bodiffusion"],
         **{f"loss={name}": ["model=agrol_mlp"] for name in OF_TERMS},
         "predictor=rotation_only_memory": ["hand=fk"],
     }
@@ -296,3 +298,25 @@ def test_a_bad_file_of_the_users_own(memmlp: Memmlp, tmp_path: Path, value: str,
 def test_a_config_without_the_schema_is_refused(memmlp: Memmlp, tmp_path: Path):
     (tmp_path / "bare.yaml").write_text("seed: 1\n")
     assert one_line(memmlp("train", "--config-dir", ".", "--config-name", "bare"), "/schema/config@_here_")
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["model.width=8", "seed=3"],
+        ["profile=tiny", "memory=gru", "experiment=no_memory", "optim.steps=4"],
+        ["model=avatar_poser", "loss.position=2", "~tracking"],
+        ["profile.width=16", "data.split.groups=[a,b]", "paths.outputs=elsewhere", "tracking=none"],
+    ],
+)
+def test_a_job_is_composed_as_hydra_composes_it(overrides):
+    """Options of groups are chosen once for many jobs (twice here), and changes of one job are its own."""
+    args, _ = parse(overrides)
+    schema.register()
+    version.setbase(VERSION_BASE)
+    for _ in range(2):
+        (own,) = preflight(args)
+        with _hydra(args):
+            assert own == compose("train", list(overrides))
+        assert OmegaConf.is_struct(own)
+        own.model.frames, own.seed = 99, 99

@@ -75,7 +75,7 @@ def test_inner_layers_are_int8_and_the_ends_are_not(step_files, tmp_path, networ
         "manikin_s": {f"model.model.{head}.0.weight" for head in ("swivel", "places", "rotation")},
         "manikin_l": {"model.model.regressor.0.weight", "model.model.regressor.3.weight"},
         "avatar_jlm": {"model.model.regressor.0.weight", "model.model.regressor.3.weight"},
-        "rpm": {"model.model.head.weight"},
+        "bodiffusion": {"model.sparse.weight", "model.motion.weight", "model.made.weight"},
         "vae_hmd": {"model.model.encoder.stem.weight", "model.model.decoder.head.weight"},
     }.get(network, {"model.model.head.weight"})
     assert {kinds[name] for name in ends} == {onnx.TensorProto.FLOAT}

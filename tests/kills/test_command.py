@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import signal
-import subprocess
 from pathlib import Path
 
 import pytest
-from command_line import MAIN, TINY, run
-from processes import started, until
+from command_line import TINY, in_folder, run
+from processes import forked, until
 
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
@@ -24,9 +23,8 @@ MOMENTS = (
 @pytest.mark.slow
 def test_kill_9_then_again_gives_the_same_model(tiny_home: Path, tmp_path: Path):
     """The whole command killed as soon as it comes to each moment, and then let finish."""
-    line = [*MAIN, "train", *TINY]
     for moment in MOMENTS:
-        with started(line, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        with forked(in_folder, tmp_path, "train", *TINY) as process:
             until(lambda at=moment: list((tmp_path / "outputs").glob(at)), moment, process)
             process.kill()
             assert process.wait() == -signal.SIGKILL

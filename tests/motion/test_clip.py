@@ -31,3 +31,12 @@ def test_resampling_is_exact(fps, how):
     ours, expected = (Rotation.from_rotvec(p.reshape(-1, 3)) for p in (clip.poses, poses))
     assert (ours.inv() * expected).magnitude().max() < 1e-9
     np.testing.assert_allclose(clip.trans, trans, atol=1e-9)
+
+
+@pytest.mark.parametrize(("frames", "lengths"), [(3, [3, 3, 1]), (7, [7]), (100, [7])])
+def test_parts_are_the_clip(frames: int, lengths: list[int]):
+    poses, trans = analytic(np.arange(7.0))
+    parts = list(Clip("clip", poses, trans, 60.0).parts(frames))
+    assert [len(part) for part in parts] == lengths
+    np.testing.assert_array_equal(np.concatenate([part.poses for part in parts]), poses)
+    np.testing.assert_array_equal(np.concatenate([part.trans for part in parts]), trans)

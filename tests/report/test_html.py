@@ -55,8 +55,8 @@ def test_systems_of_both_tables():
         ("AvatarPoser", 72.0, 3.08),
         ("AGRoL-MLP", 26.0, 2.69),
         ("AGRoL-Diffusion", 3.5, 2.66),
-        ("Mem-MLP-41 (Ours)", 72.0, 2.57),
-        ("Mem-MLP-60 (Ours)", 65.0, 2.56),
+        ("Mem-MLP-41", 72.0, 2.57),
+        ("Mem-MLP-60", 65.0, 2.56),
     }
 
 

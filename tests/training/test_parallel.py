@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import signal
 import socket
-import sys
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from processes import PATIENCE, started
-from shared_training import STEPS, dying, optim_of, precise
+from processes import PATIENCE, forked
+from shared_training import STEPS, dying, optim_of, precise, together
 from tiny_tasks import motion_task, weights
 from torch import nn
 
@@ -26,7 +24,6 @@ from memmlp.training.loop import check_shares, train
 
 NAMES = ("streams", "joint", "avatar_poser", "agrol_diffusion", "muon", "schedule_free", "vqvae")
 """Tasks with all that could differ: states, blends, passes, codes that restart, dropout, noise, averages."""
-PROGRAM = Path(__file__).parent.with_name("shared_training.py")
 
 
 class Kill(Exception):
@@ -56,10 +53,9 @@ def train_together(folder: Path, *names: str) -> list[int]:
         (folder / name.removeprefix("die=")).mkdir(parents=True, exist_ok=True)
     shared = {"TORCHELASTIC_RUN_ID": "tests", "WORLD_SIZE": "2", "OMP_NUM_THREADS": "1"}
     shared |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
-    line = [sys.executable, str(PROGRAM), str(folder), *names]
     with ExitStack() as stack:
         both = [
-            stack.enter_context(started(line, env={**os.environ, **shared, "RANK": rank, "LOCAL_RANK": rank}))
+            stack.enter_context(forked(together, folder, *names, **shared, RANK=rank, LOCAL_RANK=rank))
             for rank in "01"
         ]
         return [process.wait(PATIENCE) for process in both]

@@ -21,6 +21,7 @@ MODELS: dict[str, tuple[str, ...]] = {
     "agrol_mlp_196": ("model=agrol_mlp",),
     "agrol_mlp_41": ("model=agrol_mlp", "model.frames=41"),
     "agrol_diffusion": ("model=agrol_diffusion", "model.sampling_steps=5"),
+    "bodiffusion": ("model=bodiffusion",),
     "mem_mlp_41": (),
     "mem_mlp_60": ("model.frames=60",),
     "ego_poser": ("model=ego_poser",),
@@ -31,7 +32,8 @@ MODELS: dict[str, tuple[str, ...]] = {
     "avatar_jlm": ("model=avatar_jlm",),
     "manikin_l": ("model=manikin_l",),
 }
-SLOW = ("avatar_jlm", "manikin_l")  # seconds a step and gigabytes of files: timed where they are asked for
+SLOW = ("bodiffusion", "avatar_jlm", "manikin_l")
+"""Seconds a step, or gigabytes of files: timed where they are asked for."""
 VARIANTS = ("naive", "streaming", "fp16", "int8")
 
 

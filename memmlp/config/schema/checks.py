@@ -13,11 +13,18 @@ from omegaconf.errors import OmegaConfBaseException
 
 from memmlp.common.errors import InputError
 from memmlp.config.schema.config import SCHEMAS, Config
-from memmlp.config.schema.network import AvatarJLMConfig, BaselineConfig, RecurrentPoserConfig, RPMConfig
+from memmlp.config.schema.network import (
+    AvatarJLMConfig,
+    BaselineConfig,
+    BoDiffusionConfig,
+    RecurrentPoserConfig,
+    RPMConfig,
+)
 from memmlp.config.schema.training import (
     AGRoLLossConfig,
     BaselineLossConfig,
     NoHandConfig,
+    OwnLossConfig,
     StreamsConfig,
     TeacherForcingConfig,
     TermsLossConfig,
@@ -163,6 +170,8 @@ def _check_baseline(cfg: DictConfig) -> None:
     for group in ("memory", "predictor", "hand", "term"):
         if cfg[group] is not None:
             raise InputError(f"{group}: {name} has none; allowed is a command line without {group}=...")
+    if _is(cfg.loss, OwnLossConfig) and not _is(cfg.model, BoDiffusionConfig):
+        raise InputError(f"loss=own: {name} has none that it could be trained with; allowed is another")
     if not _is(cfg.loss, BaselineLossConfig):
         raise InputError(f"loss: weights of Mem-MLP's terms, which {name} has not; allowed is its own loss")
     carries = _is(cfg.model, RecurrentPoserConfig) and _is(cfg.rollout, StreamsConfig)
@@ -188,11 +197,15 @@ def _check_baseline(cfg: DictConfig) -> None:
             "model.offline=true: a frame is made with later ones, so there is no stream: "
             "allowed is evaluation.modes=[window] with export.graph=off"
         )
+    if cfg.model.get("offline") and cfg.refiner is not None:
+        raise InputError("refiner: corrects a stream, which model.offline=true is not; allowed is null")
     steps = cfg.model.get("diffusion_steps", 1)
     if cfg.model.get("sampling_steps", 1) > steps:
         raise InputError(
             f"model.sampling_steps={cfg.model.sampling_steps}: allowed is up to model.diffusion_steps={steps}"
         )
+    if _is(cfg.loss, OwnLossConfig) and not cfg.model.noise:
+        raise InputError("model.noise=0: allowed with loss=own is a weight above 0, or another loss")
 
 
 def _check_foreign_loss(cfg: DictConfig, predictor: str) -> None:

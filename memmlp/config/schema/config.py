@@ -24,6 +24,7 @@ from memmlp.config.schema.network import (
     AGRoLMLPConfig,
     AvatarJLMConfig,
     AvatarPoserConfig,
+    BoDiffusionConfig,
     CodeMemoryConfig,
     EgoPoserConfig,
     FrameConfig,
@@ -78,6 +79,7 @@ from memmlp.config.schema.training import (
     MuonConfig,
     NoHandConfig,
     OptimConfig,
+    OwnLossConfig,
     OwnPredictionsConfig,
     RolloutConfig,
     ScheduleFreeConfig,
@@ -108,6 +110,7 @@ class ProfileConfig:
     The other groups read their defaults from here; any of them can be overridden in its own group.
     """
 
+    synth_minutes: float = positive()
     frames: int = at_least(2)
     width: int = at_least(1)
     depth: int = at_least(1)
@@ -118,6 +121,7 @@ class ProfileConfig:
     lr: float = positive()
     final_lr: float = at_least(0)
     schedule: str = one_of("step", "cosine")
+    ema: Optional[float] = optional(Within(0, 1, strict=True))
     checkpoint_every: int = at_least(1)
     validate_every: int = at_least(1)
     log_every: int = at_least(1)
@@ -146,6 +150,10 @@ class ProfileConfig:
     avatar_jlm_depth: Optional[int] = optional(Within(1))
     avatar_jlm_heads: Optional[int] = optional(Within(1))
     avatar_jlm_feedforward: Optional[int] = optional(Within(1))
+    bodiffusion_width: Optional[int] = optional(Within(2))
+    bodiffusion_depth: Optional[int] = optional(Within(1))
+    bodiffusion_heads: Optional[int] = optional(Within(1))
+    bodiffusion_sampling_steps: Optional[int] = optional(Within(1))
     rpm_frames: Optional[int] = optional(Within(2))
     rpm_width: Optional[int] = optional(Within(1))
     rpm_depth: Optional[int] = optional(Within(1))
@@ -247,6 +255,7 @@ SCHEMAS: dict[str, type] = {
     "model": ModelConfig,
     "model_agrol_mlp": AGRoLMLPConfig,
     "model_agrol_diffusion": AGRoLDiffusionConfig,
+    "model_bodiffusion": BoDiffusionConfig,
     "model_avatar_poser": AvatarPoserConfig,
     "model_ego_poser": EgoPoserConfig,
     "model_hmd_poser": HMDPoserConfig,
@@ -274,6 +283,7 @@ SCHEMAS: dict[str, type] = {
     "loss_manual": ManualConfig,
     "loss_agrol": AGRoLLossConfig,
     "loss_avatar_poser": AvatarPoserLossConfig,
+    "loss_own": OwnLossConfig,
     "loss_terms": TermsLossConfig,
     "hand_position": HandPositionConfig,
     "hand_fk": HandFKConfig,

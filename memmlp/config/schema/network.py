@@ -70,6 +70,16 @@ class AGRoLDiffusionConfig(BaselineConfig):
 
 
 @dataclass
+class BoDiffusionConfig(AGRoLDiffusionConfig):
+    name: str = called("bodiffusion")
+    _target_: str = target("memmlp.networks.baselines.bodiffusion.BoDiffusion")
+    heads: int = at_least(1)
+    noise: float = at_least(0)
+    bound: float = positive()
+    offline: bool = key()
+
+
+@dataclass
 class AvatarPoserConfig(BaselineConfig):
     name: str = called("avatar_poser")
     _target_: str = target("memmlp.networks.baselines.avatar_poser.AvatarPoser")

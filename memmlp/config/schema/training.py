@@ -104,6 +104,14 @@ class AvatarPoserLossConfig(BaselineLossConfig):
 
 
 @dataclass
+class OwnLossConfig(BaselineLossConfig):
+    """No loss beside the network's own, for networks that have one of their outputs (BoDiffusion)."""
+
+    name: str = called("own")
+    _target_: str = target("memmlp.training.losses.OwnLoss")
+
+
+@dataclass
 class TermsLossConfig(BaselineLossConfig):
     """A loss made of terms of the library; null leaves a term out, as do runs from before there was it."""
 

@@ -113,10 +113,10 @@ def packet(fields: Mapping[str, Any]) -> Packet:
     return Packet((head, left, right), time, seq)
 
 
-def needs_osc() -> None:
-    """Raise InputError where python-osc is not installed."""
+def needs_osc(option: str = "--osc", instead: str = "--udp") -> None:
+    """Raise InputError where python-osc is not installed, which an option needs."""
     if find_spec("pythonosc") is None:
-        raise InputError("--osc: needs python-osc, pip install 'memmlp[osc]'; allowed without: --udp")
+        raise InputError(f"{option}: needs python-osc, pip install 'memmlp[osc]'; allowed without: {instead}")
 
 
 def _tracker(name: str, values: Any) -> TrackerPose:

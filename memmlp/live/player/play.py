@@ -1,67 +1,123 @@
-"""The loop of `memmlp live`: samples go from a source through the stream to all who watch."""
+"""The loop of `memmlp live`: samples go from a source through the stream to outputs, and to all who watch."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.live.player.sources import PoseSource
+from memmlp.live.outputs.output import Outputs
+from memmlp.live.player.fitting import Fitting, hips_height
+from memmlp.live.player.sources import PoseSample, PoseSource
+from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES, Space
-from memmlp.live.stream import Stream
-from memmlp.motion.body import FPS, JOINTS
+from memmlp.live.stream import Pose, Stream
+from memmlp.motion.body import FPS, JOINTS, PARENTS
+from memmlp.motion.formats.humanoid import VRM
 from memmlp.motion.limbs import LIMBS
 from memmlp.render.error_colours import HEAT
 
 SHOWN = SPACES["openxr"]  # the page's axes: those of three.js
 TOP = 20  # cm at the top of the page's colour scale
+UNIT = 10_000  # whole numbers that a quaternion's 1 is sent as
 
 Publish = Callable[[dict[str, Any]], None]
 
 
-def greeting(source: PoseSource, network: str) -> dict[str, Any]:
+def greeting(source: PoseSource, network: str, outputs: Outputs | None = None) -> dict[str, Any]:
     """Return what the page must know before the first frame."""
     limbs = [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS]
     words = {"network": network, "source": source.name, "fps": FPS, "joints": JOINTS}
-    return words | {"limbs": limbs, "heat": HEAT, "top": TOP}
+    words |= {"outputs": [output.name for output in outputs.outputs] if outputs else []}
+    return words | {"limbs": limbs, "heat": HEAT, "top": TOP, "worn": source.worn}
 
 
-def play(stream: Stream, source: PoseSource, publish: Publish, stopped: threading.Event) -> None:
-    """Feed each sample to the stream and publish the frames, until `stopped` is set.
+def with_avatar(words: Mapping[str, Any], rest: np.ndarray) -> dict[str, Any]:
+    """Return a greeting that tells of an avatar, too: its bones, and the height of the wearer's hips, metres.
 
-    A message has the frame's number and time (s), the step's time (ms), how many samples were dropped or
-    malformed so far, the trackers that are held, and the joints, predicted and true (66 whole millimetres,
-    axes of openxr). Malformed packets are reported at once, by a message that has the counts alone.
+    Args:
+        words: the greeting.
+        rest: the wearer's joints in the rest pose (22, 3), metres, SMPL's body frame.
     """
-    space, number, dropped, refused = SPACES[source.space], 0, 0, 0
-    counts = {"dropped": 0, "malformed": 0}
+    avatar = {"bones": VRM, "parents": PARENTS, "hips": round(hips_height(rest), 4), "unit": UNIT}
+    return dict(words) | {"avatar": avatar}
+
+
+def play(
+    stream: Stream,
+    source: PoseSource,
+    publish: Publish,
+    stopped: threading.Event,
+    outputs: Outputs | None = None,
+    fitting: Fitting | None = None,
+    avatar: bool = False,
+) -> None:
+    """Feed samples to the stream, and its frames to the outputs and to who watches, until `stopped` is set.
+
+    A message has the frame's number and time (s); milliseconds that the network itself took (`ms`) and that
+    the whole pose took, from the sample's arrival until all outputs had it (`whole`); how many samples were
+    dropped, malformed, or foreign so far; the trackers that are held; and the joints, predicted and true (66
+    whole millimetres, axes of openxr). Packets that were not taken are reported at once, by a message that
+    has the counts alone.
+
+    Args:
+        stream: the network.
+        source: gives the samples.
+        publish: gets the messages.
+        stopped: ends the loop.
+        outputs: get the frames first.
+        fitting: fits the stream to its wearer between the samples.
+        avatar: whether messages have the joints' rotations as well.
+    """
+    number, refused, dropped, told = 0, 0, 0, (0, 0)
     while not stopped.is_set():
         sample = source.read()
-        if source.malformed + refused != counts["malformed"]:
-            counts = {"dropped": dropped, "malformed": source.malformed + refused}
-            publish(counts)
+        if fitting:
+            fitting.step(sample and sample.trackers)
+        if (source.malformed + refused, source.foreign) != told:
+            told = source.malformed + refused, source.foreign
+            publish(counts(dropped, *told))
         if sample is None:
             continue
         dropped += sample.dropped
-        began = time.perf_counter()
-        try:
-            pose = stream.step(*sample.trackers, time=sample.time)
-        except InputError:
+        arrived = sample.arrived or time.perf_counter()
+        pose = stepped(stream, sample)
+        if pose is None:
             refused += 1
             continue
-        spent = 1000 * (time.perf_counter() - began)
         if not pose.fresh:
             continue
-        truth = source.truth(pose.time)
-        message = {"number": number, "time": round(pose.time, 4), "ms": round(spent, 3), "held": pose.held}
-        counts = {"dropped": dropped, "malformed": source.malformed + refused}
-        joints = {"joints": millimetres(space, pose.positions), "truth": millimetres(space, truth)}
-        publish(message | counts | joints)
+        if outputs:
+            outputs.take(stream, pose)
+        whole = 1000 * (time.perf_counter() - arrived)
+        times = {"ms": round(1000 * stream.network_seconds, 3), "whole": round(whole, 3)}
+        told = source.malformed + refused, source.foreign
+        head = {"number": number, "time": round(pose.time, 4), "held": pose.held}
+        message = head | times | counts(dropped, *told) | shown(stream.space, pose, source.truth(pose.time))
+        publish(message | (turns(stream.space, pose) if avatar else {}))
         number += 1
+
+
+def stepped(stream: Stream, sample: PoseSample) -> Pose | None:
+    """Return the pose of a sample; None where the stream refuses it."""
+    try:
+        return stream.step(*sample.trackers, time=sample.time)
+    except InputError:
+        return None
+
+
+def counts(dropped: int, malformed: int, foreign: int) -> dict[str, Any]:
+    """Return the part of a message about samples that were not taken."""
+    return {"dropped": dropped, "malformed": malformed, "foreign": foreign}
+
+
+def shown(space: Space, pose: Pose, truth: np.ndarray | None) -> dict[str, Any]:
+    """Return the part of a message with the joints."""
+    return {"joints": millimetres(space, pose.positions), "truth": millimetres(space, truth)}
 
 
 def millimetres(space: Space, joints: np.ndarray | None) -> list[int] | None:
@@ -70,3 +126,13 @@ def millimetres(space: Space, joints: np.ndarray | None) -> list[int] | None:
         return None
     shown = SHOWN.positions_out(space.positions_in(np.asarray(joints, np.float64)))
     return (1000 * shown).round().astype(int).ravel().tolist()
+
+
+def turns(space: Space, pose: Pose) -> dict[str, Any]:
+    """Return the part of a message with the joints' rotations: 22 quaternions xyzw as 88 whole numbers.
+
+    They are those of VRM's T-pose, which is SMPL's: Y up, facing +Z; the root's is in the page's axes.
+    """
+    local = space.pose_in(pose.rotations)
+    local[0] = SHOWN.world.T @ local[0]
+    return {"turns": (UNIT * matrix_to_quaternion(local)).round().astype(int).ravel().tolist()}

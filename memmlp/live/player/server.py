@@ -1,32 +1,61 @@
-"""The server of the page: its files, and the frames as server-sent events, by the standard library alone.
+"""The server of the page: its files, the frames as server-sent events, and orders of its wearer.
 
-It listens on 127.0.0.1 only. Watchers come and go; a slow one misses frames, and holds up nobody.
+It listens on 127.0.0.1 unless another address is asked for; then every request needs a token. Watchers come
+and go; a slow one misses frames, and holds up nobody.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import queue
 import socket
 import threading
-from collections.abc import Iterator, Mapping
+import urllib.parse
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
-from typing import Any
+from typing import Any, NamedTuple
 
-from memmlp.live.player.sources import HOST, bound
+from memmlp.common.access import Access
+from memmlp.common.errors import InputError
+from memmlp.live.player.sources import EVERYWHERE, HOST
 
 QUEUED = 240  # the most frames that wait for a watcher; beyond, its oldest are dropped
 QUIET = 2.0  # seconds without a frame after which a comment shows that the connection lives
-FILES = {
-    "": ("index.html", "text/html; charset=utf-8"),
-    **{name: (name, "text/javascript; charset=utf-8") for name in ("main.js", "stage.js", "history.js")},
-    **{
-        f"three/{name}": (f"three/{name}", "text/javascript; charset=utf-8")
-        for name in ("three.module.min.js", "three.core.min.js", "OrbitControls.js")
-    },
-    "style.css": ("style.css", "text/css; charset=utf-8"),
+LARGEST = 1000  # bytes of an order
+SCRIPT, STYLE, HTML = (
+    "text/javascript; charset=utf-8",
+    "text/css; charset=utf-8",
+    "text/html; charset=utf-8",
+)
+SCRIPTS = ("main.js", "stage.js", "history.js", "wearer.js", "avatar.js")
+THREE = ("three/three.module.min.js", "three/three.core.min.js", "three/OrbitControls.js")
+
+
+class File(NamedTuple):
+    """A file of the page.
+
+    Attributes:
+        kind: its content type.
+        read: returns its content.
+    """
+
+    kind: str
+    read: Callable[[], bytes]
+
+
+def read_page(name: str) -> bytes:
+    """Return the content of a file of the page that comes with memmlp."""
+    return resources.files("memmlp.live.player").joinpath("page", name).read_bytes()
+
+
+FILES: dict[str, File] = {
+    "": File(HTML, partial(read_page, "index.html")),
+    **{name: File(SCRIPT, partial(read_page, name)) for name in (*SCRIPTS, *THREE)},
+    "style.css": File(STYLE, partial(read_page, "style.css")),
 }
 
 
@@ -38,14 +67,23 @@ class Hub:
     """
 
     def __init__(self, greeting: Mapping[str, Any]):
-        self.greeting = event("greeting", greeting)
+        self.states = {"greeting": event("greeting", greeting)}
         self.watchers: set[queue.Queue[bytes | None]] = set()
         self.lock = threading.Lock()
         self.closed = False
 
     def publish(self, message: Mapping[str, Any]) -> None:
-        """Hand a message to all who watch now."""
-        line = event("frame", message)
+        """Hand a frame's message to all who watch now."""
+        self._hand(event("frame", message))
+
+    def tell(self, name: str, state: Mapping[str, Any]) -> None:
+        """Hand a state to all who watch now, and to all who come later until it changes."""
+        line = event(name, state)
+        with self.lock:
+            self.states[name] = line
+        self._hand(line)
+
+    def _hand(self, line: bytes) -> None:
         with self.lock:
             for watcher in self.watchers:
                 _put(watcher, line)
@@ -54,8 +92,9 @@ class Hub:
     def watch(self) -> Iterator[queue.Queue[bytes | None]]:
         """Give a watcher a queue of events for as long as it watches; None in it is the end."""
         watcher: queue.Queue[bytes | None] = queue.Queue(QUEUED)
-        watcher.put(self.greeting)
         with self.lock:
+            for state in self.states.values():
+                watcher.put(state)
             if self.closed:
                 _put(watcher, None)
             self.watchers.add(watcher)
@@ -95,26 +134,50 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Send a file of the page, or the events until the end."""
-        name = self.path.partition("?")[0].lstrip("/")
-        if self.headers.get("Host", "").partition(":")[0] not in (HOST, "localhost"):  # DNS rebinding
-            self.send_error(403)
-            return
+        url, access, port = urllib.parse.urlsplit(self.path), self.server.access, self.server.server_port
+        name = url.path.lstrip("/")
         with contextlib.suppress(ConnectionError):  # raised when the page was closed
-            if name == "events":
+            if not access.allows(self.path, self.headers, port):
+                self.send_error(403)
+            elif token := access.given(url.query):
+                self._head(303, "text/plain", access.settled(token, port))
+            elif name == "events":
                 self._events()
-            elif name in FILES:
-                self._file(*FILES[name])
+            elif name in self.server.files:
+                self._file(self.server.files[name])
             else:
                 self.send_error(404)
 
-    def _file(self, name: str, kind: str) -> None:
-        content = resources.files("memmlp.live.player").joinpath("page", name).read_bytes()
-        self._head(kind, {"Content-Length": str(len(content))})
+    def do_POST(self) -> None:
+        """Take an order of the page: an empty answer, or a line that says what is wrong with it."""
+        with contextlib.suppress(ConnectionError):
+            if not self.server.access.allows_change(self.path, self.headers, self.server.server_port):
+                self.send_error(403)
+            elif self.path != "/wearer" or self.server.ask is None:
+                self.send_error(404)
+            else:
+                self._order(self.server.ask)
+
+    def _order(self, ask: Callable[[object], None]) -> None:
+        try:
+            size = min(int(self.headers.get("Content-Length", 0)), LARGEST)
+            ask(json.loads(self.rfile.read(size)))
+        except (ValueError, RecursionError) as error:
+            said = str(error) if isinstance(error, InputError) else "no JSON"
+            self._send(400, "text/plain; charset=utf-8", said.encode())
+        else:
+            self._send(200, "text/plain; charset=utf-8", b"")
+
+    def _file(self, file: File) -> None:
+        self._send(200, file.kind, file.read())
+
+    def _send(self, code: int, kind: str, content: bytes) -> None:
+        self._head(code, kind, {"Content-Length": str(len(content))})
         self.wfile.write(content)
 
     def _events(self) -> None:
         """Send the greeting and all frames as they come, until the page or the server is closed."""
-        self._head("text/event-stream", {})
+        self._head(200, "text/event-stream", {})
         with self.server.hub.watch() as watcher:
             while True:
                 try:
@@ -125,9 +188,14 @@ class Handler(BaseHTTPRequestHandler):
                     return
                 self.wfile.write(line)
 
-    def _head(self, kind: str, headers: Mapping[str, str]) -> None:
-        self.send_response(200)
-        for name, value in {"Content-Type": kind, "Cache-Control": "no-store", **headers}.items():
+    def _head(self, code: int, kind: str, headers: Mapping[str, str]) -> None:
+        self.send_response(code)
+        safe = {
+            "Cache-Control": "no-store",
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",
+        }
+        for name, value in {"Content-Type": kind, **safe, **headers}.items():
             self.send_header(name, value)
         self.end_headers()
 
@@ -141,30 +209,50 @@ class Server(ThreadingHTTPServer):
     Args:
         hub: gives the frames to the pages.
         port: the port; 0 for any free one.
+        host: the address to serve at; 127.0.0.1 is this machine alone.
+        token: what every request needs at another address than that; None for a new one.
+        files: the files of the page, by their paths.
+        ask: takes an order of the page, or raises InputError; None where there is nobody to fit.
 
     Raises:
-        InputError: where the port is taken.
+        InputError: where the address is none of this machine's, or the port is taken.
     """
 
     daemon_threads = True
     block_on_close = False
     allow_reuse_address = True
 
-    def __init__(self, hub: Hub, port: int):
-        self.hub, self.wanted = hub, port
-        super().__init__((HOST, port), Handler)
+    def __init__(
+        self,
+        hub: Hub,
+        port: int,
+        host: str = HOST,
+        token: str | None = None,
+        files: Mapping[str, File] = FILES,
+        ask: Callable[[object], None] | None = None,
+    ):
+        self.hub, self.files, self.ask = hub, files, ask
+        self.access = Access(host, token)
+        try:
+            super().__init__((host, port), Handler)
+        except (OSError, OverflowError) as error:
+            taken = getattr(error, "errno", None) == errno.EADDRINUSE
+            reason = "taken" if taken else getattr(error, "strerror", None) or error
+            allowed = "allowed are this machine's addresses and free ports"
+            raise InputError(f"--host {host} --port {port}: {reason}; {allowed}") from None
 
     def server_bind(self) -> None:
-        """Bind to the port of this machine."""
+        """Bind to the address, without asking a name server for its name."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        bound(self.socket, self.wanted)
-        self.server_address = (HOST, self.socket.getsockname()[1])
-        self.server_name, self.server_port = self.server_address
+        self.socket.bind(self.server_address)
+        self.server_address = self.socket.getsockname()
+        self.server_name, self.server_port = self.server_address[:2]  # type: ignore[assignment]
 
     @property
     def url(self) -> str:
-        """The page's address."""
-        return f"http://{HOST}:{self.server_port}/"
+        """The page's address, with the token where one is needed; at all addresses, one that others reach."""
+        name = own_address() if self.server_name == EVERYWHERE else str(self.server_name)
+        return self.access.url(name, self.server_port)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore the error, for what one page breaks off does not concern the others."""
@@ -179,3 +267,13 @@ class Server(ThreadingHTTPServer):
         self.shutdown()
         self.thread.join()
         self.server_close()
+
+
+def own_address() -> str:
+    """Return the address of this machine by which others of its network reach it. Nothing is sent."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # an address for documentation (RFC 5737)
+        except OSError:
+            return HOST
+        return str(probe.getsockname()[0])

@@ -6,7 +6,9 @@ import errno
 import math
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from ipaddress import IPv4Network, ip_address
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -27,6 +29,8 @@ from memmlp.motion.body import (
 )
 
 HOST = "127.0.0.1"
+EVERYWHERE = "0.0.0.0"
+TOLD = 3  # strangers that are told of
 WAIT = 0.25  # seconds that `read` waits at most
 PAUSE = 1.0  # seconds between two rounds of a clip, so long that the stream begins anew
 LARGEST = 65_536  # the largest datagram, bytes
@@ -34,11 +38,19 @@ FORGOTTEN = 10_000  # so many missing numbers are not lost packets but another s
 
 
 class PoseSample(NamedTuple):
-    """What a source gives: a time (seconds), the trackers, and how many samples were lost before this one."""
+    """What a source gives.
+
+    Attributes:
+        time: seconds of the trackers' clock.
+        trackers: head, left and right.
+        dropped: how many samples were lost before this one.
+        arrived: when it came, seconds of `time.perf_counter`; None for when it is given.
+    """
 
     time: float
     trackers: TrackerPoses
     dropped: int = 0
+    arrived: float | None = None
 
 
 class PoseSource(Protocol):
@@ -48,11 +60,15 @@ class PoseSource(Protocol):
         name: the source in words.
         space: the frame of reference of its poses.
         malformed: how many packets could not be read.
+        foreign: how many packets came from machines that were not asked for.
+        worn: whether somebody wears the trackers now.
     """
 
     name: str
     space: SpaceName
     malformed: int
+    foreign: int
+    worn: bool
 
     def read(self) -> PoseSample | None:
         """Return the next sample; None where none came within `WAIT` seconds."""
@@ -99,6 +115,29 @@ class TrackedClip:
         return first, time * FPS - first
 
 
+def npz_frames(path: Path) -> np.ndarray:
+    """Return the frames (N, 252) of an AMASS npz, resampled to 60 Hz, on the built-in body.
+
+    Raises:
+        InputError: for a clip of fewer than 3 frames at 60 Hz.
+    """
+    import torch
+
+    from memmlp.motion.body import builtin_rest_joints
+    from memmlp.motion.clip import resample
+    from memmlp.motion.features import motion_frames
+    from memmlp.motion.formats.npz import read_clip
+    from memmlp.motion.plausible import check_plausible
+
+    recorded = read_clip(path, path.stem)
+    check_plausible(path, recorded)
+    clip, _ = resample(recorded)
+    if len(clip) < 3:
+        raise InputError(f"{path}: {len(clip)} frames at 60 Hz; allowed are 3 or more")
+    tensors = (torch.tensor(part) for part in (clip.poses, clip.trans, builtin_rest_joints()))
+    return motion_frames(*tensors).numpy()
+
+
 def in_space(trackers: TrackerPoses, space: Space) -> TrackerPoses:
     """Bring trackers, positions and quaternions (xyzw), from AMASS' world to a space."""
     positions, rotations = (np.stack(part) for part in zip(*filter(None, trackers), strict=True))
@@ -121,7 +160,8 @@ class ClipSource:
     """
 
     space: SpaceName = "amass"
-    malformed = 0
+    malformed = foreign = 0
+    worn = False
 
     def __init__(
         self,
@@ -168,40 +208,68 @@ class ClipSource:
 
 
 class PacketSource:
-    """Takes packets that arrive at a UDP port of this machine (127.0.0.1).
+    """Takes packets that arrive at a UDP port, from this machine and from others that it is told of.
 
     Args:
         name: what kind of packets, in words.
         port: the port; 0 for any free one.
         parse: reads the packet of a datagram, or raises ValueError.
         space: the frame of reference of the poses.
+        senders: the other machines whose packets are taken; without any, nobody else reaches the port.
+        tell: gets a line about each machine whose packets are not.
 
     Raises:
         InputError: where the port is taken.
     """
 
-    def __init__(self, name: str, port: int, parse: Parse, space: SpaceName):
-        self.parse, self.space, self.malformed = parse, space, 0
+    worn = True
+
+    def __init__(
+        self,
+        name: str,
+        port: int,
+        parse: Parse,
+        space: SpaceName,
+        senders: Sequence[IPv4Network] = (),
+        tell: Callable[[str], None] = lambda line: None,
+    ):
+        self.parse, self.space, self.senders, self.tell = parse, space, senders, tell
+        self.malformed = self.foreign = 0
+        self.strangers: set[str] = set()
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.settimeout(WAIT)
-        bound(self.socket, port)
+        bound(self.socket, port, EVERYWHERE if senders else HOST)
         self.port = self.socket.getsockname()[1]
         self.name = f"{name} packets on port {self.port}"
         self.last: int | None = None
 
     def read(self) -> PoseSample | None:
-        """Return the next packet's sample; None where none came in time, or what came could not be read."""
+        """Return the next packet's sample; None where none came in time, or what came is not taken."""
         try:
-            datagram = self.socket.recv(LARGEST)
+            datagram, (sender, _) = self.socket.recvfrom(LARGEST)
         except TimeoutError:
+            return None
+        arrived = time.perf_counter()
+        if not self._known(sender):
+            self._refuse(sender)
             return None
         try:
             packet = self.parse(datagram)
         except ValueError:
             self.malformed += 1
             return None
-        arrival = time.monotonic() if packet.time is None else packet.time
-        return PoseSample(arrival, packet.trackers, self._dropped(packet))
+        now = time.monotonic() if packet.time is None else packet.time
+        return PoseSample(now, packet.trackers, self._dropped(packet), arrived)
+
+    def _known(self, sender: str) -> bool:
+        address = ip_address(sender)
+        return address.is_loopback or any(address in network for network in self.senders)
+
+    def _refuse(self, sender: str) -> None:
+        self.foreign += 1
+        if sender not in self.strangers and len(self.strangers) < TOLD:
+            self.strangers.add(sender)
+            self.tell(f"packets from {sender} are ignored; --from {sender} takes them")
 
     def _dropped(self, packet: Packet) -> int:
         """Return how many numbers are missing between the last packet and this one."""
@@ -219,10 +287,10 @@ class PacketSource:
         self.socket.close()
 
 
-def bound(listener: socket.socket, port: int) -> None:
-    """Bind a socket to a port of this machine alone. Raises InputError where the port is taken."""
+def bound(listener: socket.socket, port: int, host: str = HOST) -> None:
+    """Bind a socket to a port, by default of this machine alone. Raises InputError where it is taken."""
     try:
-        listener.bind((HOST, port))
+        listener.bind((host, port))
     except OSError as error:
         listener.close()
         if error.errno not in (errno.EADDRINUSE, errno.EACCES):

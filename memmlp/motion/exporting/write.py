@@ -21,10 +21,12 @@ class Format(NamedTuple):
     Attributes:
         suffix: of its files.
         write: writes a clip on a body with rest joints (22, 3), metres, atomically.
+        has_bones: whether the body is in the file.
     """
 
     suffix: str
     write: Callable[[Path, Clip, np.ndarray], None]
+    has_bones: bool = True
 
 
 def _write_npz(path: Path, clip: Clip, rest: np.ndarray) -> None:
@@ -34,7 +36,7 @@ def _write_npz(path: Path, clip: Clip, rest: np.ndarray) -> None:
 
 FORMATS = {
     "bvh": Format(".bvh", write_bvh),
-    "npz": Format(".npz", _write_npz),
+    "npz": Format(".npz", _write_npz, has_bones=False),
     "gltf": Format(".glb", write_gltf),
 }
 SUFFIXES = {each.suffix: each for each in FORMATS.values()}

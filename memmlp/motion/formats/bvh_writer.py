@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from memmlp.common.files import atomic_write
+from memmlp.common.files import atomic_file
 from memmlp.motion.body import JOINTS, PARENTS
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.y_up import y_up_motion
@@ -28,15 +28,19 @@ TIPS = {
 
 def write_bvh(path: Path, clip: Clip, rest: np.ndarray) -> None:
     """Write a clip on a body with these rest joints (22, 3), metres, atomically."""
-    atomic_write(path, "\n".join([*_hierarchy(rest), *_motion(clip, rest)]) + "\n")
+    with atomic_file(path) as file:
+        file.writelines(
+            f"{line}\n".encode() for lines in (_hierarchy(rest), _motion(clip, rest)) for line in lines
+        )
 
 
-def euler_zxy(rotations: np.ndarray) -> np.ndarray:
+def euler_zxy(rotations: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
     """Return angles (N, ..., 3), degrees, with Rz Rx Ry = rotations (N, ..., 3, 3).
 
     Of an angle's equals (the two triples of a rotation, and full turns) each frame has those nearest to the
     frame before, so that a program may interpolate between frames. In gimbal lock, where only the sum of the
-    outer angles counts, the product is the rotation all the same.
+    outer angles counts, the product is the rotation all the same. The first frame's are near to the angles
+    (..., 3) `before` it, where there are some.
     """
     z = np.arctan2(-rotations[..., 0, 1], rotations[..., 1, 1])
     cosine, sine = np.cos(z)[..., None], np.sin(z)[..., None]
@@ -44,7 +48,10 @@ def euler_zxy(rotations: np.ndarray) -> np.ndarray:
     second = cosine * rotations[..., 1, :] - sine * rotations[..., 0, :]
     x = np.arctan2(rotations[..., 2, 1], second[..., 1])
     y = np.arctan2(first[..., 2], first[..., 0])
-    return np.degrees(_continuous(np.stack([z, x, y], -1)))
+    angles = np.stack([z, x, y], -1)
+    if before is None:
+        return np.degrees(_continuous(angles))
+    return np.degrees(_continuous(np.concatenate([np.radians(before)[None], angles]))[1:])
 
 
 def _continuous(angles: np.ndarray) -> np.ndarray:
@@ -109,9 +116,12 @@ def _centimetres(metres: np.ndarray) -> str:
 
 def _motion(clip: Clip, rest: np.ndarray) -> Iterator[str]:
     """Yield the lines from MOTION on."""
-    rotations, root = y_up_motion(clip, rest)
-    angles = euler_zxy(rotations)[:, list(_below(0))]
-    values = np.concatenate([CENTIMETRES * root, angles.reshape(len(clip), -1)], 1)
     yield from ("MOTION", f"Frames: {len(clip)}", f"Frame Time: {1 / clip.fps:.12f}")
-    form = " ".join([NUMBER] * values.shape[1])
-    yield from (form % tuple(row) for row in values.tolist())
+    order, before = list(_below(0)), None
+    for part in clip.parts():
+        rotations, root = y_up_motion(part, rest)
+        angles = euler_zxy(rotations, before)
+        before = angles[-1]
+        values = np.concatenate([CENTIMETRES * root, angles[:, order].reshape(len(part), -1)], 1)
+        form = " ".join([NUMBER] * values.shape[1])
+        yield from (form % tuple(row) for row in values.tolist())

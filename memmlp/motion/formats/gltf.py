@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,11 +18,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import memmlp
-from memmlp.common.files import atomic_write
+from memmlp.common.files import atomic_file
 from memmlp.motion.body import JOINTS, N_JOINTS, PARENTS
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.y_up import y_up_motion
-from memmlp.motion.limbs import LIMBS, Limb, ends
+from memmlp.motion.limbs import LIMBS, ends
 
 COMPONENTS = {"<f4": 5126, "<u2": 5123, "|u1": 5121}  # glTF's numbers for types of components
 VERTICES, INDICES = 34962, 34963  # what a buffer view is for
@@ -31,29 +32,26 @@ AROUND, CAP = 16, 4  # vertices around a limb; rings of the half sphere at each 
 
 def write_gltf(path: Path, clip: Clip, rest: np.ndarray) -> None:
     """Write a clip on a body with these rest joints (22, 3), metres, as a .glb file, atomically."""
-    buffer = _Buffer()
+    buffer = Buffer()
     bind = rest - [0, rest[:, 1].min(), 0]  # the lowest joint on the floor
     content = {
         "asset": {"version": "2.0", "generator": f"memmlp {memmlp.__version__}"},
         "scene": 0,
         "scenes": [{"nodes": [0, N_JOINTS]}],
-        "nodes": [*_joint_nodes(bind), {"name": "mannequin", "mesh": 0, "skin": 0}],
-        "skins": [_skin(buffer, bind)],
-        "meshes": [{"name": "mannequin", "primitives": [_primitive(buffer, mannequin(bind))]}],
+        "nodes": [*joint_nodes(bind), {"name": "mannequin", "mesh": 0, "skin": 0}],
+        "skins": [skin(buffer, bind)],
+        "meshes": [{"name": "mannequin", "primitives": [primitive(buffer, mannequin(bind))]}],
         "materials": [{"name": "mannequin", "pbrMetallicRoughness": _MATERIAL}],
         "animations": [_animation(buffer, clip, rest)],
-        "accessors": buffer.accessors,
-        "bufferViews": buffer.views,
-        "buffers": [{"byteLength": len(buffer.data)}],
     }
-    atomic_write(path, _glb(content, bytes(buffer.data)))
+    write_glb(path, content, buffer)
 
 
 _MATERIAL = {"baseColorFactor": COLOUR, "metallicFactor": 0.0, "roughnessFactor": 0.7}
 
 
 @dataclass
-class _Buffer:
+class Buffer:
     """The binary part, as it grows, and what the JSON says of it."""
 
     data: bytearray = field(default_factory=bytearray)
@@ -81,7 +79,7 @@ class _Buffer:
         return len(self.accessors) - 1
 
 
-def _joint_nodes(bind: np.ndarray) -> list[dict[str, Any]]:
+def joint_nodes(bind: np.ndarray) -> list[dict[str, Any]]:
     """Return the nodes of the 22 joints in the bind pose (22, 3), metres."""
     nodes: list[dict[str, Any]] = []
     for joint, parent in enumerate(PARENTS):
@@ -92,7 +90,7 @@ def _joint_nodes(bind: np.ndarray) -> list[dict[str, Any]]:
     return nodes
 
 
-def _skin(buffer: _Buffer, bind: np.ndarray) -> dict[str, Any]:
+def skin(buffer: Buffer, bind: np.ndarray) -> dict[str, Any]:
     """Return the skin: the joints, and the matrices from the bind pose (22, 3) to each joint's frame."""
     inverse = np.tile(np.eye(4, dtype="<f4"), (N_JOINTS, 1, 1))
     inverse[:, 3, :3] = -bind  # glTF stores matrices by columns
@@ -100,12 +98,11 @@ def _skin(buffer: _Buffer, bind: np.ndarray) -> dict[str, Any]:
     return {"joints": joints, "skeleton": 0, "inverseBindMatrices": buffer.add(inverse, "MAT4")}
 
 
-def _animation(buffer: _Buffer, clip: Clip, rest: np.ndarray) -> dict[str, Any]:
+def _animation(buffer: Buffer, clip: Clip, rest: np.ndarray) -> dict[str, Any]:
     """Return the animation: each joint's rotation and the root's translation, at the clip's frames."""
-    rotations, root = y_up_motion(clip, rest)
-    quaternions = continuous_quaternions(rotations).astype("<f4")
+    quaternions, root = _curves(clip, rest)
     times = buffer.add((np.arange(len(clip)) / clip.fps).astype("<f4"), "SCALAR", bounds=True)
-    outputs = [(0, "translation", buffer.add(root.astype("<f4"), "VEC3"))]
+    outputs = [(0, "translation", buffer.add(root, "VEC3"))]
     for joint in range(N_JOINTS):
         outputs.append((joint, "rotation", buffer.add(np.ascontiguousarray(quaternions[:, joint]), "VEC4")))
     return {
@@ -118,14 +115,30 @@ def _animation(buffer: _Buffer, clip: Clip, rest: np.ndarray) -> dict[str, Any]:
     }
 
 
-def continuous_quaternions(rotations: np.ndarray) -> np.ndarray:
+def _curves(clip: Clip, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the joints' quaternions xyzw (N, 22, 4) and the root's positions (N, 3), metres, float32."""
+    quaternions = np.empty((len(clip), N_JOINTS, 4), "<f4")
+    roots = np.empty((len(clip), 3), "<f4")
+    end = 0
+    for part in clip.parts():
+        rotations, root = y_up_motion(part, rest)
+        before = quaternions[end - 1] if end else None
+        here = slice(end, end := end + len(part))
+        quaternions[here], roots[here] = continuous_quaternions(rotations, before), root
+    return quaternions, roots
+
+
+def continuous_quaternions(rotations: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
     """Return unit quaternions xyzw (N, J, 4) of rotations (N, J, 3, 3).
 
-    Of the two of a rotation each frame has the one nearer to the frame before.
+    Of the two of a rotation each frame has the one nearer to the frame before; the first one's is near to the
+    quaternions (J, 4) `before` it, where there are some.
     """
     quaternions = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(*rotations.shape[:2], 4)
     away = (quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True) < 0
     quaternions[1:] *= np.cumprod(np.where(away, -1, 1), axis=0)
+    if before is not None:
+        quaternions *= np.where((quaternions[0] * before).sum(-1, keepdims=True) < 0, -1, 1)
     return quaternions
 
 
@@ -147,7 +160,11 @@ class Mesh(NamedTuple):
 
 def mannequin(bind: np.ndarray) -> Mesh:
     """Return the limbs of the bind pose (22, 3), metres, as capsules."""
-    parts = [_capsule(limb, *ends(limb, bind)) for limb in LIMBS]
+    return merged([capsule(limb.first, limb.radii, *ends(limb, bind)) for limb in LIMBS])
+
+
+def merged(parts: Sequence[Mesh]) -> Mesh:
+    """Return several meshes as one."""
     starts = np.cumsum([0, *(len(part.positions) for part in parts)])
     return Mesh(
         np.concatenate([part.positions for part in parts]),
@@ -157,8 +174,14 @@ def mannequin(bind: np.ndarray) -> Mesh:
     )
 
 
-def _capsule(limb: Limb, start: np.ndarray, end: np.ndarray) -> Mesh:
-    """Return a limb from start to end (3,): rings around its axis, which become a point at either end."""
+def capsule(joint: int, radii: tuple[float, float], start: np.ndarray, end: np.ndarray) -> Mesh:
+    """Return a round limb that follows a joint: rings around its axis, which become a point at either end.
+
+    Args:
+        joint: the joint.
+        radii: the radii at its ends, metres.
+        start, end: its ends (3,), metres, in the bind pose.
+    """
     along = (end - start) / np.linalg.norm(end - start)
     side = np.cross(along, np.eye(3)[np.abs(along).argmin()])
     side /= np.linalg.norm(side)
@@ -168,9 +191,9 @@ def _capsule(limb: Limb, start: np.ndarray, end: np.ndarray) -> Mesh:
     height = np.concatenate([cap - np.pi / 2, cap])  # latitudes of the rings: start's half sphere, then end's
     normals = np.cos(height)[:, None, None] * ring + np.sin(height)[:, None, None] * along
     centres = np.repeat([start, end], CAP, axis=0)[:, None]
-    radii = np.repeat(limb.radii, CAP)[:, None, None]
-    positions = centres + radii * normals
-    joints = np.full(normals.shape[0] * AROUND, limb.first)
+    around = np.repeat(radii, CAP)[:, None, None]
+    positions = centres + around * normals
+    joints = np.full(normals.shape[0] * AROUND, joint)
     return Mesh(positions.reshape(-1, 3), normals.reshape(-1, 3), joints, _tube(2 * CAP))
 
 
@@ -182,7 +205,7 @@ def _tube(rings: int) -> np.ndarray:
     return np.concatenate([np.stack([this, beside, aslant], 1), np.stack([this, aslant, above], 1)])
 
 
-def _primitive(buffer: _Buffer, mesh: Mesh) -> dict[str, Any]:
+def primitive(buffer: Buffer, mesh: Mesh, material: int = 0) -> dict[str, Any]:
     """Return the mesh as glTF has it: up to four joints a vertex, of which ours uses one."""
     joints = np.zeros((len(mesh.joints), 4), "|u1")
     weights = np.zeros((len(mesh.joints), 4), "<f4")
@@ -194,13 +217,26 @@ def _primitive(buffer: _Buffer, mesh: Mesh) -> dict[str, Any]:
         "WEIGHTS_0": buffer.add(weights, "VEC4", VERTICES),
     }
     indices = buffer.add(mesh.triangles.astype("<u2").reshape(-1), "SCALAR", INDICES)
-    return {"attributes": attributes, "indices": indices, "material": 0}
+    return {"attributes": attributes, "indices": indices, "material": material}
 
 
-def _glb(content: dict[str, Any], binary: bytes) -> bytes:
-    """Return the file: a header, a chunk of JSON, and a chunk of binary data."""
-    text = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text
-    chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+def write_glb(path: Path, content: dict[str, Any], buffer: Buffer) -> None:
+    """Write a file atomically: a header, a chunk of JSON, and a chunk of binary data.
+
+    Args:
+        path: the file.
+        content: the JSON, without what the buffer knows.
+        buffer: the binary data.
+    """
+    buffers = {"accessors": buffer.accessors, "bufferViews": buffer.views}
+    size = len(buffer.data)
+    text = json.dumps(
+        content | buffers | {"buffers": [{"byteLength": size}]}, separators=(",", ":"), allow_nan=False
+    )
+    encoded = text.encode()
+    encoded += b" " * (-len(encoded) % 4)
+    with atomic_file(path) as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(encoded) + size))
+        file.write(struct.pack("<I4s", len(encoded), b"JSON") + encoded)
+        file.write(struct.pack("<I4s", size, b"BIN\0"))
+        file.write(buffer.data)

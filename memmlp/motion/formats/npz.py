@@ -16,11 +16,13 @@ The translation is `trans` or `transl` (N, 3); the frame rate `mocap_framerate`,
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from memmlp.common.errors import InputError
+from memmlp.common.files import atomic_file
 from memmlp.motion.body import N_JOINTS
 from memmlp.motion.clip import FRAME_RATE_RANGE, Clip
 from memmlp.motion.formats.archive import Npz, brief, open_npz
@@ -93,20 +95,28 @@ def _check_numbers(path: Path, body: np.ndarray, trans: np.ndarray) -> None:
 
 def write_clip(path: Path, clip: Clip) -> None:
     """Write a clip in AMASS' SMPL+H layout (hands at rest, zero betas, neutral gender), atomically."""
-    poses = np.zeros((len(clip), SMPLH_POSE_DIM), np.float32)
-    poses[:, : 3 * N_JOINTS] = clip.poses.reshape(len(clip), -1)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    with open(temporary, "wb") as file:
-        np.savez(
-            file,
-            poses=poses,
-            trans=clip.trans.astype(np.float32),
-            betas=np.zeros(16, np.float32),
-            gender=np.array("neutral"),
-            mocap_framerate=np.array(float(clip.fps)),
-        )
-    temporary.replace(path)
+    about = {"descr": "<f4", "fortran_order": False, "shape": (len(clip), SMPLH_POSE_DIM)}
+    others = {
+        "trans": clip.trans.astype(np.float32),
+        "betas": np.zeros(16, np.float32),
+        "gender": np.array("neutral"),
+        "mocap_framerate": np.array(float(clip.fps)),
+    }
+    with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
+        with archive.open("poses.npy", "w", force_zip64=True) as member:  # in parts: it may be an hour
+            np.lib.format.write_array_header_1_0(member, about)
+            member.writelines(_smplh(part).tobytes() for part in clip.parts())
+        for name, array in others.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
+
+
+def _smplh(clip: Clip) -> np.ndarray:
+    """Return a clip's poses (N, 156) with hands at rest, float32."""
+    poses = np.zeros((len(clip), SMPLH_POSE_DIM), "<f4")
+    poses[:, :BODY_DIM] = clip.poses.reshape(len(clip), -1)
+    return poses
 
 
 def _frame_rate(path: Path, value: np.ndarray) -> float:

@@ -90,15 +90,17 @@ class TimeEmbedding(nn.Module):
 
     Args:
         width: d, the width of the embedding.
+        sines: how many sines and cosines there are; by default d.
     """
 
     PERIOD = 10_000
 
     rates: Tensor
 
-    def __init__(self, width: int):
+    def __init__(self, width: int, sines: int | None = None):
         super().__init__()
-        rates = torch.exp(-math.log(self.PERIOD) * torch.arange(width // 2) / (width // 2))
+        half = (sines or width) // 2
+        rates = torch.exp(-math.log(self.PERIOD) * torch.arange(half) / half)
         self.register_buffer("rates", rates, persistent=False)
         self.mlp = nn.Sequential(nn.Linear(2 * len(rates), width), nn.SiLU(), nn.Linear(width, width))
 

@@ -1,4 +1,8 @@
-"""Denoising diffusion with a network that predicts the clean signal: schedule, training noise, DDIM."""
+"""Denoising diffusion: schedules of noise, the noising of training signals, and DDIM.
+
+DDIM is for networks that predict the clean signal; memmlp.networks.baselines.ancestral is for those that
+predict the noise.
+"""
 
 from __future__ import annotations
 
@@ -23,22 +27,32 @@ def cosine_schedule(steps: int) -> Tensor:
     return kept.cumprod(0)
 
 
-class Diffusion(nn.Module):
-    """The noising of training signals, and DDIM, which samples clean signals.
+def linear_schedule(steps: int) -> Tensor:
+    """Return the share (steps,) of signal in the noisy signal's variance, float64.
+
+    The noise that one step adds has a share that grows linearly from 1e-4 to 0.02 over 1000 steps (Ho et al.
+    2020, Sec. 4); of fewer steps each adds in proportion more, at most 0.999.
+    """
+    added = torch.linspace(1e-4, 0.02, steps, dtype=torch.float64) * (1000 / steps)
+    return (1 - added.clamp_max(0.999)).cumprod(0)
+
+
+class Noising(nn.Module):
+    """The noising of training signals, and the times at which a sample is denoised.
 
     Args:
-        steps: number of steps of the noise schedule.
+        signal: share (steps,) of signal in the noisy signal's variance, by step.
         sampling_steps: number of denoiser calls for a sample, evenly spaced from the last step down (Song et
             al. 2021, App. D.2: linear), so that the first one sees noise alone.
     """
 
     signal: Tensor
 
-    def __init__(self, steps: int, sampling_steps: int):
+    def __init__(self, signal: Tensor, sampling_steps: int):
         super().__init__()
-        self.steps = steps
-        self.times = [steps * (i + 1) // sampling_steps - 1 for i in reversed(range(sampling_steps))]
-        self.register_buffer("signal", cosine_schedule(steps).float(), persistent=False)
+        self.steps = len(signal)
+        self.times = [self.steps * (i + 1) // sampling_steps - 1 for i in reversed(range(sampling_steps))]
+        self.register_buffer("signal", signal.float(), persistent=False)
 
     def random_times(self, clean: Tensor) -> Tensor:
         """Draw a time (B,) for each signal of a batch (B, ...)."""
@@ -46,8 +60,25 @@ class Diffusion(nn.Module):
 
     def noised(self, clean: Tensor, time: Tensor, noise: Tensor) -> Tensor:
         """Mix clean signals (B, ...) with standard normal noise (B, ...) as the times (B,) demand."""
-        signal = self.signal[time].view(-1, *[1] * (clean.dim() - 1))
+        signal = at(self.signal, time, clean)
         return signal.sqrt() * clean + (1 - signal).sqrt() * noise
+
+
+def at(table: Tensor, time: Tensor, like: Tensor) -> Tensor:
+    """Return a table's values (..., B, 1, ...) at times (B,), to be broadcast to signals (B, ...)."""
+    return table[..., time].unflatten(-1, (-1, *[1] * (like.dim() - 1)))
+
+
+class Diffusion(Noising):
+    """Diffusion with a cosine schedule, whose network predicts the clean signal, and which DDIM samples.
+
+    Args:
+        steps: number of steps of the noise schedule.
+        sampling_steps: number of denoiser calls for a sample; see Noising.
+    """
+
+    def __init__(self, steps: int, sampling_steps: int):
+        super().__init__(cosine_schedule(steps), sampling_steps)
 
     def sample(self, denoise: Denoise, noise: Tensor) -> Tensor:
         """Sample the clean signal (B, ...) by DDIM that adds no noise (Song et al. 2021, Eq. 12, eta = 0).

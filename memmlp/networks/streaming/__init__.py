@@ -10,6 +10,7 @@ from memmlp.common.errors import InputError
 from memmlp.networks.baselines.agrol import AGRoLDiffusion, AGRoLMLP
 from memmlp.networks.baselines.avatar_jlm import AvatarJLM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser
+from memmlp.networks.baselines.bodiffusion import BoDiffusion
 from memmlp.networks.baselines.ego_poser import EgoPoser
 from memmlp.networks.baselines.hmd_poser import HMDPoser
 from memmlp.networks.baselines.manikin import ManikinL, ManikinS
@@ -30,6 +31,7 @@ from memmlp.networks.streaming.baselines import (
     RPMStream,
     VAEHMDStream,
 )
+from memmlp.networks.streaming.bodiffusion import BoDiffusionStream
 from memmlp.networks.streaming.graph import StreamingGraph
 from memmlp.networks.streaming.mem_mlp import MemMLPStream
 from memmlp.networks.streaming.recurrent_poser import RecurrentPoserStream
@@ -51,6 +53,7 @@ STREAMS: dict[type[WindowModel], type[StreamingGraph]] = {
     ManikinL: ManikinLStream,
     AGRoLMLP: AGRoLMLPStream,
     AGRoLDiffusion: AGRoLDiffusionStream,
+    BoDiffusion: BoDiffusionStream,
 }
 
 

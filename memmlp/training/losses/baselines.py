@@ -1,4 +1,4 @@
-"""The losses of AGRoL and AvatarPoser, which their authors train them with."""
+"""The losses of AGRoL and AvatarPoser, which their authors train them with, and none but a network's own."""
 
 from __future__ import annotations
 
@@ -87,3 +87,21 @@ class AvatarPoserLoss(Loss):
             "rotation": error[..., 6:].mean(),
             "position": position.abs().mean(),
         }
+
+
+class OwnLoss(Loss):
+    """No loss of the motion: what a network trains with is its own (`WindowModel.auxiliary_losses`)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weighting = Fixed({})
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
+        """Return no terms."""
+        return {}
+
+    def forward(
+        self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer
+    ) -> tuple[Tensor, Terms]:
+        """Return 0 and no terms."""
+        return motion.new_zeros(()), {}

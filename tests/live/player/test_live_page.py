@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chromium import Browser
-from processes import PATIENCE
+from processes import PATIENCE, until
 
+from memmlp.live.player.fitting import Fitting
 from memmlp.live.player.play import greeting, play
 from memmlp.live.player.server import Hub, Server
 from memmlp.live.player.sources import ClipSource, TrackedClip
@@ -85,6 +86,57 @@ def test_it_says_what_it_waits_for_and_when_the_command_has_ended(browser: Brows
         server.hub.publish({"dropped": 0, "malformed": 3})
         browser.wait("document.querySelector('#status').textContent.endsWith('3 packets malformed')")
     browser.wait("document.querySelector('#status').textContent == 'not connected'")
+
+
+class Worn(ClipSource):
+    """A clip that counts as somebody's devices."""
+
+    worn = True
+
+
+def test_the_wearer_fits_the_stream_from_the_page(browser: Browser, network: Path, clip: TrackedClip):
+    stopped, source, stream = threading.Event(), Worn(clip, 60), Stream(network)
+    hub = Hub(greeting(source, "tiny"))
+    fitting = Fitting(stream, "amass", None, hub.tell)
+    with Server(hub, 0, ask=fitting.ask) as server:
+        parts = (stream, source, hub.publish, stopped, None, fitting)
+        loop = threading.Thread(target=play, args=parts, daemon=True)
+        loop.start()
+        browser.open(server.url)
+        browser.wait("document.querySelector('#height').value == '172'")
+        for name, value in (("height", 186), ("floor", 5)):
+            change = f"i.value = {value}; i.dispatchEvent(new Event('change'))"
+            browser.value(f"(i => {{ {change} }})(document.querySelector('#{name}'))")
+            until(lambda name=name, value=value: getattr(stream.wearer, name) == value / 100, name)
+        browser.wait("document.querySelector('#said').textContent.includes('5 cm')")
+        browser.click("#calibrate")
+        browser.wait("!document.querySelector('#countdown').hidden")
+        assert browser.value("document.querySelector('#what').textContent") == "Stand in a T-pose"
+        assert 1 <= int(browser.value("document.querySelector('#seconds').textContent")) <= 5
+        browser.click("#cancel")
+        browser.wait("document.querySelector('#countdown').hidden")
+        fitting.ask({"action": "calibrate", "value": 0})  # nobody in the clip stands in a T-pose
+        browser.wait("document.querySelector('#said').classList.contains('failed')")
+        whole = "Number(document.querySelector('#latency [data-key=whole] td').textContent)"
+        assert browser.wait(whole) > 0
+        stopped.set()
+        loop.join(PATIENCE)
+    assert browser.errors == []
+
+
+def test_the_printed_address_opens_the_page_for_others(browser: Browser, clip: TrackedClip):
+    """Scripts, frames and orders go by the cookie, and the token stands in the address no more."""
+    asked: list[object] = []
+    hub = Hub(greeting(Worn(clip, 60), "tiny"))
+    with Server(hub, 0, "0.0.0.0", ask=asked.append) as server:
+        address = f"http://127.0.0.1:{server.server_port}/"
+        browser.call("Page.navigate", url=f"{address}?{server.url.partition('?')[2]}")
+        browser.wait(f"location.href == '{address}' && document.readyState == 'complete'")
+        browser.wait("document.querySelector('#about').textContent == 'tiny · person at 60 Hz'")
+        browser.click("#calibrate")
+        until(lambda: asked, "an order")
+    assert asked == [{"action": "calibrate", "value": None}]
+    assert browser.errors == []
 
 
 def test_it_fits_a_phone_in_the_dark(tmp_path: Path, url: str):

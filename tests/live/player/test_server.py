@@ -74,14 +74,16 @@ def test_truth_and_prediction_in_the_pages_axes(network: Path, clip: TrackedClip
     )
     joints = np.array(message["joints"]).reshape(22, 3)
     assert joints[15] == pytest.approx(np.array(message["truth"]).reshape(22, 3)[15], abs=1)
-    assert message["ms"] > 0
+    assert message["whole"] > message["ms"] > 0
     json.dumps(message)
 
 
 def test_held_trackers_and_refused_samples_are_told(network: Path, clip: TrackedClip):
     told = played(network, clip, 60, Losing)
     messages = [message for message in told if "joints" in message]
-    assert [message for message in told if "joints" not in message] == [{"dropped": 0, "malformed": 1}]
+    assert [message for message in told if "joints" not in message] == [
+        {"dropped": 0, "malformed": 1, "foreign": 0}
+    ]
     held = [m["number"] for m in messages if m["held"]]
     assert held == list(range(39, 49))
     assert messages[45]["held"] == ("left",)
@@ -139,9 +141,9 @@ def test_a_slow_watcher_loses_the_oldest_frames(monkeypatch):
 
 
 def test_the_pages_files_are_there(server: Server):
-    for name, (path, kind) in FILES.items():
+    for name, file in FILES.items():
         response = get(server, f"/{name}")
-        assert (response.status, response.headers["Content-Type"]) == (200, kind), path
+        assert (response.status, response.headers["Content-Type"]) == (200, file.kind), name
         assert len(response.read()) > 200
 
 
@@ -173,8 +175,85 @@ def test_a_page_of_another_site_gets_nothing(server: Server):
 
 
 def test_a_taken_port_is_one_line(server: Server):
-    with pytest.raises(InputError, match=f"port {server.server_port}: taken"):
+    with pytest.raises(InputError, match=f"--port {server.server_port}: .*; allowed are"):
         Server(Hub({}), server.server_port)
+
+
+def post(server: Server, content: bytes, path: str = "/wearer", **headers: str) -> tuple[int, str]:
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=PATIENCE)
+    connection.request(
+        "POST", path, content, {name.replace("_", "-"): value for name, value in headers.items()}
+    )
+    response = connection.getresponse()
+    return response.status, response.read().decode()
+
+
+@pytest.fixture
+def asked() -> list[object]:
+    return []
+
+
+@pytest.fixture
+def fitted(asked: list[object]) -> Iterator[Server]:
+    """A server that takes orders, of which "no" is refused."""
+
+    def ask(fields: object) -> None:
+        if fields == "no":
+            raise InputError("no: not allowed")
+        asked.append(fields)
+
+    with Server(Hub({}), 0, ask=ask) as server:
+        yield server
+
+
+def test_orders_of_the_page_arrive(fitted: Server, asked: list[object]):
+    own = f"http://127.0.0.1:{fitted.server_port}"
+    assert post(fitted, b'{"action": "forget"}', Origin=own) == (200, "")
+    assert asked == [{"action": "forget"}]
+    assert post(fitted, b'"no"') == (400, "no: not allowed")
+    for content in (b"", b"nonsense", b"[" * 900, b'"' + 2000 * b"x" + b'"', b"\xff"):
+        assert post(fitted, content) == (400, "no JSON")
+    assert post(fitted, b"{}", "/other")[0] == 404
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [{"Origin": "http://elsewhere.example"}, {"Host": "elsewhere.example"}, {"Sec_Fetch_Site": "cross-site"}],
+)
+def test_orders_of_another_site_s_page_do_not(fitted: Server, asked: list[object], headers: dict[str, str]):
+    assert post(fitted, b'{"action": "forget"}', **headers)[0] == 403
+    assert asked == []
+
+
+def test_nobody_to_fit_takes_no_orders(server: Server):
+    assert post(server, b"{}")[0] == 404
+
+
+def test_at_another_address_everything_needs_the_token(clip: TrackedClip):
+    token = "a token of many letters"
+    with Server(Hub({}), 0, "0.0.0.0", token, ask=pytest.fail) as server:
+        for path in ("/", "/events", "/main.js", "/?token=wrong", "/events?token="):
+            assert get(server, path).status == 403, path
+        assert post(server, b"{}")[0] == 403
+        entered = get(server, f"/?{server.url.partition('?')[2]}")
+        assert (entered.status, entered.headers["Location"]) == (303, "/")
+        cookie = entered.headers["Set-Cookie"].partition(";")[0]
+        connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=PATIENCE)
+        connection.request("GET", "/events", headers={"Cookie": cookie})
+        response = connection.getresponse()
+        assert response.status == 200
+        assert next(events(response))[0] == "greeting"
+        assert "0.0.0.0" not in server.url  # which nobody can open from elsewhere
+
+
+def test_a_later_watcher_gets_the_newest_state():
+    hub = Hub({})
+    hub.tell("wearer", {"height": 170})
+    hub.tell("wearer", {"height": 180})
+    with hub.watch() as watcher:
+        found = [watcher.get_nowait() for _ in range(2)]
+    assert found[1] == b'event: wearer\ndata: {"height":180}\n\n'
 
 
 def test_the_end_leaves_the_port_and_no_thread(clip: TrackedClip):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+from ipaddress import IPv4Network
 
 import numpy as np
 import pytest
@@ -125,6 +126,44 @@ def test_malformed_and_missing_packets_are_counted():
     assert arrives.malformed == 2
     assert arrives.read() is None
     arrives.close()
+
+
+class Datagrams:
+    """A socket to which a datagram came from an address."""
+
+    def __init__(self, data: bytes, sender: str):
+        self.given = data, (sender, 5000)
+
+    def recvfrom(self, size: int) -> tuple[bytes, tuple[str, int]]:
+        return self.given
+
+    def close(self) -> None: ...
+
+
+def test_other_machines_packets_are_taken_where_they_are_asked_for_only():
+    told: list[str] = []
+    senders = [IPv4Network("192.168.1.9"), IPv4Network("10.0.0.0/8")]
+    arrives = PacketSource("UDP", 0, from_json, "amass", senders, told.append)
+    assert arrives.socket.getsockname()[0] == "0.0.0.0"
+    arrives.close()
+    taken = {}
+    for sender in (
+        "192.168.1.9",
+        "10.3.2.1",
+        "127.0.0.1",
+        *5 * ["192.168.1.8"],
+        *(f"8.8.8.{i}" for i in range(9)),
+    ):
+        arrives.socket = Datagrams(b'{"head": [0, 0, 1.6, 0, 0, 0, 1]}', sender)
+        taken[sender] = arrives.read() is not None
+    assert [sender for sender, is_taken in taken.items() if is_taken] == [
+        "192.168.1.9",
+        "10.3.2.1",
+        "127.0.0.1",
+    ]
+    assert (arrives.foreign, arrives.malformed) == (14, 0)
+    assert told[0] == "packets from 192.168.1.8 are ignored; --from 192.168.1.8 takes them"
+    assert len(told) == 3  # a flood of them fills no screen
 
 
 def test_only_this_machine_is_listened_to():

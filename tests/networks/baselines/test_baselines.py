@@ -72,6 +72,8 @@ KNOBS = [
     ("agrol_mlp", {"frames": 6}), ("agrol_mlp", {"depth": 3}), ("agrol_mlp", {"width": 12}),
     ("agrol_diffusion", {"diffusion_steps": 60}), ("agrol_diffusion", {"sampling_steps": 2}),
     ("agrol_diffusion", {"noise_seed": 1}), ("agrol_diffusion", {"depth": 3}),
+    ("bodiffusion", {"diffusion_steps": 60}), ("bodiffusion", {"sampling_steps": 2}),
+    ("bodiffusion", {"noise_seed": 1}), ("bodiffusion", {"heads": 2}),
     ("avatar_poser", {"frames": 6}), ("avatar_poser", {"heads": 2}), ("avatar_poser", {"feedforward": 16}),
     ("avatar_poser", {"depth": 3}),
     ("ego_poser", {"frames": 6}), ("ego_poser", {"heads": 2}), ("ego_poser", {"feedforward": 16}),

@@ -23,17 +23,22 @@ export class History {
   choose(number) { this.chosen = Math.min(Math.max(number, this.first), this.last); }
   resume() { this.chosen = null; }
 
-  // The median and 95th percentile of the steps' milliseconds over the last frames.
-  timing(count = 300) {
-    const sorted = this.frames.slice(-count).map(frame => frame.ms).sort((a, b) => a - b);
-    const at = part => sorted[Math.min(Math.floor(part * sorted.length), sorted.length - 1)];
-    return sorted.length ? { median: at(0.5), p95: at(0.95) } : null;
+  // The median and 95th percentile of a key's milliseconds over the last frames that have it.
+  timing(key, count = 300) {
+    return percentiles(this.frames.slice(-count).map(frame => frame[key]).filter(ms => ms !== undefined));
   }
+}
+
+function percentiles(values) {
+  const sorted = values.sort((a, b) => a - b);
+  const at = part => sorted[Math.min(Math.floor(part * sorted.length), sorted.length - 1)];
+  return sorted.length ? [at(0.5), at(0.95)] : null;
 }
 
 // Returns the frame in metres, with the joints' errors in cm where the truth is known.
 function measured(frame) {
   const joints = Float32Array.from(frame.joints, mm => mm / 1000);
+  if (frame.turns) frame.turns = Int16Array.from(frame.turns);
   if (!frame.truth) return { ...frame, joints, errors: null, mean: null };
   const truth = Float32Array.from(frame.truth, mm => mm / 1000);
   const errors = new Float32Array(joints.length / 3);

@@ -2,20 +2,29 @@
 
 import { History } from './history.js';
 import { Stage } from './stage.js';
+import { Wearer } from './wearer.js';
 
 const QUIET = 1000; // milliseconds without a frame after which the page says so
 const $ = id => document.getElementById(id);
 const history = new History();
+const wearer = new Wearer();
 let stage = null;
+let avatar = null;
 let greeting = null;
 let arrived = 0;
 let malformed = 0;
+let foreign = 0;
 
 const events = new EventSource('events');
 events.addEventListener('greeting', event => greet(JSON.parse(event.data)));
+events.addEventListener('wearer', event => {
+  const state = JSON.parse(event.data);
+  wearer.show(state);
+  if (avatar) avatar.hips = state.hips;
+});
 events.addEventListener('frame', event => {
   const frame = JSON.parse(event.data);
-  ({ malformed } = frame);
+  ({ malformed, foreign } = frame);
   if (!frame.joints) return; // the message has the counts alone
   if (frame.number <= history.last && history.frames.length) begin(); // the command was started again
   history.add(frame);
@@ -29,12 +38,33 @@ function greet(words) {
   document.querySelector('.prediction').style.background = words.heat[1];
   $('top').textContent = `${words.top}+`;
   $('budget').textContent = `of ${(1000 / words.fps).toFixed(1)} ms at ${words.fps} Hz`;
+  $('wearer').hidden = !words.worn;
+  $('goes').hidden = !words.outputs.length;
+  $('outputs').replaceChildren(...words.outputs.map(name => Object.assign(document.createElement('li'), { textContent: name })));
   try {
     stage ??= new Stage(document.querySelector('canvas'), words);
   } catch (error) {
-    $('trouble').textContent = `This browser draws no WebGL (${error.message}); the numbers go on.`;
-    $('trouble').hidden = false;
+    trouble(`This browser draws no WebGL (${error.message}); the numbers go on.`);
   }
+  if (stage && words.avatar && !avatar) dress(words.avatar);
+}
+
+// The avatar's scripts are fetched only where the command serves an avatar.
+async function dress(words) {
+  try {
+    const { Avatar } = await import('./avatar.js');
+    avatar ??= await Avatar.load('avatar.vrm', words);
+    stage.wear(avatar);
+    $('dress').hidden = false;
+    document.documentElement.dataset.avatar = 'there';
+  } catch (error) {
+    trouble(`The avatar cannot be shown (${error.message}).`);
+  }
+}
+
+function trouble(words) {
+  $('trouble').textContent = words;
+  $('trouble').hidden = false;
 }
 
 function begin() {
@@ -46,8 +76,13 @@ const pause = () => (history.paused ? history.resume() : history.choose(history.
 const step = by => history.choose((history.shown?.number ?? 0) + by);
 $('pause').addEventListener('click', pause);
 $('newest').addEventListener('click', () => history.resume());
+$('dress').addEventListener('click', () => {
+  stage.dressed = !stage.dressed;
+  $('dress').setAttribute('aria-pressed', stage.dressed);
+});
 $('scrub').addEventListener('input', event => history.choose(event.target.valueAsNumber));
 addEventListener('keydown', event => {
+  if (event.target.matches('input[type=number], button')) return;
   const action = { ' ': pause, ArrowLeft: () => step(-1), ArrowRight: () => step(1), End: () => history.resume() }[event.key];
   if (!action) return;
   event.preventDefault();
@@ -76,11 +111,14 @@ function tell(frame) {
   if (frame.mean !== null) $('mean').textContent = frame.mean.toFixed(1);
   for (const key of ['dropped', 'malformed']) $(key).textContent = frame[key];
   $('frames').textContent = frame.number + 1;
+  $('foreign').textContent = foreign;
+  $('strangers').hidden = !foreign;
   for (const item of $('trackers').children) item.classList.toggle('held', frame.held.includes(item.dataset.name));
-  const { median, p95 } = history.timing();
-  $('median').textContent = median.toFixed(2);
-  $('p95').textContent = p95.toFixed(2);
-  const share = (p95 * greeting.fps) / 1000;
+  for (const row of document.querySelectorAll('#latency [data-key]')) {
+    const timing = history.timing(row.dataset.key);
+    row.querySelectorAll('td').forEach((cell, i) => { cell.textContent = timing ? timing[i].toFixed(timing[i] < 10 ? 2 : 0) : '–'; });
+  }
+  const share = (history.timing('whole')[1] * greeting.fps) / 1000;
   $('share').style.width = `${Math.min(100 * share, 100)}%`;
   $('share').classList.toggle('over', share > 1);
 }
@@ -89,8 +127,10 @@ let told = 0;
 function tick(now) {
   const frame = history.shown;
   if (stage && frame) {
+    const began = performance.now();
     stage.show(frame);
     stage.draw();
+    frame.drawn = performance.now() - began;
     document.documentElement.dataset.shown = frame.number;
   }
   if (now - told > 100) {

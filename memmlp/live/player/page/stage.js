@@ -54,12 +54,23 @@ export class Stage {
     this.grey = colour('--truth');
   }
 
+  // Show a VRM avatar in place of the round limbs, as long as `dressed` is true.
+  wear(avatar) {
+    this.avatar = avatar;
+    this.dressed = true;
+    this.scene.add(avatar.scene);
+  }
+
   show(frame) {
     const { joints, truth, errors } = frame;
     const known = errors !== null;
-    this.prediction.pose(joints, known ? this.heat.bind(null, errors) : () => this.grey);
-    this.truth.group.visible = known;
-    if (known) this.truth.pose(truth, () => this.grey);
+    const dressed = Boolean(this.avatar && this.dressed);
+    if (this.avatar) this.avatar.scene.visible = dressed;
+    this.prediction.group.visible = !dressed;
+    this.truth.group.visible = known && !dressed;
+    if (dressed) this.avatar.pose(frame.turns, joints);
+    else this.prediction.pose(joints, known ? this.heat.bind(null, errors) : () => this.grey);
+    if (known && !dressed) this.truth.pose(truth, () => this.grey);
     this.follow(truth ?? joints, frame.restarted);
   }
 
@@ -118,11 +129,12 @@ class Body {
 }
 
 // A round limb: one surface of revolution, with a half circle at each end and a line between.
-class Limb {
-  constructor({ start, end, radii, tip }, material, slim) {
+export class Limb {
+  constructor({ start, end, radii, tip }, material, slim, round = ROUND, rings = RINGS) {
     Object.assign(this, { start, end, tip });
-    this.profile = outline(...radii.map(radius => slim * radius));
-    this.geometry = new THREE.LatheGeometry(this.profile.map(p => new THREE.Vector2(p.x, p.y + p.part)), ROUND);
+    this.profile = outline(...radii.map(radius => slim * radius), rings);
+    this.round = round;
+    this.geometry = new THREE.LatheGeometry(this.profile.map(p => new THREE.Vector2(p.x, p.y + p.part)), round);
     const count = this.geometry.attributes.position.count;
     this.geometry.setAttribute('color', new THREE.BufferAttribute(new Float32Array(3 * count), 3));
     this.mesh = new THREE.Mesh(this.geometry, material);
@@ -132,6 +144,11 @@ class Limb {
   }
 
   pose(joints, paint) {
+    this.place(joints);
+    this.colour(paint);
+  }
+
+  place(joints) {
     const at = joint => new THREE.Vector3().fromArray(joints, 3 * joint);
     let [from, to] = [at(this.start), at(this.end)];
     const along = to.clone().sub(from).normalize();
@@ -139,7 +156,6 @@ class Limb {
     this.mesh.position.copy(from);
     this.mesh.quaternion.setFromUnitVectors(UP, along);
     this.stretch(from.distanceTo(to));
-    this.colour(paint);
   }
 
   // Make the line between the ends as long as the limb; the round ends keep their form.
@@ -160,16 +176,16 @@ class Limb {
 
   each(action) {
     const points = this.profile.length;
-    for (let v = 0; v < (ROUND + 1) * points; v++) action(v, this.profile[v % points], v % points);
+    for (let v = 0; v < (this.round + 1) * points; v++) action(v, this.profile[v % points], v % points);
   }
 }
 
 // The limb's outline from end to end: at radius x, y above the point that is `part` of the way along.
-function outline(start, end) {
+function outline(start, end, count) {
   const quarter = Array.from({ length: 7 }, (_, i) => (Math.PI / 12) * i);
   const cap = (radius, side, part) =>
     quarter.map(angle => ({ x: radius * Math.sin(angle), y: side * radius * Math.cos(angle), part }));
-  const rings = Array.from({ length: RINGS - 1 }, (_, i) => (i + 1) / RINGS);
+  const rings = Array.from({ length: count - 1 }, (_, i) => (i + 1) / count);
   const between = rings.map(part => ({ x: start + part * (end - start), y: 0, part }));
   return [...cap(start, -1, 0), ...between, ...cap(end, 1, 1).reverse()];
 }

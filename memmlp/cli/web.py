@@ -1,0 +1,108 @@
+"""`memmlp web`: a static site that times, plays and wears networks in the browser it is opened in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from memmlp.cli.options import PATH, Finite, outputs_option, plugins_option
+
+if TYPE_CHECKING:
+    from memmlp.config.open_run import OpenedRun
+    from memmlp.web.clips import SiteClip
+    from memmlp.web.networks import SiteNetwork
+
+BASE = ("profile=paper", "model=avatar_poser")
+"""What the bench compares with: AvatarPoser of the paper's size, with random weights."""
+
+
+CALIBRATION = 2  # clips: int8's ranges do not matter for the time
+
+
+@click.command("web")
+@click.argument("runs", nargs=-1, required=True)
+@click.option("--out", required=True, type=PATH, help="Folder to write the site into.")
+@click.option(
+    "--clips",
+    default=3,
+    show_default=True,
+    type=click.IntRange(1, 50),
+    help="How many test clips of each run are on it.",
+)
+@click.option(
+    "--seconds",
+    default=20.0,
+    show_default=True,
+    type=Finite(1, 600),
+    help="How much of a clip, of its middle, at most.",
+)
+@click.option("--no-webgpu", is_flag=True, help="Leave out what WebGPU needs, 6.7 MB.")
+@click.option("--no-bench", is_flag=True, help="Leave out the bench, and the graphs that are timed there.")
+@plugins_option
+@outputs_option
+def web(
+    runs: tuple[str, ...],
+    out: Path,
+    clips: int,
+    seconds: float,
+    no_webgpu: bool,
+    no_bench: bool,
+    outputs: Path,
+) -> None:
+    """Make a site of finished RUNS (ids, their beginnings, or folders) that any static server can serve.
+
+    In the browser in which it is opened, such as a headset's, it times each network, plays test clips, and
+    shows the wearer's own body in a mirror (docs/guides/web.md). It takes onnxruntime-web and three.js from
+    the npm registry, once.
+    """
+    from memmlp.common.errors import InputError
+    from memmlp.config.open_run import open_run
+    from memmlp.web.site import Site, check_place
+
+    check_place(out)
+    opened = [open_run(outputs, run) for run in dict.fromkeys(runs)]
+    if len({one.run.id for one in opened}) < len(opened):
+        raise InputError(f"{' '.join(runs)}: a run is named twice; allowed is each run once")
+    found = {one.run.id: clips_of(one, clips, seconds) for one in opened}
+    site = Site(
+        networks=[network_of(one, found[one.run.id]) for one in opened],
+        base=None if no_bench else base(),
+        clips=list({clip.key: clip for some in found.values() for clip in some}.values()),
+        calibration=[] if no_bench else opened[0].data.open("train").clips()[:CALIBRATION],
+        webgpu=not no_webgpu,
+    )
+    size = site.make(out)
+    click.echo(f"{out}: {size / 1e6:.1f} MB; serve it with: python -m http.server --directory {out}")
+
+
+def clips_of(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
+    """Return the middle of some test clips of a run, evenly spaced among all of them."""
+    import numpy as np
+
+    from memmlp.web.clips import packed
+
+    test = opened.test
+    chosen = np.linspace(0, len(test.names) - 1, min(count, len(test.names))).round().astype(int)
+    return [packed(test.names[index], test.clip(index).numpy(), seconds) for index in chosen.tolist()]
+
+
+def network_of(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
+    """Return a run's network as a site has it."""
+    from memmlp.runs.identity import flatten
+    from memmlp.runs.name import run_name
+    from memmlp.web.networks import SiteNetwork
+
+    run, config = opened.run, flatten(opened.run.config)
+    name, model = run_name(run.manifest, config).removeprefix("default · "), config["model.name"]
+    name = name if f"model={model}" in name else f"{model} {name}"
+    return SiteNetwork(run.id, name, run.id, opened.network(), tuple(clip.key for clip in clips))
+
+
+def base() -> SiteNetwork:
+    """Return AvatarPoser of the paper's size."""
+    from memmlp.config.build import untrained
+    from memmlp.web.networks import SiteNetwork
+
+    return SiteNetwork("avatar-poser", "AvatarPoser", "random", untrained(BASE))

@@ -1,0 +1,43 @@
+"""How a command ends that was told to end: what it has begun is finished first."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Iterator
+from typing import Protocol
+
+
+class Closing(Protocol):
+    """What is to be finished."""
+
+    def close(self) -> None:
+        """Finish it."""
+
+
+@contextlib.contextmanager
+def closed_in_peace(thing: Closing) -> Iterator[None]:
+    """Close a thing at the end, whatever ends it; another Ctrl-C or termination does not interrupt that."""
+    try:
+        yield
+    finally:
+        before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            thing.close()
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def termination_interrupts() -> Iterator[None]:
+    """Take a request to end (SIGTERM) as a Ctrl-C."""
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,179 @@
+"""Pinned packages of the npm registry, whose files pages are made of: fetched once, checked, and kept.
+
+The registry is the one that npm would ask: `NPM_CONFIG_REGISTRY`, else what `npm config get registry` says,
+else `~/.npmrc`, else registry.npmjs.org. Tarballs are kept below the user's cache folder. They are read
+member by member, and never unpacked.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import os
+import shutil
+import subprocess
+import tarfile
+import urllib.request
+from collections.abc import Collection
+from dataclasses import dataclass
+from http.client import HTTPException
+from pathlib import Path
+from urllib.error import URLError
+
+from memmlp.common.errors import InputError, why_unreadable
+from memmlp.common.files import atomic_write
+from memmlp.common.progress import tell
+
+DEFAULT_REGISTRY = "https://registry.npmjs.org/"
+FOLDER = "MEMMLP_NPM"
+"""The environment's variable for a folder of tarballs, as `npm pack` writes them, that is asked first."""
+
+SECONDS = 60  # without a byte, after which a download has failed
+LARGEST = 300_000_000  # bytes of a tarball
+
+
+@dataclass(frozen=True)
+class Package:
+    """A package of one version.
+
+    Attributes:
+        name: its name, with its scope where it has one.
+        version: its version.
+        integrity: its tarball's digest as npm writes it: "sha512-" and the digest in base 64.
+    """
+
+    name: str
+    version: str
+    integrity: str
+
+    def __str__(self) -> str:
+        return f"{self.name}@{self.version}"
+
+    @property
+    def file(self) -> str:
+        """The tarball's name, as `npm pack` gives it."""
+        return f"{self.name.removeprefix('@').replace('/', '-')}-{self.version}.tgz"
+
+    def url(self, registry: str) -> str:
+        """Return the tarball's address in a registry."""
+        return f"{registry.rstrip('/')}/{self.name}/-/{self.name.split('/')[-1]}-{self.version}.tgz"
+
+
+THREE = Package(
+    "three",
+    "0.187.0",
+    "sha512-Qiu7R+Cmh8CstZsY1uJOSWnVlfo7ZtNLV7mF8Jltk3LB3AtDu9cRZlcnRKkAk8Y4z6KKw35z7Y7Urd7jWY8etA==",
+)
+THREE_VRM = Package(
+    "@pixiv/three-vrm",
+    "3.5.5",
+    "sha512-RPXy7jYAXs704NIpZlosB0U2ENu21G9DrqGWdQgRe8dShaCo1ugpj+6BVPRCy91nt+MPMA96j5rbsSzEl0HlQA==",
+)
+ONNXRUNTIME_WEB = Package(
+    "onnxruntime-web",
+    "1.30.0",
+    "sha512-q0y+JrrtukXSzsBWEMccVfqX25LRmosXHF+CaRJmg8pZClzcV7svNc4rKY3jL02Vb7QmRMDs1SigqR4CXAfKYQ==",
+)
+IWER = Package(  # a headset in software, for tests
+    "iwer",
+    "2.5.0",
+    "sha512-grq7iMyWo4s2DYnATKLPPoAByhcNuwLjMHHOILrFU9q8EGHIEzHyUuq1mz+9Xqy6+xrYPn3Ho8Z9eymZCE+D6w==",
+)
+
+
+def read(package: Package, names: Collection[str]) -> dict[str, bytes]:
+    """Return files of a package, by their names in it, such as "dist/ort.min.mjs".
+
+    Raises:
+        InputError: where the package cannot be had.
+        KeyError: where it has no such file.
+    """
+    found = {}
+    with tarfile.open(tarball(package), "r:gz") as archive:
+        for member in archive:
+            name = member.name.split("/", 1)[-1]  # all lie in one folder, "package" as a rule
+            if member.isfile() and name in names and (file := archive.extractfile(member)):
+                found[name] = file.read()
+    if missing := sorted(set(names) - set(found)):
+        raise KeyError(f"{package} has no {', '.join(missing)}")
+    return found
+
+
+def tarball(package: Package) -> Path:
+    """Return the tarball of a package, whose digest was checked; it is fetched where it is not kept yet.
+
+    Raises:
+        InputError: where it can't be fetched, or is not the file that is pinned.
+    """
+    if (given := os.environ.get(FOLDER)) and (path := Path(given) / package.file).is_file():
+        if _is(package, path.read_bytes()):
+            return path
+        raise InputError(f"{path}: not {package} as pinned ({package.integrity[:20]}...)")
+    path = cache() / package.file
+    if not (path.is_file() and _is(package, path.read_bytes())):
+        content = _download(package, registry())
+        path.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(path, content)
+    return path
+
+
+def cache() -> Path:
+    """Return the folder in which tarballs are kept."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "memmlp" / "npm"
+
+
+def registry() -> str:
+    """Return the address of the registry that npm is configured with."""
+    asked = next((value for key, value in os.environ.items() if key.upper() == "NPM_CONFIG_REGISTRY"), "")
+    return asked or _of_npm() or _of_npmrc() or DEFAULT_REGISTRY
+
+
+def _of_npm() -> str | None:
+    """Return the registry that npm itself names; None without npm."""
+    npm = shutil.which("npm")
+    if npm is None:
+        return None
+    try:
+        command = [npm, "config", "get", "registry"]
+        said = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return said.strip() if said.startswith("http") else None
+
+
+def _of_npmrc() -> str | None:
+    """Return the registry that the user's npmrc names; None where it names none."""
+    path = Path(os.environ.get("NPM_CONFIG_USERCONFIG") or Path.home() / ".npmrc")
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return None
+    pairs = [line.split("=", 1) for line in lines if "=" in line]
+    named = [value.strip().strip("\"'") for key, value in pairs if key.strip() == "registry"]
+    return named[-1] if named else None
+
+
+def _download(package: Package, host: str) -> bytes:
+    """Fetch a package's tarball. Raises InputError where that fails, or another file comes."""
+    tell(f"fetch {package} from the npm registry; it is kept in {cache()}")
+    try:
+        with urllib.request.urlopen(package.url(host), timeout=SECONDS) as answer:
+            content = answer.read(LARGEST)
+    except (OSError, ValueError, HTTPException) as error:  # a ValueError: an address that is none
+        reason = error.reason if isinstance(error, URLError) else why_unreadable(error)
+        raise InputError(
+            f"{package}: cannot be fetched from the npm registry ({reason}); {_way(package)}"
+        ) from None
+    if not _is(package, content):
+        raise InputError(f"{package}: the npm registry gave another file than the pinned; {_way(package)}")
+    return content
+
+
+def _way(package: Package) -> str:
+    """Return how to go on without the registry."""
+    return f"allowed is also {FOLDER}=FOLDER with {package.file} in it, as npm pack {package} writes it"
+
+
+def _is(package: Package, content: bytes) -> bool:
+    """Return whether a tarball's content has the pinned digest."""
+    return f"sha512-{base64.b64encode(hashlib.sha512(content).digest()).decode()}" == package.integrity

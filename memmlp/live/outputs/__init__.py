@@ -1,0 +1,1 @@
+"""Where a live body goes while it is there: other programs, and files."""

@@ -1,0 +1,79 @@
+"""The wearer beside the network's body: of another height, and on a floor at another height.
+
+A network knows bodies of one size, that of the rest pose in its file, on a floor at height zero. So positions
+go in scaled about the floor by the network's height over the wearer's, and come out scaled back. Angles stay.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from memmlp.common.errors import InputError
+from memmlp.live.rotations import BodyTree
+
+STATURE = 1.72 / 1.57
+"""Body height over the height of the head joint above the lowest joint, as the built-in adult has it."""
+
+HEIGHTS = (0.5, 2.5)  # metres; from a small child to more than the tallest person
+DEEPEST = 100.0  # metres that a floor may be from the height zero
+
+
+@dataclass(frozen=True)
+class Wearer:
+    """Who wears the trackers.
+
+    Attributes:
+        height: the body height, metres.
+        floor: the height of the floor, metres, in the trackers' frame of reference.
+        scale: the network's height over the wearer's.
+    """
+
+    height: float
+    floor: float
+    scale: float
+
+    def positions_in(self, positions: np.ndarray) -> np.ndarray:
+        """Bring the wearer's positions (..., 3), metres, AMASS' axes, to the network's size and floor."""
+        return (positions - self._up(positions)) * self.scale
+
+    def positions_out(self, positions: np.ndarray) -> np.ndarray:
+        """Bring the network's positions (..., 3), metres, AMASS' axes, to the wearer's size and floor."""
+        return positions / self.scale + self._up(positions)
+
+    def _up(self, positions: np.ndarray) -> np.ndarray:
+        return np.array([0.0, 0.0, self.floor], positions.dtype)
+
+
+def stature(skeleton: BodyTree) -> float:
+    """Return the body height, metres, of who has this rest pose."""
+    heights = skeleton.rest[:, 1]
+    return STATURE * float(heights[skeleton.tracked[0]] - heights.min())
+
+
+def wearer(skeleton: BodyTree, height: float | None = None, floor: float = 0.0) -> Wearer:
+    """Return a wearer beside a network's body.
+
+    Args:
+        skeleton: the network's body.
+        height: the wearer's body height, metres; None for the network's body's.
+        floor: the height of the floor, metres.
+
+    Raises:
+        InputError: for no height of a person, or no floor.
+    """
+    low, high = HEIGHTS
+    if height is not None and not (_number(height) and low <= height <= high):
+        raise InputError(
+            f"height={height}: allowed are {low:g} to {high:g} metres, or None for the network's"
+        )
+    if not (_number(floor) and abs(floor) <= DEEPEST):
+        raise InputError(f"floor={floor}: allowed is a height in metres, at most {DEEPEST:g} from zero")
+    own = stature(skeleton)
+    return Wearer(float(height or own), float(floor), own / height if height else 1.0)
+
+
+def _number(value: object) -> bool:
+    return isinstance(value, int | float | np.integer | np.floating) and math.isfinite(value)

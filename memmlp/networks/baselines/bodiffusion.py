@@ -1,0 +1,221 @@
+"""BoDiffusion (Castillo et al., ICCV 2023): a transformer denoises the rotations of a window.
+
+As published it is offline: windows that overlap by half are denoised together, and averaged at every step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from memmlp.common import parallel
+from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM, TRACKED
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.baselines.agrol import TimeEmbedding, WholeWindow
+from memmlp.networks.baselines.ancestral import AncestralDiffusion, Made
+from memmlp.networks.baselines.encoder import Attention
+from memmlp.networks.memory import State
+
+SINES = 256  # of the diffusion time
+CHANNELS = SPARSE_DIM // len(TRACKED)  # of the inputs, of which each joint gets a mixture of thirds
+NOISY = 6  # channels of the noisy motion, a joint's 6D rotation
+
+
+class DiTBlock(nn.Module):
+    """Attention and an MLP, shifted, scaled and gated by the diffusion time (Peebles & Xie 2023, adaLN).
+
+    Args:
+        width: d, the width of the features and of the MLP's hidden layer.
+        heads: number of attention heads; it divides d.
+    """
+
+    def __init__(self, width: int, heads: int):
+        super().__init__()
+        self.attention_norm = nn.LayerNorm(width, eps=1e-6, elementwise_affine=False)
+        self.attention = Attention(width, heads)
+        self.norm = nn.LayerNorm(width, eps=1e-6, elementwise_affine=False)
+        self.mlp = nn.Sequential(nn.Linear(width, width), nn.GELU("tanh"), nn.Linear(width, width))
+        self.modulation = nn.Linear(width, 6 * width)
+
+    def forward(self, h: Tensor, time: Tensor) -> Tensor:
+        """Map features (B, T, d) to (B, T, d), given the activated embedding (B, d) of the times."""
+        return self.newest(h, self.modulation(time)[..., None, :].chunk(6, -1), h.shape[-2])
+
+    def newest(self, h: Tensor, modulation: Sequence[Tensor], count: int) -> Tensor:
+        """Map features (..., T, d) to those of the newest frames (..., count, d), without making the others.
+
+        Args:
+            h: features (..., T, d).
+            modulation: shift, scale and gate of the attention and of the MLP, broadcast to the features.
+            count: how many of the newest frames are wanted.
+        """
+        shift, scale, gate, mlp_shift, mlp_scale, mlp_gate = modulation
+        seen, attention = self.attention_norm(h) * (1 + scale) + shift, self.attention
+        query = attention.query(seen[..., -count:, :])
+        attended = attention.attend(query, attention.key(seen), attention.value(seen))
+        h = h[..., -count:, :] + gate * attended
+        return h + mlp_gate * self.mlp(self.norm(h) * (1 + mlp_scale) + mlp_shift)
+
+
+class BoDiffusion(WholeWindow):
+    """A denoiser of rotations that predicts their noise, conditioned on the window's inputs.
+
+    It has 21,942,270 trained parameters at the paper's sizes (T = 41, d = 384, 12 blocks), and places of the
+    frames that are zeros and stay so, as published.
+
+    The noise of a sample is always the same, drawn from `noise_seed`, as AGRoLDiffusion's is. A live stream
+    samples a window at each frame and keeps its last one.
+
+    Args:
+        normalizer: converts between the world and network space.
+        frames: T, the window's length.
+        width: d, the width of the features.
+        depth: number of blocks.
+        heads: number of attention heads; it divides d.
+        diffusion_steps: number of steps of the training's noise schedule.
+        sampling_steps: number of denoiser calls at inference.
+        noise_seed: seed of the noise of samples.
+        noise: weight of the loss of the noise.
+        bound: weight of the variational bound, from which the variances learn.
+        offline: whether window mode denoises the windows of a clip together, as published.
+    """
+
+    noises: Tensor
+
+    def __init__(
+        self,
+        normalizer: Normalizer,
+        *,
+        frames: int,
+        width: int,
+        depth: int,
+        heads: int,
+        diffusion_steps: int,
+        sampling_steps: int,
+        noise_seed: int,
+        noise: float,
+        bound: float,
+        offline: bool,
+    ):
+        super().__init__(normalizer, frames)
+        self.noise_weight, self.bound_weight = noise, bound
+        self.noise_seed, self.offline = noise_seed, offline
+        self._call: tuple[Tensor, Tensor, Tensor, Made] | None = None
+        self.diffusion = AncestralDiffusion(diffusion_steps, sampling_steps)
+        self.time = TimeEmbedding(width, SINES)
+        self.spread = nn.Linear(len(TRACKED), N_JOINTS, bias=False)
+        self.stem = nn.Linear(N_JOINTS * (NOISY + CHANNELS), width)
+        self.places = nn.Parameter(torch.zeros(frames, width), requires_grad=False)
+        self.blocks = nn.ModuleList(DiTBlock(width, heads) for _ in range(depth))
+        self.head = nn.Linear(width, N_JOINTS * (NOISY + CHANNELS))
+        self.joint_head = nn.Linear(NOISY + CHANNELS, 2 * NOISY)
+        self.register_buffer("noises", self.drawn(frames), persistent=False)  # more with more sampling steps
+
+    @property
+    def streams(self) -> bool:
+        """Whether a frame is made without later ones: not as published."""
+        return not self.offline
+
+    @property
+    def joint(self) -> bool:
+        """Whether window mode makes all windows of a clip together: as published."""
+        return self.offline
+
+    def drawn(self, frames: int) -> Tensor:
+        """Draw the noise (draws, N, 132) of a sample of N frames, always the same."""
+        draw = torch.Generator().manual_seed(self.noise_seed)
+        return torch.randn(self.diffusion.draws, frames, ROTATION.stop, generator=draw)
+
+    def limits(self) -> tuple[Tensor, Tensor]:
+        """Return the least and the largest values (132,) of rotations in network space: 6D's -1 and 1."""
+        mean, std = (part[SPARSE_DIM:][ROTATION] for part in (self.normalizer.mean, self.normalizer.std))
+        return (-1 - mean) / std, (1 - mean) / std
+
+    def mixed(self, encoded: Tensor) -> Tensor:
+        """Mix the thirds of inputs (..., 54) to channels of each joint (..., 22, 18)."""
+        thirds = encoded.unflatten(-1, (len(TRACKED), CHANNELS))
+        return self.spread(thirds.transpose(-1, -2)).transpose(-1, -2)
+
+    def denoise(self, noisy: Tensor, time: Tensor, encoded: Tensor) -> Made:
+        """Predict the noise in rotations (B, T, 132), and the share of a step's variance.
+
+        Args:
+            noisy: noisy rotations (B, T, 132).
+            time: diffusion times (B,).
+            encoded: inputs (B, T, 54) in network space.
+        """
+        joints = torch.cat([noisy.unflatten(-1, (N_JOINTS, NOISY)), self.mixed(encoded)], -1)
+        h, embedding = self.stem(joints.flatten(-2)) + self.places, F.silu(self.time(time))
+        for block in self.blocks:
+            h = block(h, embedding)
+        made = self.joint_head(self.head(h).unflatten(-1, (N_JOINTS, -1)))
+        return Made(*(part.flatten(-2).to(noisy) for part in made.chunk(2, -1)))
+
+    def step(self, noisy: Tensor, encoded: Tensor, index: int) -> tuple[Tensor, Tensor]:
+        """Return mean and variance (B, T, 132) after a sampling step of rotations given inputs (B, T, 54)."""
+        time = torch.full((len(noisy),), self.diffusion.times[index], device=noisy.device)
+        return self.diffusion.step(noisy, self.denoise(noisy, time, encoded), index, self.limits())
+
+    def rotations(self, encoded: Tensor) -> Tensor:
+        """Sample rotations (B, T, 132) for inputs (B, T, 54), both in network space."""
+
+        def step(noisy: Tensor, index: int) -> tuple[Tensor, Tensor]:
+            mean, variance = self.step(noisy, encoded, index)
+            return mean, variance.sqrt()
+
+        return self.diffusion.sample(step, self.noises[:, None].expand(-1, len(encoded), -1, -1))
+
+    def whole(self, sparse: Tensor) -> Tensor:
+        """Sample the world motion (N, 198) of a clip's world inputs (N, 54), N >= T, its windows together.
+
+        A window begins every T // 2 frames, the last one where it ends with the clip; at every step the
+        windows are averaged where they overlap (Castillo et al. 2023; the released code drops the tail).
+        """
+        count, size = len(sparse), self.frames
+        begin = torch.tensor([*range(0, count - size, size // 2), count - size], device=sparse.device)
+        windows = begin[:, None] + torch.arange(size, device=sparse.device)
+        encoded = self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))[windows]
+        times_covered = torch.bincount(windows.flatten(), minlength=count)[:, None]
+
+        def total(parts: Tensor) -> Tensor:
+            return parts.new_zeros(count, ROTATION.stop).index_add(0, windows.flatten(), parts.flatten(0, 1))
+
+        def step(noisy: Tensor, index: int) -> tuple[Tensor, Tensor]:
+            mean, variance = self.step(noisy[windows], encoded, index)
+            return total(mean) / times_covered, total(variance).sqrt() / times_covered
+
+        rotation = self.diffusion.sample(step, self.drawn(count).to(self.noises))
+        return self.normalizer.posed(rotation, sparse)
+
+    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
+        """Make a training call: add noise to the truth (B, T, 252), and denoise it in one call.
+
+        Each window gets noise of a time that is drawn for it. The motion is that of the rotations which the
+        predicted noise leaves, kept within their limits as in sampling.
+
+        Args:
+            sparse: world inputs (B, n, 54) of the newest frames.
+            state: what the last call returned, or `initial_state`.
+            truth: world frames [X | Theta] (B, T, 252) of the window.
+        """
+        _, kept = self.taken_in(sparse, state)
+        window, frames = truth[..., :SPARSE_DIM], self.normalizer.encode(truth)
+        encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
+        time = parallel.drawn(self.diffusion.random_times, truth)
+        noise = parallel.drawn(torch.randn_like, clean)
+        noisy = self.diffusion.noised(clean, time, noise)
+        made = self.denoise(noisy, time, encoded)
+        self._call = clean, noise, time, made
+        found = self.diffusion.clean(noisy, made.noise, time).clamp(*self.limits())
+        return self.normalizer.posed(found, window), kept
+
+    def auxiliary_losses(self, truth: Tensor) -> dict[str, Tensor]:
+        """Return the losses of the last training call's noise and variances, weighted."""
+        if self._call is None:
+            return {}
+        (clean, noise, time, made), self._call = self._call, None
+        error, bound = self.diffusion.losses(clean, noise, time, made, self.limits())
+        return {"noise": self.noise_weight * error, "bound": self.bound_weight * bound}

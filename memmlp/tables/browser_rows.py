@@ -1,0 +1,171 @@
+"""Rows of Table 17 that a browser measured: what the bench of `memmlp web` copies, read and checked."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from memmlp.common.errors import InputError, one_line, why_unreadable
+from memmlp.tables.table import Cell, Effect, Row, Table
+
+FORMAT = "memmlp web bench 1"
+NUMBER = 17  # the table's, in the paper
+LARGEST = 1_000_000  # bytes of a file
+GRAPHS = {"naive": "as published", "streaming": "stream"}
+BASE = ("AvatarPoser", "naive", "fp32")
+"""What ratios on the page are to: AvatarPoser as published."""
+
+Check = Callable[[Any], bool]
+
+
+def _text(value: Any) -> bool:
+    return isinstance(value, str) and 0 < len(value) <= 300
+
+
+def _positive(value: Any) -> bool:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number and math.isfinite(value) and value > 0
+
+
+def _maybe(value: Any) -> bool:
+    return value is None or _positive(value)
+
+
+def _count(value: Any) -> bool:
+    return _positive(value) and value == int(value)
+
+
+TEXT, NUMBER_ABOVE_0, OR_NULL, COUNT = "text", "a number above 0", "a number above 0, or null", "a count"
+CHECKS: dict[str, Check] = {TEXT: _text, NUMBER_ABOVE_0: _positive, OR_NULL: _maybe, COUNT: _count}
+FILE = {"device": TEXT, "browser": TEXT, "onnxruntime_web": TEXT, "date": TEXT, "clock_ms": NUMBER_ABOVE_0}
+ROW = {
+    "network": TEXT, "graph": TEXT, "precision": TEXT, "backend": TEXT, "threads": COUNT, "steps": COUNT,
+    "median_ms": NUMBER_ABOVE_0, "p95_ms": NUMBER_ABOVE_0, "ratio_to_avatar_poser": OR_NULL,
+    "ratio_to_yardstick": OR_NULL, "whole_median_ms": OR_NULL, "whole_p95_ms": OR_NULL,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A file of the bench: the device, the browser, and the rows, each as the page wrote them."""
+
+    about: Mapping[str, Any]
+    rows: tuple[Mapping[str, Any], ...]
+
+    @property
+    def name(self) -> str:
+        """Device and browser in words."""
+        return f"{self.about['device']}, {self.about['browser']}"
+
+
+def read(path: Path) -> Measured:
+    """Read a file of the bench.
+
+    Raises:
+        InputError: where it can't be read, or is none.
+    """
+    try:
+        text = path.read_text(encoding="utf-8") if path.stat().st_size <= LARGEST else ""
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"--add {path}: {why_unreadable(error)}") from None
+    try:
+        found = json.loads(text)
+    except ValueError as error:
+        raise InputError(f"--add {path}: no JSON ({error}); {_ALLOWED}") from None
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise InputError(f"--add {path}: its format is not '{FORMAT}'; {_ALLOWED}")
+    rows = found.get("rows")
+    if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) for row in rows):
+        raise InputError(f"--add {path}: rows: none; {_ALLOWED}")
+    _check(path, "", found, FILE)
+    for index, row in enumerate(rows):
+        _check(path, f"rows[{index}].", row, ROW)
+    return Measured(
+        {key: _shown(found[key]) for key in FILE}, tuple({k: _shown(r[k]) for k in ROW} for r in rows)
+    )
+
+
+_ALLOWED = "allowed is what the bench of a site of memmlp web copies or saves"
+
+
+def _check(path: Path, where: str, found: Mapping[str, Any], fields: Mapping[str, str]) -> None:
+    for key, kind in fields.items():
+        if key not in found:
+            raise InputError(f"--add {path}: {where}{key}: missing; {_ALLOWED}")
+        if not CHECKS[kind](found[key]):
+            raise InputError(f"--add {path}: {where}{key}: {str(found[key])[:60]}; allowed is {kind}")
+
+
+def _shown(value: Any) -> Any:
+    """Return a value as a terminal may show it."""
+    return one_line(value) if isinstance(value, str) else value
+
+
+def with_rows(table: Table, measured: Measured) -> Table:
+    """Return Table 17 with a browser's rows below its own.
+
+    Their differences and ratios are to AvatarPoser as published, in the same browser on the same backend.
+    The column `ratio` is to the same fixed network as in the other rows.
+
+    Raises:
+        InputError: for another table.
+    """
+    if table.number != NUMBER:
+        raise InputError(f"--add: {table.name} is not Table {NUMBER}; allowed is memmlp table {NUMBER}")
+    bases = {row["backend"]: row for row in measured.rows if _kind(row) == BASE}
+    rows = [_row(table, measured, row, bases.get(row["backend"])) for row in measured.rows]
+    return replace(table, rows=(*table.rows, *rows), flags=(*table.flags, *_told(measured)))
+
+
+def _kind(row: Mapping[str, Any]) -> tuple[str, str, str]:
+    return row["network"], row["graph"], row["precision"]
+
+
+def _label(measured: Measured, row: Mapping[str, Any]) -> str:
+    graph = GRAPHS.get(row["graph"], row["graph"])
+    return f"{row['network']}, {graph}, {row['precision']}, {row['backend']}: {measured.name}"
+
+
+def _row(table: Table, measured: Measured, row: Mapping[str, Any], base: Mapping[str, Any] | None) -> Row:
+    costs, others = _costs(row), _costs(base) if base and base is not row else {}
+
+    def cell(metric: str) -> Cell:
+        value, other = costs.get(metric), others.get(metric)
+        known = value is not None and other is not None
+        effect = Effect(value - other) if known else None  # type: ignore[operator]
+        return Cell({} if value is None else {0: value}, effect=effect)
+
+    return Row(
+        label=_label(measured, row),
+        branch=table.rows[0].branch,
+        against=_label(measured, base) if base and base is not row else None,
+        note=None,
+        found=(0,),
+        wanted=(0,),
+        cells={mode: {metric: cell(metric) for metric in table.metrics} for mode in table.modes},
+    )
+
+
+def _costs(row: Mapping[str, Any]) -> dict[str, float | None]:
+    """Return a row's values by the table's metrics."""
+    return {
+        "ms": row["median_ms"],
+        "pose ms": row["whole_median_ms"],
+        "ratio": row["ratio_to_yardstick"],
+        "FPS": 1000 / row["median_ms"],
+    }
+
+
+def _told(measured: Measured) -> list[str]:
+    """Say how the rows were measured."""
+    about, first = measured.about, measured.rows[0]
+    clock = f"a clock of {about['clock_ms']:.2g} ms"
+    how = f"{first['threads']} thread, the median of {first['steps']} steps, {clock}"
+    return [
+        f"{measured.name}: onnxruntime-web {about['onnxruntime_web']}, {how}, {about['date'][:10]}; a whole "
+        "pose is by the full graph; differences are from AvatarPoser as published, there on the same backend"
+    ]

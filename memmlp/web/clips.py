@@ -1,0 +1,67 @@
+"""A site's clips: trackers and true joints of some seconds, as small binary files."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from memmlp.live.player.sources import TrackedClip
+from memmlp.live.rotations import matrix_to_quaternion
+from memmlp.live.spaces import SPACES
+from memmlp.motion.body import FPS
+
+NUMBERS = 9 + 12 + 66
+"""Of a frame: positions and quaternions (xyzw) of head and wrists, true joints; metres, axes of openxr."""
+
+
+class SiteClip(NamedTuple):
+    """A clip of a site.
+
+    Attributes:
+        key: what it is called in files: a digest of its content.
+        name: its name for people.
+        content: little-endian float32 (frames, 87).
+    """
+
+    key: str
+    name: str
+    content: bytes
+
+    @property
+    def frames(self) -> int:
+        """How many frames it has, at 60 Hz."""
+        return len(self.content) // (4 * NUMBERS)
+
+
+def packed(name: str, frames: np.ndarray, seconds: float) -> SiteClip:
+    """Return the middle of a clip.
+
+    Args:
+        name: the clip's name.
+        frames: [X | Theta] (N, 252) at 60 Hz, world (`memmlp.motion.body`).
+        seconds: how much of it, at most.
+    """
+    count = min(len(frames), round(seconds * FPS))
+    first = (len(frames) - count) // 2
+    clip, space = TrackedClip(name, frames[first : first + count]), SPACES["openxr"]
+    rotations = matrix_to_quaternion(space.rotations_out(clip.rotations).reshape(-1, 3, 3))
+    parts = [space.positions_out(clip.positions), rotations, space.positions_out(clip.joints)]
+    content = np.concatenate([part.reshape(count, -1) for part in parts], 1).astype("<f4").tobytes()
+    return SiteClip(hashlib.sha256(content).hexdigest()[:12], name, content)
+
+
+def written(clips: Iterable[SiteClip], folder: Path) -> list[dict[str, Any]]:
+    """Write clips into a site's folder, and return what the page has to know of them."""
+    entries = []
+    for clip in clips:
+        path = folder / "clips" / f"{clip.key}.bin"
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(clip.content)
+        entries.append(
+            {"key": clip.key, "name": clip.name, "file": f"clips/{path.name}", "frames": clip.frames}
+        )
+    return entries

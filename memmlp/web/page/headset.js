@@ -1,0 +1,48 @@
+// What a WebXR frame tells of head and hands, as a Stream takes them, and where joints are on devices as a rule.
+
+// Head and hands in a reference space: { position, rotation } each, or null where the device does not see it.
+// Hands are controllers' grips, or wrists where the device tracks hands.
+export function trackersOf(frame, space, sources) {
+  const hand = side => {
+    const source = [...sources].find(({ handedness, gripSpace, hand }) => handedness === side && (gripSpace || hand));
+    if (!source) return null;
+    const pose = source.hand ? frame.getJointPose(source.hand.get('wrist'), space) : frame.getPose(source.gripSpace, space);
+    return tracker(pose);
+  };
+  return [tracker(frame.getViewerPose(space)), hand('left'), hand('right')];
+}
+
+// "hands" or "controllers"; null where there is neither. Each sits differently on the wrists.
+export function kindOf(sources) {
+  const held = [...sources].filter(({ handedness, gripSpace, hand }) => handedness !== 'none' && (gripSpace || hand));
+  if (!held.length) return null;
+  return held.some(({ hand }) => hand) ? 'hands' : 'controllers';
+}
+
+// A device that sees a hand no longer guesses for a while where it is, which is taken; then it gives no pose.
+function tracker(pose) {
+  if (!pose) return null;
+  const { position: p, orientation: q } = pose.transform;
+  return { position: [p.x, p.y, p.z], rotation: [q.x, q.y, q.z, q.w] };
+}
+
+const HALF = Math.SQRT1_2;
+const HEAD = { position: [0, -0.07, 0.09], rotation: [0, 0, 0, 1] }; // from between the eyes to the base of the skull
+const SITS = {
+  // A wrist's pose has -Z along the hand and +Y out of its back; in a T-pose with palms down -Z points to the side.
+  hands: [
+    { position: [0, 0, 0], rotation: [0, -HALF, 0, HALF] },
+    { position: [0, 0, 0], rotation: [0, HALF, 0, HALF] },
+  ],
+  // A grip has -Z from the little finger to the thumb and X through the palm; the wrist is up its Y.
+  controllers: [
+    { position: [0, 0.09, 0], rotation: [0, 0, HALF, HALF] },
+    { position: [0, 0.09, 0], rotation: [0, 0, -HALF, HALF] },
+  ],
+};
+
+// About where head and wrists are on the devices, until a calibration finds out.
+export function usualOffsets(kind) {
+  const parts = [HEAD, ...SITS[kind ?? 'controllers']];
+  return { positions: parts.map(({ position }) => position), rotations: parts.map(({ rotation }) => rotation) };
+}

@@ -1,0 +1,71 @@
+// The pages by their addresses, what the site has, and whether it works offline.
+
+import { bench } from './bench.js';
+import { h, replace } from './dom.js';
+import { play } from './play.js';
+import { wear } from './wear.js';
+
+const PAGES = { wear, play, bench };
+const content = document.getElementById('content');
+let leave = () => {};
+
+async function begin() {
+  try {
+    const answer = await fetch('site.json');
+    if (!answer.ok) throw new Error(`site.json: the server says ${answer.status}`);
+    const site = await answer.json();
+    about(site);
+    if (!site.base) document.querySelector('nav a[href="#/bench"]').remove();
+    addEventListener('hashchange', () => show(site));
+    show(site);
+  } catch (error) {
+    replace(content, h('p', { class: 'wait' }, `The site cannot be read: ${error.message}.`));
+  }
+  offline();
+}
+
+function show(site) {
+  const named = location.hash.replace(/^#\//, '').split('?')[0];
+  const name = named in PAGES && (named !== 'bench' || site.base) ? named : 'wear';
+  leave();
+  document.title = `memmlp ${name}`;
+  for (const link of document.querySelectorAll('.top nav a')) {
+    if (link.hash === `#/${name}`) link.setAttribute('aria-current', 'page');
+    else link.removeAttribute('aria-current');
+  }
+  const page = h('div', { class: `page ${name}` });
+  replace(content, page);
+  leave = PAGES[name](page, site) ?? (() => {});
+}
+
+function about(site) {
+  const versions = Object.entries(site.packages).map(([name, version]) => `${name} ${version}`);
+  document.querySelector('.about').textContent =
+    `memmlp ${site.memmlp}, ${versions.join(', ')} (MIT licences). Made ${site.made.slice(0, 10)}. Nothing leaves this page.`;
+}
+
+// The service worker keeps the site in the browser; only https and this machine itself may have one.
+async function offline() {
+  const status = document.getElementById('status');
+  if (!navigator.serviceWorker) {
+    status.textContent = 'needs the server';
+    status.title = 'Works offline, and with a headset, at an https address or at localhost';
+    return;
+  }
+  const had = navigator.serviceWorker.controller !== null;
+  navigator.serviceWorker.addEventListener('controllerchange', () => {
+    if (had) replace(status, h('a', { href: '', onclick: () => location.reload() }, 'new version: reload'));
+  });
+  try {
+    await navigator.serviceWorker.register('sw.js');
+    await navigator.serviceWorker.ready;
+    status.textContent = 'works offline';
+    status.className = 'live';
+    document.documentElement.dataset.offline = 'ready';
+  } catch (error) {
+    status.textContent = 'needs the server';
+    status.title = error.message;
+  }
+}
+
+begin();

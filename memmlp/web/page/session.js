@@ -1,0 +1,50 @@
+// An exported step in ONNX Runtime (memmlp.deploy.session.OnnxStream), whatever build of it `ort` is.
+//
+// The inputs `state.*` are fed by the outputs `state.*.next` of the step before, zeros at first.
+
+const STATE = 'state.';
+const NEXT = '.next';
+
+export class Session {
+  // model: the ONNX file's bytes; weights: the bytes of the file that holds weights outside of it, if any;
+  // backend: wasm or webgpu.
+  static async open(ort, model, { weights = null, backend = 'wasm' } = {}) {
+    const options = { executionProviders: [backend], graphOptimizationLevel: 'all', logSeverityLevel: 3 };
+    if (weights) options.externalData = [{ path: 'weights', data: weights }];
+    return new Session(ort, await ort.InferenceSession.create(model, options));
+  }
+
+  constructor(ort, session) {
+    this.session = session;
+    this.inputs = {};
+    this.zeros = {};
+    for (const { name, type, shape } of session.inputMetadata) {
+      const tensor = new ort.Tensor(type, new Float32Array(shape.reduce((a, b) => a * b, 1)), shape);
+      (name.startsWith(STATE) ? this.zeros : this.inputs)[name] = tensor;
+    }
+    this.reset();
+  }
+
+  // A fresh start.
+  reset() { this.state = { ...this.zeros }; }
+
+  // One step of the inputs, arrays by name; resolves to the outputs, arrays by name.
+  async step(inputs) {
+    for (const [name, values] of Object.entries(inputs)) this.inputs[name].data.set(values);
+    const made = await this.session.run({ ...this.inputs, ...this.state });
+    const outputs = {};
+    for (const [name, tensor] of Object.entries(made)) {
+      if (name.endsWith(NEXT)) this.state[name.slice(0, -NEXT.length)] = tensor;
+      else outputs[name] = tensor.data;
+    }
+    return outputs;
+  }
+
+  // One frame of the full graph, as a Stream's `run`.
+  async pose({ positions, rotations, fresh }) {
+    if (fresh) this.reset();
+    return this.step({ tracker_positions: positions, tracker_rotations: rotations });
+  }
+
+  close() { return this.session.release(); }
+}

@@ -1,0 +1,251 @@
+// Enter VR or AR: the wearer's head and hands become a body, computed here, in front of a mirror.
+
+import { h, replace, select } from './dom.js';
+import { kindOf, trackersOf, usualOffsets } from './headset.js';
+import { Mirror } from './mirror.js';
+import { Remote } from './remote.js';
+import { heading, Stream } from './stream.js';
+import { median, percentile } from './timing.js';
+
+const MODES = { 'immersive-vr': 'Enter VR', 'immersive-ar': 'Enter AR' };
+const COUNTDOWN = 3; // seconds from the trigger to the calibration
+const AWAITED = 2; // samples that may wait for the network; what comes then is skipped
+const TIMED = 600; // the newest poses whose times are told
+const USUAL = 91; // the newest frames of the display, whose median tells its rate
+const SURE = 10; // so many of them at least
+const [SHORTEST, TALLEST] = [0.9, 2.4]; // metres; outside of them a floor or a height is wrong
+const INVITE = ['Pull a trigger or pinch, then stand upright in T-pose:', 'arms to the sides, palms down, eyes forward'];
+
+export function wear(page, site) {
+  const view = new Wear(page, site);
+  return () => view.leave();
+}
+
+class Wear {
+  constructor(page, site) {
+    Object.assign(this, { page, site, network: site.networks[0], worn: null });
+    this.canvas = h('canvas', { 'aria-label': 'What is seen in the mirror' });
+    this.trouble = h('p', { class: 'trouble' }, 'Loading the network.');
+    this.height = h('input', { type: 'number', id: 'height', min: 100, max: 230, placeholder: 'by headset' });
+    this.record = h('input', { type: 'checkbox', id: 'record' });
+    this.save = h('button', { type: 'button', id: 'save', hidden: true, onclick: () => this.saved() }, 'Save recording');
+    this.buttons = Object.entries(MODES).map(([mode, name]) =>
+      h('button', { type: 'button', class: 'primary', id: mode, disabled: true, onclick: () => this.enter(mode) }, name));
+    this.layout();
+    try {
+      this.mirror = new Mirror(this.canvas, site);
+    } catch (error) {
+      this.trouble.textContent = `This browser draws no WebGL: ${error.message}`;
+      return;
+    }
+    this.ready();
+  }
+
+  layout() {
+    const facts = [['display', 'rate', 'Hz'], ['frames', 'frames', ''], ['dropped', 'dropped', ''], ['skipped samples', 'skipped', ''], ['pose, median', 'middle', 'ms'], ['pose, p95', 'p95', 'ms'], ['height', 'tall', 'm']];
+    const named = id => (this[`${id}Text`] = h('b', { id }, '–'));
+    replace(this.page,
+      h('h1', {}, 'Your body, from head and hands'),
+      h('div', { class: 'entry' }, this.buttons,
+        this.site.networks.length > 1 && select('Network', this.site.networks.map(({ key, name }) => [key, name]), this.network.key, key => {
+          this.network = this.site.networks.find(network => network.key === key);
+          this.ready();
+        }),
+        h('label', { class: 'field' }, h('span', {}, 'Your height [cm]'), this.height),
+        h('label', { class: 'tick' }, this.record, 'record'), this.save),
+      h('p', { class: 'faint', id: 'support' }, ''),
+      this.seen = h('div', { class: 'replay' }, h('div', { class: 'view' }, h('div', { class: 'view-stage' }, this.canvas, this.trouble)),
+        h('dl', { class: 'facts' }, facts.map(([name, id, unit]) => h('div', {}, h('dt', {}, name), h('dd', {}, named(id), ` ${unit}`))))),
+      h('ol', { class: 'steps' },
+        h('li', {}, 'Put on the headset, open this page in its browser, and choose Enter VR (or AR, to see your room).'),
+        h('li', {}, 'Pull a trigger, or pinch, and stand in T-pose within three seconds: upright, arms to the sides, palms down, eyes forward.'),
+        h('li', {}, 'Look into the mirror. Pull again to calibrate anew, as after changing between controllers and hands.')));
+  }
+
+  // Load the network, and ask the browser what it can enter.
+  async ready() {
+    const remote = (this.remote = (this.remote?.close(), new Remote()));
+    try {
+      await remote.open('wear', this.network.play);
+    } catch (error) {
+      if (remote === this.remote) this.trouble.textContent = `The network did not load: ${error.message}`;
+      return;
+    }
+    const can = await Promise.all(Object.keys(MODES).map(mode => navigator.xr?.isSessionSupported(mode).catch(() => false) ?? false));
+    if (remote !== this.remote) return;
+    this.buttons.forEach((button, i) => { button.disabled = !can[i]; });
+    const why = !window.isSecureContext ? 'This address is not secure: a headset may be entered at https or localhost alone.'
+      : !navigator.xr ? 'This browser has no WebXR. Open this page in a headset’s browser.'
+      : can.some(Boolean) ? '' : 'No headset is found. Open this page in a headset’s browser.';
+    document.getElementById('support').textContent = why;
+    this.trouble.hidden = true;
+    this.seen.hidden = this.worn === null;
+    document.documentElement.dataset.wear = 'ready';
+  }
+
+  async enter(mode) {
+    if (!this.height.reportValidity()) return;
+    try {
+      const session = await navigator.xr.requestSession(mode, { requiredFeatures: ['local-floor'], optionalFeatures: ['hand-tracking'] });
+      this.begin(session, mode);
+      this.mirror.renderer.xr.setReferenceSpaceType('local-floor');
+      await this.mirror.renderer.xr.setSession(session);
+    } catch (error) {
+      document.getElementById('support').textContent = `The headset was not entered: ${error.message}`;
+    }
+  }
+
+  begin(session, mode) {
+    const { body, fps } = this.network;
+    this.worn = {
+      session, kind: null, placed: false, calibrated: false, due: null, waiting: 0, frames: 0, dropped: 0, skipped: 0, last: null, passed: [], times: [],
+      tape: this.record.checked ? [] : null,
+      stream: new Stream({ fps, body, offsets: usualOffsets(null), run: frame => this.remote.call('pose', ['wear', frame]) }),
+    };
+    this.seen.hidden = false;
+    this.scaled(null);
+    this.mirror.through(mode === 'immersive-ar');
+    this.mirror.tell(...INVITE);
+    session.addEventListener('select', () => { this.worn.due ??= performance.now() + 1000 * COUNTDOWN; });
+    session.addEventListener('visibilitychange', () => { this.worn.last = null; });
+    session.addEventListener('end', () => this.ended());
+    this.mirror.renderer.setAnimationLoop((time, frame) => this.tick(time, frame));
+  }
+
+  tick(time, frame) {
+    const space = this.mirror.renderer.xr.getReferenceSpace();
+    if (frame && space && this.worn) {
+      this.count(time);
+      const trackers = trackersOf(frame, space, this.worn.session.inputSources);
+      this.change(kindOf(this.worn.session.inputSources));
+      if (trackers[0] && !this.worn.placed) this.stand(trackers[0]);
+      this.calibrate(trackers);
+      this.feed(trackers, time / 1000);
+    }
+    this.mirror.draw();
+  }
+
+  // Count the display's frames that were dropped: those that came later than one and a half of the usual time.
+  count(time) {
+    const { worn } = this;
+    if (worn.last !== null) {
+      worn.passed.push(time - worn.last);
+      if (worn.passed.length > USUAL) worn.passed.shift();
+      const usual = median(worn.passed);
+      if (worn.passed.length >= SURE && time - worn.last > 1.5 * usual) worn.dropped += Math.round((time - worn.last) / usual) - 1;
+    }
+    worn.last = time;
+    worn.frames++;
+    if (worn.frames % 20 === 0) this.tell();
+  }
+
+  // Controllers and hands sit differently on the wrists: what was calibrated with one does not hold for the other.
+  change(kind) {
+    const { worn } = this;
+    if (kind === null || kind === worn.kind) return;
+    if (worn.kind !== null && worn.calibrated) this.mirror.tell(`Now ${kind}:`, ...INVITE);
+    Object.assign(worn, { kind, calibrated: false });
+    worn.stream.offsets = usualOffsets(kind);
+    worn.stream.reset();
+  }
+
+  stand(head) {
+    this.mirror.stand(head.position, heading(head));
+    this.worn.placed = true;
+  }
+
+  // When the countdown is over, take over how the devices sit on the body.
+  calibrate(trackers) {
+    const { worn, mirror } = this;
+    if (worn.due === null) return;
+    const left = (worn.due - performance.now()) / 1000;
+    if (left > 0) return mirror.tell(`T-pose ... ${Math.ceil(left)}`, INVITE[1]);
+    worn.due = null;
+    try {
+      if (!trackers.includes(null)) this.scaled(trackers[0]);
+      worn.stream.calibrate(...trackers);
+      worn.calibrated = true;
+      this.stand(trackers[0]);
+      mirror.tell(`Calibrated, ${worn.tall.toFixed(2)} m tall.`, 'Pull a trigger or pinch to do it again.');
+      worn.tape?.push({ calibrated: worn.stream.offsets, height: worn.tall });
+    } catch (error) {
+      mirror.tell('Not calibrated:', error.message, INVITE[0]);
+    }
+  }
+
+  // How tall the wearer is over the network's body: as typed in, else by the headset's height over the floor.
+  scaled(head) {
+    const { body } = this.network;
+    const typed = this.height.valueAsNumber / 100;
+    const tall = typed > 0 ? typed : head ? head.position[1] / body.eyes : body.height;
+    if (!(tall >= SHORTEST && tall <= TALLEST)) throw new Error(`${tall.toFixed(2)} m tall; stand upright, or type in your height`);
+    this.worn.tall = tall;
+    this.worn.stream.scale = body.height / tall;
+  }
+
+  feed(trackers, time) {
+    const { worn } = this;
+    if (worn.waiting >= AWAITED) return worn.skipped++;
+    worn.waiting++;
+    const start = performance.now();
+    const noted = { time, trackers, pose: null, held: null };
+    worn.tape?.push(noted);
+    worn.stream.step(...trackers, time).then(pose => {
+      worn.waiting--;
+      if (pose.fresh) worn.times.push(performance.now() - start);
+      if (worn.times.length > TIMED) worn.times.shift();
+      if (pose.positions) this.mirror.show(pose.positions);
+      noted.held = pose.held;
+      if (pose.fresh && worn.tape) noted.pose = { time: pose.time, positions: [...pose.positions] };
+    }, error => {
+      worn.waiting--;
+      this.mirror.tell('The network stopped:', error.message);
+    });
+  }
+
+  tell() {
+    const { worn } = this;
+    this.framesText.textContent = worn.frames;
+    this.rateText.textContent = rateOf(worn);
+    this.droppedText.textContent = worn.dropped;
+    this.skippedText.textContent = worn.skipped;
+    this.tallText.textContent = worn.tall.toFixed(2);
+    if (!worn.times.length) return;
+    this.middleText.textContent = median(worn.times).toFixed(1);
+    this.p95Text.textContent = percentile(worn.times, 95).toFixed(1);
+  }
+
+  ended() {
+    this.tell();
+    this.tape = this.worn.tape;
+    this.save.hidden = !this.tape?.length;
+    this.worn = null;
+    this.mirror.visible(false);
+    this.mirror.through(false);
+    this.mirror.renderer.setAnimationLoop(null);
+    this.seen.hidden = true;
+  }
+
+  // The recording: samples as the headset gave them, in OpenXR's axes, and the poses that were made of them; without
+  // the last ones, which still waited for the network.
+  saved() {
+    const samples = this.tape.filter(({ held, calibrated }) => held || calibrated);
+    const content = JSON.stringify({ format: 'memmlp web recording 1', run: this.network.run, joints: this.site.joints, samples });
+    const address = URL.createObjectURL(new Blob([content], { type: 'application/json' }));
+    h('a', { href: address, download: 'recording.json' }).click();
+    setTimeout(() => URL.revokeObjectURL(address), 10000);
+  }
+
+  leave() {
+    this.worn?.session.end();
+    this.remote?.close();
+    this.mirror?.dispose();
+  }
+}
+
+// The display's rate as it is, and as it should be where the browser tells it.
+function rateOf({ passed, session }) {
+  if (!passed.length) return '–';
+  const usual = (1000 / median(passed)).toFixed(0);
+  return session.frameRate ? `${usual} of ${session.frameRate.toFixed(0)}` : usual;
+}

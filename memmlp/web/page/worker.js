@@ -1,0 +1,76 @@
+// Runs networks beside the page, which goes on drawing: opens graphs, computes poses, times steps.
+
+import { fetched } from './fetched.js';
+import { Session } from './session.js';
+import { Stream } from './stream.js';
+import { clockStep, interleaved } from './timing.js';
+import { drawn } from './weights.js';
+
+const sessions = new Map();
+let runtime = null;
+
+// ONNX Runtime for a backend, "wasm" or "webgpu", on one thread; its SIMD is part of the build.
+function load(backend) {
+  runtime ??= (async () => {
+    const [ort, wasm] = await Promise.all([import(`./ort/${backend}.js`), fetched(`ort/${backend}.wasm.gz`)]);
+    ort.env.wasm.numThreads = 1;
+    ort.env.wasm.wasmBinary = wasm;
+    return { ort, backend };
+  })();
+  return runtime;
+}
+
+const calls = {
+  async open(key, { file, weights }, backend) {
+    const [{ ort }, model] = await Promise.all([load(backend), fetched(file)]);
+    sessions.set(key, await Session.open(ort, model, { weights: drawn(weights), backend }));
+  },
+
+  pose: (key, frame) => sessions.get(key).pose(frame),
+
+  // plan: [{ key, kind, body, fps }] of open graphs; kind: step, whole (from trackers to joints) or plain (no state).
+  async time(plan, each, id) {
+    const steps = Object.fromEntries(plan.map(part => [part.key, stepper[part.kind](sessions.get(part.key), part)]));
+    const times = await interleaved(steps, { each, told: share => postMessage({ id, share }) });
+    for (const part of plan) await check(steps[part.key], part.key);
+    return { times, clock: clockStep() };
+  },
+};
+
+const stepper = {
+  step(session) {
+    const sparse = Float32Array.from({ length: 54 }, (_, i) => Math.sin(12.9898 * (i + 1)));
+    return () => session.step({ sparse });
+  },
+  plain(session) {
+    const inputs = Object.fromEntries(Object.entries(session.inputs).map(([name, tensor]) => [name, tensor.data.map(() => 1)]));
+    return () => session.step(inputs);
+  },
+  // A sample of a person who sways, resampled, held and with the devices' offsets, to joints.
+  whole(session, { body, fps }) {
+    const offsets = { positions: [[0, -0.07, 0.09], [0, 0, 0], [0, 0, 0]], rotations: Array(3).fill([0, 0, 0, 1]) };
+    const stream = new Stream({ fps, body, offsets, run: frame => session.pose(frame) });
+    let count = 0;
+    return () => {
+      const angle = 0.4 * Math.sin(count++ / 20);
+      const rotation = [0, Math.sin(angle / 2), 0, Math.cos(angle / 2)];
+      const at = (x, y) => ({ position: [x + 0.1 * angle, y, 0.2 * angle], rotation });
+      return stream.step(at(0, 1.6), at(-0.3, 1), at(0.3, 1));
+    };
+  },
+};
+
+// A step whose numbers are none could be quicker or slower than the network's.
+async function check(step, key) {
+  const outputs = await step();
+  const arrays = Object.values(outputs).filter(value => value instanceof Float32Array);
+  if (!arrays.length || !arrays.every(array => array.every(Number.isFinite))) throw new Error(`${key}: its outputs are no numbers`);
+}
+
+onmessage = async ({ data: { id, call, args } }) => {
+  try {
+    postMessage({ id, value: await calls[call](...args, id) });
+  } catch (error) {
+    postMessage({ id, error: String(error?.message ?? error) });
+  }
+};

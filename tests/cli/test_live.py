@@ -1,0 +1,114 @@
+"""`memmlp live`: what it refuses in one line, and a recording that another process ends."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Memmlp, one_line
+from glb import Glb
+from processes import PATIENCE, hearing_interrupts, started
+
+from memmlp.cli.live import Room, known_of
+from memmlp.live.calibration import Calibration, save_calibration
+from memmlp.live.stream import Offsets, Stream
+from memmlp.motion.formats.npz import read_clip, write_clip
+from memmlp.motion.synthetic import synthesize_clip
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--height", "180"], "--height: goes with --udp PORT or --osc PORT"),
+        (["--from", "192.168.1.9"], "--from: goes with --udp PORT"),
+        (["--udp", "9001", "--from", "nowhere"], "nowhere"),
+        (["--udp", "9001", "--send", "--vmc", "127.0.0.1"], "--send: sends a clip's trackers alone"),
+        (["--udp", "9001", "--token", "a token of many letters"], "--token: goes with --host"),
+        (["--udp", "9001", "--host", "0.0.0.0", "--token", "short"], "--token: 5 characters"),
+        (["--vmc", "127.0.0.1:none"], "--vmc"),
+        (["--save-avatar", "{avatar}"], "is there already"),
+        (["--save-avatar", "me.glb"], "--save-avatar me.glb: no such kind of file; allowed: .vrm"),
+        (["--clip", "{clip}", "--avatar", "none.vrm"], "--avatar none.vrm: no such file"),
+        (["--clip", "{clip}", "--avatar", "{clip}"], "no binary glTF"),
+        (["--clip", "{clip}", "--record", "a.fbx"], "--record a.fbx: no such kind of file"),
+        (["--clip", "{clip}", "--record", "{clip}"], "is there already"),
+        (["--clip", "{clip}", "--vrchat", "nowhere.invalid"], "--vrchat nowhere.invalid"),
+        (["--udp", "9001", "--calibration", "{clip}"], "no calibration"),
+    ],
+)
+def test_what_is_refused(memmlp: Memmlp, clip: Path, step: Path, words: list[str], told: str):
+    avatar = clip.with_suffix(".vrm")
+    avatar.write_bytes(b"precious")
+    line = [word.format(clip=clip, avatar=avatar) for word in words]
+    assert one_line(memmlp("live", str(step), "--no-browser", "--port", "0", *line), told)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("clip") / "walk.npz"
+    write_clip(path, synthesize_clip("walking", 0, seconds=2.0, fps=60.0))
+    return path
+
+
+@pytest.fixture
+def step(step_files) -> Path:
+    return step_files("no_memory")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_a_recording_is_whole_when_the_command_is_ended(ending: int, step: Path, clip: Path, tmp_path: Path):
+    files = [tmp_path / f"me.{kind}" for kind in ("npz", "glb")]
+    line = [sys.executable, "-m", "memmlp.cli.main", "live", str(step), "--clip", str(clip), "--no-browser"]
+    for path in files:
+        line += ["--record", str(path)]
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with contextlib.ExitStack() as running:
+        with hearing_interrupts():
+            process = running.enter_context(started([*line, "--port", "0"], **pipes))
+        address = process.stdout.readline().split()[0]
+        assert "me.npz, me.glb" in process.stdout.readline()
+        watch(address, 5)
+        process.send_signal(ending)
+        _, said = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0, said
+    frames = len(read_clip(files[0], "me"))
+    assert len(Glb(files[1]).channels()["head", "rotation"][0]) == frames >= 5
+    assert all(f"{path}: {frames / 60:.1f} s" in said for path in files)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["me.glb", "me.npz"]
+
+
+def watch(address: str, frames: int) -> None:
+    """Wait until a page has seen so many frames."""
+    with urllib.request.urlopen(f"{address}events", timeout=PATIENCE) as events:
+        seen = (line for line in events if line.startswith(b"event: frame"))
+        for _ in range(frames):
+            next(seen)
+
+
+def test_the_avatar_as_a_file(memmlp: Memmlp, step: Path, tmp_path: Path):
+    assert memmlp("live", str(step), "--save-avatar", "me.vrm").code == 0
+    assert "VRMC_vrm" in Glb(tmp_path / "me.vrm").json["extensions"]
+    assert np.isfinite(Glb(tmp_path / "me.vrm").vertices(None)).all()
+
+
+def test_a_calibration_of_another_height_is_told(
+    step: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Its offsets are of that height, and would be wrong in silence."""
+    stream = Stream(step)
+    worn = Offsets(np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)))
+    save_calibration(tmp_path / "me.json", Calibration("amass", 1.72, worn, 1.80, 0.02))
+    room = Room(None, None, tmp_path / "me.json", (), (), (), None, 0, "127.0.0.1", None, True)
+    known = known_of(room, "amass", stream)
+    assert (known.height, known.floor, capsys.readouterr().err) == (1.80, 0.02, "")
+    known = known_of(room._replace(height=186.0, floor=5.0), "amass", stream)
+    assert (known.height, known.floor) == (1.86, 0.05)
+    assert "its calibration is of a height of 180 cm; calibrate again" in capsys.readouterr().err

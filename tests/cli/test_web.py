@@ -1,0 +1,47 @@
+"""`memmlp web`: what it makes of a run, and what it refuses before it computes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import command_line
+import pytest
+
+from memmlp.common.errors import InputError
+from memmlp.common.npm import ONNXRUNTIME_WEB, THREE, tarball
+from memmlp.runs.lookup import is_trained, list_runs
+
+pytestmark = pytest.mark.slow
+
+
+def test_a_site_to_play_and_wear(home: Path):
+    """Without the bench, whose AvatarPoser takes many seconds to export."""
+    try:
+        tarball(ONNXRUNTIME_WEB), tarball(THREE)
+    except InputError as error:
+        pytest.skip(str(error))
+    (run,) = [run.id for run in list_runs(home / "outputs") if is_trained(run)]
+    words = ("web", run[:6], "--out", "site", "--no-bench", "--no-webgpu", "--clips", "2", "--seconds", "1")
+    said = command_line.run(home, *words)
+    assert "python -m http.server --directory site" in said
+    about = json.loads((home / "site" / "site.json").read_text())
+    (network,) = about["networks"]
+    assert network["run"] == run
+    assert network["graphs"] == []
+    assert "base" not in about
+    assert about["backends"] == ["wasm"]
+    assert [clip["frames"] for clip in about["clips"]] == [60] * len(about["clips"])
+    assert network["clips"] == [clip["key"] for clip in about["clips"]]
+    size = sum(path.stat().st_size for path in (home / "site").rglob("*") if path.is_file())
+    assert size < 25_000_000
+    assert f"site: {size / 1e6:.1f} MB" in said
+
+
+def test_what_it_refuses(home: Path):
+    (run,) = [run.id for run in list_runs(home / "outputs") if is_trained(run)]
+    said = command_line.run(home, "web", run, run[:5], "--out", "site", code=2)
+    assert "a run is named twice" in said
+    assert "has something else in it" in command_line.run(home, "web", run, "--out", "outputs", code=2)
+    assert "begins so" in command_line.run(home, "web", "zzz", "--out", "site", code=2)
+    assert not (home / "site").exists()

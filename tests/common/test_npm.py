@@ -1,0 +1,124 @@
+"""Pinned npm packages: where they are fetched from, that their digest is checked, and what is said if not."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import subprocess
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from memmlp.common import npm
+from memmlp.common.errors import InputError
+from memmlp.common.npm import DEFAULT_REGISTRY, Package
+
+FILES = {"package/package.json": b"{}", "package/dist/a.js": b"let a;", "package/dist/b.js": b"let b;"}
+
+
+def packed(files: dict[str, bytes]) -> bytes:
+    """A tarball."""
+    made = io.BytesIO()
+    with tarfile.open(fileobj=made, mode="w:gz") as archive:
+        for name, content in files.items():
+            member = tarfile.TarInfo(name)
+            member.size = len(content)
+            archive.addfile(member, io.BytesIO(content))
+    return made.getvalue()
+
+
+@pytest.fixture
+def package() -> tuple[Package, bytes]:
+    """A package of a scope, and its tarball."""
+    content = packed(FILES)
+    digest = base64.b64encode(hashlib.sha512(content).digest()).decode()
+    return Package("@scope/name", "1.2.3", f"sha512-{digest}"), content
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache of its own, and a registry that is a folder."""
+    for name in ("NPM_CONFIG_REGISTRY", "npm_config_registry", "NPM_CONFIG_USERCONFIG", npm.FOLDER):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    return tmp_path
+
+
+def serve(folder: Path, content: bytes, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Lay the tarball where a registry has it, and configure that registry."""
+    path = folder / "registry" / "@scope" / "name" / "-" / "name-1.2.3.tgz"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(content)
+    monkeypatch.setenv("NPM_CONFIG_REGISTRY", (folder / "registry").as_uri())
+    return path
+
+
+def test_it_is_fetched_once_and_read_member_by_member(package, place, monkeypatch):
+    pinned, content = package
+    source = serve(place, content, monkeypatch)
+    assert npm.read(pinned, ["dist/a.js", "dist/b.js"]) == {"dist/a.js": b"let a;", "dist/b.js": b"let b;"}
+    source.unlink()
+    assert npm.read(pinned, ["package.json"]) == {"package.json": b"{}"}
+    assert [path.name for path in (place / "cache" / "memmlp" / "npm").iterdir()] == ["scope-name-1.2.3.tgz"]
+    with pytest.raises(KeyError, match=r"@scope/name@1.2.3 has no dist/c.js"):
+        npm.read(pinned, ["dist/a.js", "dist/c.js"])
+
+
+def test_another_file_is_refused_and_not_kept(package, place, monkeypatch):
+    pinned, _ = package
+    serve(place, packed({"package/dist/a.js": b"evil"}), monkeypatch)
+    with pytest.raises(InputError, match=r"^@scope/name@1.2.3: the npm registry gave another file"):
+        npm.tarball(pinned)
+    assert not list(npm.cache().glob("*"))
+
+
+def test_a_kept_file_that_was_changed_is_fetched_again(package, place, monkeypatch):
+    pinned, content = package
+    serve(place, content, monkeypatch)
+    npm.tarball(pinned).write_bytes(content[:-5])
+    assert npm.tarball(pinned).read_bytes() == content
+
+
+def test_a_folder_of_tarballs_comes_first(package, place, monkeypatch):
+    pinned, content = package
+    monkeypatch.setenv(npm.FOLDER, str(place / "given"))
+    monkeypatch.setenv("NPM_CONFIG_REGISTRY", (place / "nothing").as_uri())
+    with pytest.raises(InputError, match=r"cannot be fetched .*MEMMLP_NPM=FOLDER with scope-name-1.2.3.tgz"):
+        npm.tarball(pinned)
+    (place / "given").mkdir()
+    file = place / "given" / "scope-name-1.2.3.tgz"
+    file.write_bytes(content)
+    assert npm.tarball(pinned) == file
+    file.write_bytes(content[1:])
+    with pytest.raises(InputError, match=r"scope-name-1.2.3.tgz: not @scope/name@1.2.3 as pinned"):
+        npm.tarball(pinned)
+
+
+@pytest.mark.parametrize("address", ["http://127.0.0.1:9/", "no address"])
+def test_a_registry_out_of_reach_is_one_line(package, address, monkeypatch):
+    monkeypatch.setenv("NPM_CONFIG_REGISTRY", address)
+    with pytest.raises(InputError) as told:
+        npm.tarball(package[0])
+    assert str(told.value).startswith("@scope/name@1.2.3: cannot be fetched from the npm registry (")
+    assert "npm pack @scope/name@1.2.3" in str(told.value)
+
+
+def test_the_registry_is_npm_s(place, monkeypatch):
+    monkeypatch.setattr(npm.shutil, "which", lambda name: None)
+    assert npm.registry() == DEFAULT_REGISTRY
+    (place / ".npmrc").write_text("fund=false\nregistry = https://mine.example/npm\n")
+    assert npm.registry() == "https://mine.example/npm"
+    monkeypatch.setattr(npm.shutil, "which", lambda name: "/bin/npm")
+    said = subprocess.CompletedProcess([], 0, "https://asked.example/\n", "")
+    monkeypatch.setattr(npm.subprocess, "run", lambda *_, **__: said)
+    assert npm.registry() == "https://asked.example/"
+    monkeypatch.setenv("NPM_CONFIG_REGISTRY", "https://set.example/")
+    assert npm.registry() == "https://set.example/"
+
+
+def test_the_pins_are_whole():
+    for pinned in (npm.THREE, npm.THREE_VRM, npm.ONNXRUNTIME_WEB, npm.IWER):
+        assert len(base64.b64decode(pinned.integrity.removeprefix("sha512-"))) == 64

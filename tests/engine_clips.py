@@ -1,0 +1,60 @@
+"""A clip of trackers through a tiny network in a space, as the examples of docs/examples read it."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+from typing import NamedTuple
+
+import exported
+import numpy as np
+import wearer
+from filelock import FileLock
+
+from memmlp.live.rotations import matrix_to_quaternion
+from memmlp.live.spaces import SPACES
+from memmlp.live.stream import Pose, Stream
+
+EXAMPLES = Path(__file__).parent.parent / "docs/examples"
+PERSON = wearer.person(np.arange(61) / 60)
+
+
+class Played(NamedTuple):
+    """The files of a clip and a network in a space, and the poses that `memmlp.Stream` makes of them."""
+
+    network: Path
+    trackers: Path
+    poses: list[Pose]
+
+    @property
+    def joints(self) -> np.ndarray:
+        """Positions (N, 22, 3), metres."""
+        return wearer.joints(self.poses)
+
+
+def trackers(space: str) -> np.ndarray:
+    """Head, left and right of the clip (N, 3, 7), x y z qx qy qz qw."""
+    there = SPACES[space]
+    rotations = there.rotations_out(PERSON.rotations)
+    quaternions = matrix_to_quaternion(rotations.reshape(-1, 3, 3)).reshape(-1, 3, 4)
+    return np.concatenate([there.positions_out(PERSON.positions), quaternions], -1)
+
+
+def play(folder: Path, step: Path, space: str) -> Played:
+    """Write the files into a folder, once for all processes; `step` is the network alone."""
+    network, path = folder / f"{space}.onnx", folder / f"{space}.csv"
+    with FileLock(f"{network}.lock"):
+        if not network.exists():
+            export(network, space)
+            runpy.run_path(str(EXAMPLES / "trackers.py"))["write"](path, trackers(space))
+    there = SPACES[space]
+    given = there.positions_out(PERSON.positions), there.rotations_out(PERSON.rotations)
+    return Played(network, path, wearer.play(Stream(step, space=space), *given))
+
+
+def export(path: Path, space: str) -> None:
+    """Export the whole way from trackers to joints."""
+    from memmlp.live.full_graph import export_full  # it takes seconds to import
+    from memmlp.networks.streaming import streaming
+
+    export_full(streaming(exported.NETWORKS["mem_mlp"]()), path, "0123456789abcdef", space)

@@ -1,0 +1,186 @@
+"""The example for Unity, compiled by Mono against stand-ins of Unity's types, with the network run from here.
+
+It shows that the scripts compile in C# 7, and that states, axes, frames, holding, calibration and the rig are
+right as far as the stand-ins (tests/examples/unity) are; it does not show that Unity takes them.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+import onnxruntime
+import pytest
+import wearer
+from engine_clips import EXAMPLES, PERSON, Played, trackers
+from processes import started
+from scipy.spatial.transform import Rotation
+
+from memmlp.deploy.session import open_session
+from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix
+from memmlp.live.spaces import SPACES
+from memmlp.live.stream import Stream
+from memmlp.live.trackers import GAP
+from memmlp.motion.body import PARENTS, builtin_rest_joints
+
+pytestmark = pytest.mark.slow
+
+SPACE = SPACES["unity"]
+REST = builtin_rest_joints() * SPACE.body
+Rows = list[tuple[float, np.ndarray, str]]  # a time, trackers (3, 7) with NaN where lost, a word
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The example, compiled."""
+    if shutil.which("mcs") is None or shutil.which("mono") is None:
+        pytest.skip("Mono is not installed (apt-get install mono-mcs mono-runtime)")
+    path = tmp_path_factory.mktemp("unity") / "play.exe"
+    sources = [*EXAMPLES.glob("unity/*.cs"), *Path(__file__).parent.glob("unity/*.cs")]
+    command = ["mcs", "-langversion:7.2", "-warnaserror", f"-out:{path}", *map(str, sources)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return path
+
+
+class Player:
+    """Plays samples through the example.
+
+    Attributes:
+        taken: the trackers' positions (3, 3) of each frame that the network was given.
+        turned: how each bone turned since the T-pose (N, 22, 3, 3), in the world.
+    """
+
+    def __init__(self, program: Path, network: Path, folder: Path):
+        self.program, self.folder, self.session = program, folder, open_session(network)
+        self.quaternions = False  # whether the network gives rotations as these
+
+    def __call__(self, rows: Rows) -> np.ndarray:
+        """Where the rig's bones (N, 22, 3) are after each sample."""
+        names = ("model.txt", "avatar.csv", "samples.csv", "bones.csv")
+        model, avatar, samples, out = files = [self.folder / name for name in names]
+        parts = (self.session.get_inputs(), self.session.get_outputs())
+        ends = "\n\n".join("\n".join(described(one) for one in part) for part in parts)
+        model.write_text(ends.replace("rotations 1 22 3 3", "rotations 1 22 4") if self.quaternions else ends)
+        np.savetxt(avatar, REST, delimiter=",")
+        samples.write_text("\n".join(",".join(written(*row)) for row in rows))
+        self.taken: list[np.ndarray] = []
+        command = ["mono", str(self.program), *map(str, files)]
+        with started(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+            while given := self._inputs(process.stdout):
+                self.taken.append(given["tracker_positions"][0])
+                for made in self.session.run(None, given):
+                    if self.quaternions and made.shape == (1, 22, 3, 3):
+                        made = matrix_to_quaternion(made[0])
+                    process.stdin.write(made.astype(np.float32).tobytes())
+                process.stdin.flush()
+            assert process.wait(60) == 0
+        bones = np.loadtxt(out, delimiter=",").reshape(-1, 22, 7)
+        self.turned = quaternion_to_matrix(bones[..., 3:])
+        return bones[..., :3]
+
+    def _inputs(self, stream: IO[bytes]) -> dict[str, np.ndarray]:
+        """The inputs of the next step that the program asks for; none at its end."""
+        given = {}
+        for one in self.session.get_inputs():
+            data = stream.read(4 * int(np.prod(one.shape)))
+            if not data:
+                return {}
+            given[one.name] = np.frombuffer(data, np.float32).reshape(one.shape)
+        return given
+
+
+@pytest.fixture
+def play(program: Path, played: Callable[[str], Played], tmp_path: Path) -> Player:
+    return Player(program, played("unity").network, tmp_path)
+
+
+def described(end: onnxruntime.NodeArg) -> str:
+    """The name and shape of an input or output."""
+    return " ".join(map(str, (end.name, *end.shape)))
+
+
+def written(time: float, frame: np.ndarray, word: str) -> list[str]:
+    """The words of a row."""
+    places = ["" if np.isnan(value) else repr(float(value)) for value in frame.ravel()]
+    return [repr(time), *places, word]
+
+
+def rows(frames: np.ndarray, fps: float = 60) -> Rows:
+    return [(index / fps, frame, "") for index, frame in enumerate(frames)]
+
+
+def poses(stream: Stream, rows: Rows) -> np.ndarray:
+    """The positions (N, 22, 3) that a stream gives for the same samples."""
+    made = []
+    for time, frame, word in rows:
+        given = [None if np.isnan(one).any() else (one[:3], one[3:]) for one in frame]
+        made.append(stream.step(*given, time).positions)
+        if word == "calibrate":
+            stream.calibrate(*given)
+    return np.array(made)
+
+
+@pytest.fixture
+def stream(step_files: Callable[[str], Path]) -> Stream:
+    return Stream(step_files("mem_mlp"), space="unity")
+
+
+@pytest.mark.parametrize("quaternions", [False, True])
+def test_bones_are_where_the_stream_has_the_joints(
+    quaternions: bool, play: Player, played: Callable[[str], Played]
+):
+    play.quaternions = quaternions
+    bones = play(rows(trackers("unity")))
+    assert wearer.fastest(bones) > 10
+    np.testing.assert_allclose(bones, played("unity").joints, atol=1e-4)
+    turns = np.stack([pose.rotations for pose in played("unity").poses])
+    for joint, parent in enumerate(PARENTS[1:], 1):
+        turns[:, joint] = turns[:, parent] @ turns[:, joint]
+    np.testing.assert_allclose(play.turned, turns, atol=1e-4)
+
+
+def test_other_rates_and_gaps(play: Player, stream: Stream):
+    """At 90 Hz some samples bring no frame, at 37 some bring two; after a gap all begins anew."""
+    fast, slow = rows(trackers("unity")[:40], 90), rows(trackers("unity")[:20], 37)
+    samples = fast + [(time + fast[-1][0] + GAP + 0.1, *rest) for time, *rest in slow]
+    np.testing.assert_allclose(play(samples), poses(stream, samples), atol=1e-4)
+
+
+def test_a_lost_hand_is_held_and_comes_back_slowly(play: Player, stream: Stream):
+    frames = trackers("unity").copy()
+    frames[20:35, 1] = np.nan
+    bones, expected = play(rows(frames)), poses(stream, rows(frames))
+    np.testing.assert_allclose(bones[:35], expected[:35], atol=1e-4)
+    assert np.isfinite(bones).all()
+    # On its way back the hand never jumps, and in the end it is where it is.
+    hand, there = np.array([frame[1] for frame in play.taken]), trackers("unity")[:, 1, :3]
+    jump = np.linalg.norm(hand[34] - there[35])
+    assert jump > 0.1
+    assert np.linalg.norm(np.diff(hand, axis=0), axis=-1).max() < jump / 4
+    np.testing.assert_allclose(hand[35 + 12 :], there[35 + 12 :], atol=1e-5)
+
+
+def test_calibration_is_that_of_the_stream(play: Player, stream: Stream):
+    """Devices that sit askew and apart from the joints, on a wearer in T-pose who looks to the side."""
+    turn = Rotation.from_euler("y", 50, degrees=True).as_matrix()
+    stance = np.array([0.3, 0.95, -0.2]) + REST[[15, 20, 21]] @ turn.T
+    joints = [(stance, np.tile(turn, (3, 1, 1)))]
+    moving = trackers("unity")
+    joints += [(frame[:, :3], quaternion_to_matrix(frame[:, 3:])) for frame in moving]
+    askew = Rotation.from_euler("xyz", [[10, 5, 0], [70, -20, 30], [60, 20, -40]], degrees=True).as_matrix()
+    away = np.array([[0, 0.02, 0.08], [0.01, 0.03, -0.05], [-0.01, 0.03, -0.05]])
+    frames = [
+        np.concatenate([place + (turned @ away[..., None])[..., 0], matrix_to_quaternion(turned @ askew)], 1)
+        for place, turned in joints
+    ]
+    samples = [
+        (time, frame, "" if index else "calibrate") for index, (time, frame, _) in enumerate(rows(frames))
+    ]
+    bones = play(samples)
+    np.testing.assert_allclose(bones, poses(stream, samples), atol=1e-4)
+    assert len(bones) == len(PERSON.positions) + 1

@@ -1,0 +1,66 @@
+"""The example that prints hips and head of VMC packets, sent by another implementation of OSC."""
+
+from __future__ import annotations
+
+import re
+import socket
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from engine_clips import EXAMPLES
+from processes import started
+from scipy.spatial.transform import Rotation
+
+builder = pytest.importorskip("pythonosc.osc_bundle_builder")
+message = pytest.importorskip("pythonosc.osc_message_builder")
+
+CHAIN = ("root", "Hips", "Spine", "Chest", "Neck", "Head")  # a body without an upper chest
+FRAMES = 4
+
+
+def packet(name: str, values: np.ndarray) -> bytes:
+    """A message as the specification has it, in a bundle within a bundle."""
+    made = message.OscMessageBuilder(f"/VMC/Ext/{'Root' if name == 'root' else 'Bone'}/Pos")
+    made.add_arg(name)
+    for value in values:
+        made.add_arg(float(value), "f")
+    inner, outer = (builder.OscBundleBuilder(builder.IMMEDIATELY) for _ in range(2))
+    time = message.OscMessageBuilder("/VMC/Ext/T")
+    time.add_arg(1.5, "f")
+    inner.add_content(time.build())
+    inner.add_content(made.build())
+    outer.add_content(inner.build())
+    return outer.build().dgram
+
+
+@pytest.mark.slow
+def test_it_prints_hips_and_head():
+    random = np.random.default_rng(0)
+    frames = random.normal(size=(FRAMES + 1, len(CHAIN), 7))
+    frames[..., 3:] /= np.linalg.norm(frames[..., 3:], axis=-1, keepdims=True)
+    command = [sys.executable, str(EXAMPLES / "vmc/receive.py"), "--port", "0", "--frames", str(FRAMES)]
+    with (
+        started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        port = int(re.search(r"\d+", process.stderr.readline())[0])
+        for frame in frames:  # the last is what ends the one before it
+            for name, values in zip(CHAIN, frame, strict=True):
+                sender.sendto(packet(name, values), ("127.0.0.1", port))
+        said, wrong = process.communicate(timeout=60)
+    assert (process.returncode, wrong) == (0, "")
+    found = np.array([line.split()[1:4] + line.split()[5:] for line in said.splitlines()], float)
+    np.testing.assert_allclose(found, [hips_and_head(frame) for frame in frames[:-1]], atol=1e-3)
+
+
+def hips_and_head(frame: np.ndarray) -> list[float]:
+    """By matrices."""
+    world, found = np.eye(4), {}
+    for name, values in zip(CHAIN, frame, strict=True):
+        local = np.eye(4)
+        local[:3, :3], local[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]
+        world = world @ local
+        found[name] = world[:3, 3]
+    return [*found["Hips"], *found["Head"]]

@@ -1,0 +1,106 @@
+"""Wearers of other heights and on other floors: the same stream, at their size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import wearer as moving
+
+from memmlp.common.errors import InputError
+from memmlp.live.rotations import BodyTree
+from memmlp.live.spaces import SPACES
+from memmlp.live.stream import Stream
+from memmlp.live.trackers import t_pose
+from memmlp.live.wearer import stature, wearer
+from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
+
+BODY = BodyTree(JOINTS, PARENTS, builtin_rest_joints())
+PERSON = moving.person(np.arange(40) / 60)
+HEIGHT, FLOOR = 1.95, 0.4
+SIZE = HEIGHT / 1.72
+
+
+@pytest.fixture
+def file(step_files: Callable[[str], Path]) -> Path:
+    return step_files("no_memory")
+
+
+def test_the_built_in_body_is_as_tall_as_it_says():
+    assert stature(BODY) == pytest.approx(1.72)
+    assert wearer(BODY).scale == 1
+
+
+def test_in_and_out_again_and_the_floor_comes_to_zero():
+    tall = wearer(BODY, 2.0, 0.3)
+    standing = np.array([[0.5, -0.25, 0.3], [0.0, 0.0, 2.3]])  # on the floor, and the top of the head
+    np.testing.assert_allclose(tall.positions_in(standing)[:, 2], [0, 1.72], atol=1e-12)
+    np.testing.assert_allclose(tall.positions_out(tall.positions_in(standing)), standing, atol=1e-12)
+    assert tall.positions_out(standing.astype(np.float32)).dtype == np.float32
+
+
+@pytest.mark.parametrize("height", [0.1, 180, float("nan"), "tall"])
+def test_no_height_of_a_person_is_refused(height):
+    with pytest.raises(InputError, match=r"height=.*allowed are 0.5 to 2.5 metres"):
+        wearer(BODY, height)
+
+
+@pytest.mark.parametrize("floor", [1e3, float("inf"), None])
+def test_no_floor_is_refused(floor):
+    with pytest.raises(InputError, match=r"floor=.*allowed is a height in metres"):
+        wearer(BODY, None, floor)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SPACES)
+def test_a_tall_wearer_on_a_raised_floor_moves_as_the_network_s_body(name: str, file: Path):
+    space = SPACES[name]
+
+    def there(positions: np.ndarray) -> np.ndarray:
+        return space.positions_out(positions * SIZE + [0, 0, FLOOR])
+
+    plain = moving.play(Stream(file), PERSON.positions, PERSON.rotations)
+    tall = Stream(file, space=name, height=HEIGHT, floor=FLOOR)
+    poses = moving.play(tall, there(PERSON.positions), space.rotations_out(PERSON.rotations))
+    for here, pose in zip(plain, poses, strict=True):
+        np.testing.assert_allclose(pose.positions, there(here.positions), atol=1e-4)
+        np.testing.assert_allclose(pose.position_branch, there(here.position_branch), atol=1e-4)
+        np.testing.assert_allclose(pose.rotations, space.pose_out(here.rotations), atol=1e-4)
+    np.testing.assert_allclose(tall.rest, builtin_rest_joints() * SIZE)
+
+
+@pytest.mark.slow
+def test_another_height_begins_anew(file: Path):
+    stream = Stream(file)
+    moving.play(stream, PERSON.positions, PERSON.rotations)
+    stream.fit(HEIGHT, FLOOR)
+    pose = stream.step(*zip(PERSON.positions[0], PERSON.rotations[0], strict=True))
+    assert pose.restarted
+    assert (stream.wearer.height, stream.wearer.floor) == (HEIGHT, FLOOR)
+    assert stream.network_seconds > 0
+
+
+@pytest.mark.slow
+def test_calibration_takes_the_wearer_s_height(file: Path):
+    """Devices exactly on the joints of a tall person in T-pose have no offsets; without a height they do."""
+    pose = t_pose(BODY, np.array([0.3, 0.2, 1.6]), 0.7)
+    devices = list(zip(pose.positions * SIZE + [0, 0, FLOOR], pose.rotations, strict=True))
+    fitted = Stream(file, height=HEIGHT, floor=FLOOR).calibrate(*devices)
+    assert np.abs(fitted.positions).max() < 1e-6
+    assert np.abs(fitted.rotations - np.eye(3)).max() < 1e-6
+    assert np.abs(Stream(file).calibrate(*devices).positions).max() > 0.05
+
+
+@pytest.mark.slow
+def test_offsets_are_metres_of_the_wearer(file: Path):
+    """After calibration a T-pose has the wearer's hands where the tall body's are, whatever the devices."""
+    pose = t_pose(BODY, np.array([0.0, 0.0, 1.58]), 0.0)
+    joints = pose.positions * SIZE
+    away = np.array([[0, -0.09, 0.05], [0.06, 0, 0], [-0.06, 0, 0]])
+    devices = list(zip(joints + away, pose.rotations, strict=True))
+    stream = Stream(file, height=HEIGHT)
+    stream.calibrate(*devices)
+    head = stream.step(*devices).positions[JOINTS.index("head")]
+    assert np.linalg.norm(head - (joints[0] + away.mean(0))) < 1e-6
