@@ -118,6 +118,16 @@ def forked(work: Callable[..., object], *arguments: Any, **environment: str) -> 
 
 
 @contextlib.contextmanager
+def hearing_interrupts() -> Iterator[None]:
+    """As from a terminal: processes started herein hear SIGINT, where this one ignores it (nohup, or `&`)."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
 def ignoring_interrupts() -> Iterator[None]:
     """As in what nohup started: processes started herein ignore SIGINT, if they do nothing about it."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

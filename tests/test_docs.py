@@ -110,9 +110,10 @@ def test_what_is_wrong_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.chdir(tmp_path)
     for wrong in (
         "memmlp trian", "memmlp train memry=none", "memmlp train -m seed=0,x", "memmlp sweep 14 --jobs 3",
-        "memmlp sweep 14 memory.shift=day", "memmlp sweep 99", "memmlp export RUN", "memmlp runs lost",
-        "memmlp table 14 --format doc", "memmlp tune search.n_trial=3", "memmlp live RUN --udp many",
-        "memmlp sweep 14 executor=slurm slurm.nodes=3", "make everything", "docker build --build-arg GPU=1 .",
+        "memmlp sweep 14 memory.shift=day", "memmlp sweep 99", "memmlp export RUN --opset 9",
+        "memmlp runs lost", "memmlp table 14 --format doc", "memmlp tune search.n_trial=3",
+        "memmlp live RUN --udp many", "memmlp sweep 14 executor=slurm slurm.nodes=3", "make everything",
+        "docker build --build-arg GPU=1 .",
         "python docs/examples/none.py", "python docs/examples/trackers.py a.npz --out b --space mars",
         "python docs/examples/vmc/receive.py --prt 1", "node docs/examples/none.mjs",
     ):  # fmt: skip

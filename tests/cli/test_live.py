@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import subprocess
 import sys
 import urllib.request
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from conftest import Memmlp, one_line
 from glb import Glb
-from processes import PATIENCE, started
+from processes import PATIENCE, hearing_interrupts, started
 
 from memmlp.cli.live import Room, known_of
 from memmlp.live.calibration import Calibration, save_calibration
@@ -67,10 +69,10 @@ def test_a_recording_is_whole_when_the_command_is_ended(ending: int, step: Path,
     line = [sys.executable, "-m", "memmlp.cli.main", "live", str(step), "--clip", str(clip), "--no-browser"]
     for path in files:
         line += ["--record", str(path)]
-    with started(
-        [*line, "--port", "0"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with contextlib.ExitStack() as running:
+        with hearing_interrupts():
+            process = running.enter_context(started([*line, "--port", "0"], **pipes))
         address = process.stdout.readline().split()[0]
         assert "me.npz, me.glb" in process.stdout.readline()
         watch(address, 5)

@@ -159,7 +159,13 @@ def deployed(experiment: Experiment, model: Any, clip: MotionDataset) -> list[An
             motion, state = network.advance(clip.frames[None, t : t + 1, :54], state, 1)
             motions.append(motion.tolist())
     settings = experiment.deployment
-    return [type(network).__name__, settings.precision, max(settings.latency_steps, 200), motions]
+    return [
+        type(network).__name__,
+        settings.precision,
+        settings.opset,
+        max(settings.latency_steps, 200),
+        motions,
+    ]
 
 
 def digest(value: Any) -> str:

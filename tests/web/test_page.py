@@ -130,9 +130,7 @@ def check_wearer(recording: dict[str, Any], site: Made) -> None:
     begun = recording["samples"].index(calibrated[0])
     offsets = Offsets(*(calibrated[0]["calibrated"][key] for key in ("positions", "rotations")))
     stream, apart = Stream(site.step, space="openxr", height=calibrated[0]["height"]), []
-    worn = recording[
-        "worn"
-    ]  # how the devices sat on the network's own body, which is laid as near as it can be
+    worn = recording["worn"]  # how the devices sat on the network's own body, laid as near as it can be
     np.testing.assert_allclose(offsets.rotations, worn["rotations"], atol=1e-5)
     np.testing.assert_allclose(offsets.positions[0], 2 / 3 * np.array(worn["positions"][0]), atol=1e-5)
     found = stream.calibrate(*given(recording["samples"][begun - 1]["trackers"]))

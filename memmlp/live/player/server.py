@@ -7,6 +7,7 @@ and go; a slow one misses frames, and holds up nobody.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import queue
 import socket
@@ -235,7 +236,8 @@ class Server(ThreadingHTTPServer):
         try:
             super().__init__((host, port), Handler)
         except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or error
+            taken = getattr(error, "errno", None) == errno.EADDRINUSE
+            reason = "taken" if taken else getattr(error, "strerror", None) or error
             allowed = "allowed are this machine's addresses and free ports"
             raise InputError(f"--host {host} --port {port}: {reason}; {allowed}") from None
 

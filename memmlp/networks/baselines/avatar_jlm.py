@@ -32,9 +32,14 @@ GROUPS = 8  # of the regressor's normalisation
 PARTS = (SPARSE_ROTATION, SPARSE_ANGULAR_VELOCITY, SPARSE_POSITION, SPARSE_VELOCITY)
 
 
+def tracker_features(encoded: Tensor) -> Tensor:
+    """Return inputs (..., 54) by tracker (..., 3, 18)."""
+    return torch.cat([encoded[..., part].unflatten(-1, (len(TRACKED), -1)) for part in PARTS], -1)
+
+
 def joint_features(encoded: Tensor) -> Tensor:
     """Spread inputs (..., 54) over the joints (..., 22 x 18); joints without a tracker hold a constant."""
-    trackers = torch.cat([encoded[..., part].unflatten(-1, (len(TRACKED), -1)) for part in PARTS], -1)
+    trackers = tracker_features(encoded)
     unseen = torch.full_like(trackers[..., :1, :], UNSEEN)
     seen = dict(zip(TRACKED, trackers.split(1, -2), strict=True))
     rows = [seen.get(joint, unseen) for joint in range(N_JOINTS)]

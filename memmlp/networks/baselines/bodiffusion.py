@@ -28,16 +28,18 @@ class DiTBlock(nn.Module):
     """Attention and an MLP, shifted, scaled and gated by the diffusion time (Peebles & Xie 2023, adaLN).
 
     Args:
-        width: d, the width of the features and of the MLP's hidden layer.
+        width: d, the width of the features.
         heads: number of attention heads; it divides d.
+        ratio: the MLP's hidden layer has so many times d.
     """
 
-    def __init__(self, width: int, heads: int):
+    def __init__(self, width: int, heads: int, ratio: int = 1):
         super().__init__()
         self.attention_norm = nn.LayerNorm(width, eps=1e-6, elementwise_affine=False)
         self.attention = Attention(width, heads)
         self.norm = nn.LayerNorm(width, eps=1e-6, elementwise_affine=False)
-        self.mlp = nn.Sequential(nn.Linear(width, width), nn.GELU("tanh"), nn.Linear(width, width))
+        hidden = ratio * width
+        self.mlp = nn.Sequential(nn.Linear(width, hidden), nn.GELU("tanh"), nn.Linear(hidden, width))
         self.modulation = nn.Linear(width, 6 * width)
 
     def forward(self, h: Tensor, time: Tensor) -> Tensor:

@@ -129,7 +129,7 @@ class EgoPoserStream(StreamingGraph):
 class AGRoLStream(StreamingGraph):
     """The base of the streaming graphs of AGRoL's networks; it carries the stem's outputs."""
 
-    ends: tuple[str, ...] = ("model.stem", "model.head")
+    ends = ("model.stem", "model.head")
     width: int
     blocks: list[MLPBlock]
 

@@ -23,7 +23,7 @@ class BoDiffusionStream(AGRoLStream):
     frame alone is made.
     """
 
-    ends = ("sparse", "motion", "made")
+    ends: tuple[str, ...] = ("sparse", "motion", "made")  # type: ignore[assignment]
     model: BoDiffusion
     blocks: list[DiTBlock]  # type: ignore[assignment]
     modulations: Tensor

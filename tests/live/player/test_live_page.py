@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chromium import Browser
-from processes import PATIENCE
+from processes import PATIENCE, until
 
 from memmlp.live.player.fitting import Fitting
 from memmlp.live.player.play import greeting, play
@@ -107,8 +107,8 @@ def test_the_wearer_fits_the_stream_from_the_page(browser: Browser, network: Pat
         for name, value in (("height", 186), ("floor", 5)):
             change = f"i.value = {value}; i.dispatchEvent(new Event('change'))"
             browser.value(f"(i => {{ {change} }})(document.querySelector('#{name}'))")
+            until(lambda name=name, value=value: getattr(stream.wearer, name) == value / 100, name)
         browser.wait("document.querySelector('#said').textContent.includes('5 cm')")
-        assert (stream.wearer.height, stream.wearer.floor) == (1.86, 0.05)
         browser.click("#calibrate")
         browser.wait("!document.querySelector('#countdown').hidden")
         assert browser.value("document.querySelector('#what').textContent") == "Stand in a T-pose"
@@ -121,6 +121,21 @@ def test_the_wearer_fits_the_stream_from_the_page(browser: Browser, network: Pat
         assert browser.wait(whole) > 0
         stopped.set()
         loop.join(PATIENCE)
+    assert browser.errors == []
+
+
+def test_the_printed_address_opens_the_page_for_others(browser: Browser, clip: TrackedClip):
+    """Scripts, frames and orders go by the cookie, and the token stands in the address no more."""
+    asked: list[object] = []
+    hub = Hub(greeting(Worn(clip, 60), "tiny"))
+    with Server(hub, 0, "0.0.0.0", ask=asked.append) as server:
+        address = f"http://127.0.0.1:{server.server_port}/"
+        browser.call("Page.navigate", url=f"{address}?{server.url.partition('?')[2]}")
+        browser.wait(f"location.href == '{address}' && document.readyState == 'complete'")
+        browser.wait("document.querySelector('#about').textContent == 'tiny · person at 60 Hz'")
+        browser.click("#calibrate")
+        until(lambda: asked, "an order")
+    assert asked == [{"action": "calibrate", "value": None}]
     assert browser.errors == []
 
 
