@@ -110,7 +110,7 @@ class ProfileConfig:
     The other groups read their defaults from here; any of them can be overridden in its own group.
     """
 
-    synth_minutes: float = positive()
+    synth_minutes: Optional[float] = optional(Within(0, strict=True))
     frames: int = at_least(2)
     width: int = at_least(1)
     depth: int = at_least(1)
