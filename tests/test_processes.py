@@ -47,7 +47,7 @@ def test_all_that_a_test_started_ends(tmp_path: Path):
         assert process.pid in pids
         assert os.getpid() not in pids
         end_all()
-    assert all(ended(pid) for pid in pids)
+    until(lambda: all(ended(pid) for pid in pids), "they have ended")
     assert process.returncode == -signal.SIGKILL
     with started([sys.executable, "-c", STUBBORN, STUBBORN]) as process:
         until(lambda: len(marked()) == 2, "both are there", process)
