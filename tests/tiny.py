@@ -22,6 +22,7 @@ from memmlp.networks.baselines.ego_poser import EgoPoser
 from memmlp.networks.baselines.hmd_poser import HMDPoser
 from memmlp.networks.baselines.manikin import ManikinL, ManikinS
 from memmlp.networks.baselines.rpm import RPM
+from memmlp.networks.baselines.sage_net import SAGENet
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import CodeMemory, JointCodeMemory, Memory, NoMemory, RecurrentMemory
@@ -130,6 +131,10 @@ BASELINES: dict[str, Callable[..., WindowModel]] = {
         ManikinL, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, coarse=1.0, parts=1.0,
         turned=True, offline=False,
     ),
+    "sage": partial(
+        SAGENet, frames=8, width=16, depth=2, heads=2, code_width=16, code_depth=2, code_heads=2, dropout=0.1,
+        diffusion_steps=50, sampling_steps=3, noise=0.01, noise_seed=0,
+    ),
 }  # fmt: skip
 WINDOWLESS = ["hmd_poser", "vae_hmd", "rpm"]
 """Baselines without a window, which are streams in both modes of evaluation."""
@@ -145,6 +150,7 @@ BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
     "vae_hmd": partial(TermsLoss, "square", rotation=1.0, position=20.0, angle=0.1),
     "avatar_jlm": partial(TermsLoss, rotation=2.0, position=5.0, velocity_3=16.0, contact=20.0, hand=5.0),
     "rpm": partial(TermsLoss, rotation=1.0, sixd_velocity=1.0, world_position=1.0, velocity=1.0),
+    "sage": partial(TermsLoss, "norm", orientation=0.02, rotation=1.0, world_position=5.0),
     "manikin_s": partial(TermsLoss, orientation=0.02),
     "manikin_l": partial(TermsLoss, orientation=0.02, world_position=40.0, velocity=50.0, hand=5.0),
 }

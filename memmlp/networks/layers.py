@@ -126,4 +126,4 @@ def _draws(layer: nn.Module) -> bool:
 
 
 def _counts(layer: nn.Module) -> bool:
-    return isinstance(layer, _BatchNorm)
+    return isinstance(layer, _BatchNorm) or getattr(layer, "of_whole_batch", False)

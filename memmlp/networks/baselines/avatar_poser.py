@@ -24,15 +24,38 @@ def head(width: int, size: int) -> nn.Module:
     return nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, size))
 
 
-class AvatarPoser(WindowModel):
+class OwnWindows(WindowModel):
+    """The base of networks that make every frame from its own window (`rotations`).
+
+    Both evaluation modes give the same numbers, except for the shifted tail window: there the buffer does not
+    hold the frames of its overlap.
+    """
+
+    def rotations(self, encoded: Tensor) -> Tensor:
+        """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
+        raise NotImplementedError
+
+    def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
+        """Take in the newest frames; see WindowModel.
+
+        By default the n new frames are returned, which are the most that it can make.
+        """
+        inputs, kept = self.taken_in(sparse, state)
+        wanted = sparse.shape[1] if newest is None else newest
+        ends = torch.arange(inputs.shape[1] - wanted, inputs.shape[1], device=inputs.device)
+        window = ends[:, None] + torch.arange(1 - self.frames, 1, device=inputs.device)
+        encoded = self.normalizer.encode_sparse(inputs, self.normalizer.origin(inputs))
+        windows = encoded.index_select(1, window.flatten()).unflatten(1, window.shape)
+        rotation = self.rotations(windows.flatten(0, 1)).unflatten(0, (len(inputs), wanted))
+        return self.normalizer.posed(rotation, inputs[:, -wanted:]), kept
+
+
+class AvatarPoser(OwnWindows):
     """An embedding, an encoder, and two heads on the newest frame, for the root's orientation and the rest.
 
     It has 4,124,804 parameters at the paper's sizes (T = 40, d = 256, 8 heads, 3 layers, feed-forward 2048),
     4.12 M in Table 16. Post-norm, ReLU, dropout 0.1 and the lack of a positional encoding are our readings:
     the paper names none of them, and its parameter count leaves no room for learned positions.
-
-    Every frame is predicted from its own window, so both evaluation modes give the same numbers, except for
-    the shifted tail window: there the buffer does not hold the frames of its overlap.
 
     Args:
         normalizer: converts between the world and network space.
@@ -81,17 +104,3 @@ class AvatarPoser(WindowModel):
     def read(self, newest: Tensor) -> Tensor:
         """Map the newest frame's feature (..., d) to rotations (..., 132)."""
         return torch.cat([self.orientation(newest), self.rotation(newest)], -1)
-
-    def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames; see WindowModel.
-
-        By default the n new frames are returned, which are the most that it can make.
-        """
-        inputs, kept = self.taken_in(sparse, state)
-        wanted = sparse.shape[1] if newest is None else newest
-        ends = torch.arange(inputs.shape[1] - wanted, inputs.shape[1], device=inputs.device)
-        window = ends[:, None] + torch.arange(1 - self.frames, 1, device=inputs.device)
-        encoded = self.normalizer.encode_sparse(inputs, self.normalizer.origin(inputs))
-        windows = encoded.index_select(1, window.flatten()).unflatten(1, window.shape)
-        rotation = self.rotations(windows.flatten(0, 1)).unflatten(0, (len(inputs), wanted))
-        return self.normalizer.posed(rotation, inputs[:, -wanted:]), kept

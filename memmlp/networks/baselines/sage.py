@@ -28,6 +28,7 @@ BOOKS, CODES = 8, 64
 DECAY = 0.99  # of how often a code is used
 TEMPERATURE = 0.07  # of the contrastive loss, which is of the first two books
 CONTRASTED = 2
+HIDDEN = 0.01  # what stands in training for joints that are hidden
 
 
 class Mixture(nn.Module):
@@ -63,7 +64,14 @@ class Block(nn.Module):
 
     def forward(self, h: Tensor) -> Tensor:
         """Map features (B, T, d) to (B, T, d)."""
-        h = h + self.dropout(self.attention(self.attention_norm(h)))
+        return self.newest(h, h.shape[-2])
+
+    def newest(self, h: Tensor, count: int) -> Tensor:
+        """Map features (..., T, d) to those of the newest frames (..., count, d), without the others."""
+        seen, attention = self.attention_norm(h), self.attention
+        query = attention.query(seen[..., -count:, :])
+        attended = attention.attend(query, attention.key(seen), attention.value(seen))
+        h = h[..., -count:, :] + self.dropout(attended)
         return h + self.dropout(self.mlp(self.norm(h)))
 
 
@@ -127,6 +135,15 @@ class Lengthened(Stack):
         """Return features (B, 2 T, d) of features (B, T, d)."""
         return self.convolution(h.transpose(1, 2))[..., 1:].transpose(1, 2)
 
+    def last(self, h: Tensor, places: Tensor) -> Tensor:
+        """Map features (T, d) and their places (T, d) to the last of 2 T frames (1, d), without the others."""
+        *earlier, block = self.blocks
+        h = h + places
+        for one in earlier:
+            h = one(h)
+        newest = block.newest(h, 1) @ self.convolution.weight[..., -1] + self.convolution.bias
+        return self.head(self.norm(newest))
+
 
 class ProductQuantiser(nn.Module):
     """Eight codebooks of 64 vectors of 48, one for each part of a latent, learned by gradient.
@@ -135,6 +152,7 @@ class ProductQuantiser(nn.Module):
     """
 
     usage: Tensor
+    of_whole_batch = True  # several processes would each count and move codes by themselves
 
     def __init__(self) -> None:
         super().__init__()
@@ -244,9 +262,20 @@ class Halved(nn.Module):
         self.linear = nn.Linear(N_JOINTS * JOINT_DIM, width)
         self.time = nn.Linear(frames, frames // 2)
 
-    def forward(self, encoded: Tensor) -> Tensor:
-        """Map inputs (B, T, 54) to features (B, T // 2, d)."""
-        h = self.linear(self.mixture(encoded).flatten(-2))
+    def forward(self, encoded: Tensor, hidden: Tensor | None = None) -> Tensor:
+        """Map inputs (B, T, 54) to features (B, T // 2, d).
+
+        Args:
+            encoded: inputs (B, T, 54).
+            hidden: which joints (B, 22) are hidden in training; None for none.
+        """
+        mixed = self.mixture(encoded)
+        if hidden is not None:
+            mixed = mixed.masked_fill(hidden[:, None, :, None], HIDDEN)
+        return self.shortened(self.linear(mixed.flatten(-2)))
+
+    def shortened(self, h: Tensor) -> Tensor:
+        """Mix features (..., T, d) over time to (..., T // 2, d)."""
         return self.time(h.transpose(-1, -2)).transpose(-1, -2)
 
 
@@ -273,9 +302,18 @@ class UpperDenoiser(nn.Module):
         """Mix the frames of latents (B, T // 2, 384)."""
         return self.align(latent.transpose(-1, -2)).transpose(-1, -2)
 
-    def forward(self, noisy: Tensor, time: Tensor, encoded: Tensor) -> Tensor:
-        """Map noisy latents (B, T // 2, 384), times (B,) and inputs (B, T, 54) to clean latents."""
-        h = self.stem(torch.cat([self.condition(encoded), self.aligned(noisy)], -1))
+    def forward(
+        self, noisy: Tensor, time: Tensor, encoded: Tensor, hidden: Tensor | None = None
+    ) -> Tensor:
+        """Map noisy latents (B, T // 2, 384), times (B,) and inputs (B, T, 54) to clean latents.
+
+        In training joints (B, 22) may be `hidden`; see Halved.
+        """
+        return self.denoise(noisy, time, self.condition(encoded, hidden))
+
+    def denoise(self, noisy: Tensor, time: Tensor, condition: Tensor) -> Tensor:
+        """Map noisy latents (B, T // 2, 384), times (B,) and the condition (B, T // 2, d) to clean latents."""
+        h = self.stem(torch.cat([condition, self.aligned(noisy)], -1))
         embedding = F.silu(self.time(time))
         for block in self.blocks:
             h = block(h, embedding)
@@ -289,9 +327,9 @@ class LowerDenoiser(UpperDenoiser):
         super().__init__(frames, width=width, depth=depth, heads=heads)
         self.beside = nn.Linear(2 * LATENT, LATENT)
 
-    def given(self, noisy: Tensor, upper: Tensor, time: Tensor, encoded: Tensor) -> Tensor:
-        """Map noisy latents (B, T // 2, 384) to clean ones, given the upper half's (B, T // 2, 384)."""
-        return self(self.beside(torch.cat([upper, noisy], -1)), time, encoded)
+    def joined(self, noisy: Tensor, upper: Tensor) -> Tensor:
+        """Make one of noisy latents (..., 384) and the upper half's (..., 384)."""
+        return self.beside(torch.cat([upper, noisy], -1))
 
 
 class Decoder(nn.Module):

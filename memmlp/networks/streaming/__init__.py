@@ -15,6 +15,7 @@ from memmlp.networks.baselines.ego_poser import EgoPoser
 from memmlp.networks.baselines.hmd_poser import HMDPoser
 from memmlp.networks.baselines.manikin import ManikinL, ManikinS
 from memmlp.networks.baselines.rpm import RPM
+from memmlp.networks.baselines.sage_net import SAGENet
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.recurrent_poser import RecurrentPoser
@@ -36,6 +37,7 @@ from memmlp.networks.streaming.graph import StreamingGraph
 from memmlp.networks.streaming.mem_mlp import MemMLPStream
 from memmlp.networks.streaming.recurrent_poser import RecurrentPoserStream
 from memmlp.networks.streaming.refined import RefinedStream
+from memmlp.networks.streaming.sage import SAGENetStream
 from memmlp.networks.window_model import WindowModel
 
 __all__ = ["StreamingGraph", "has_stream", "streaming"]
@@ -54,6 +56,7 @@ STREAMS: dict[type[WindowModel], type[StreamingGraph]] = {
     AGRoLMLP: AGRoLMLPStream,
     AGRoLDiffusion: AGRoLDiffusionStream,
     BoDiffusion: BoDiffusionStream,
+    SAGENet: SAGENetStream,
 }
 
 

@@ -38,7 +38,8 @@ def test_the_way_of_a_window():
     ]
     time = torch.tensor([3, 5])
     assert sage.UpperDenoiser(**small)(upper, time, x).shape == (2, 10, 384)
-    assert sage.LowerDenoiser(**small).given(lower, upper, time, x).shape == (2, 10, 384)
+    denoiser = sage.LowerDenoiser(**small)
+    assert denoiser(denoiser.joined(lower, upper), time, x).shape == (2, 10, 384)
     assert sage.Decoder(**small)(upper, lower, x).shape == (2, 20, 132)
     assert sorted({*sage.UPPER, *sage.LOWER}) == list(range(22))
 
