@@ -35,13 +35,14 @@ from memmlp.networks.architecture import (
     Architecture,
     BaselineArchitecture,
     MemMLPArchitecture,
+    PartedArchitecture,
     RefinedArchitecture,
 )
 from memmlp.networks.memory import Memory
 from memmlp.networks.vqvae import VQVAE
 from memmlp.networks.window_model import WindowModel
 from memmlp.pipeline.devices import device
-from memmlp.pipeline.experiment import Experiment
+from memmlp.pipeline.experiment import Experiment, UpstreamTraining
 from memmlp.runs.lookup import check_trained
 from memmlp.runs.run import Run
 from memmlp.tracking.feed import Tracking
@@ -77,11 +78,7 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
         force=cfg.force,
         data=build_motion(cfg),
         architecture=build_architecture(cfg),
-        vqvae=VQVAETraining(
-            config={"frame": config["frame"], "vqvae": config["vqvae"]},
-            seed=cfg.vqvae.seed,
-            optim=partial(build_vqvae_optim, cfg),
-        ),
+        upstream=build_upstream(cfg, config),
         training=build_training(cfg, metrics),
         evaluation=Evaluation(
             modes=list(cfg.evaluation.modes),
@@ -103,6 +100,27 @@ def _unrefined(cfg: DictConfig) -> DictConfig:
     bare = cfg.copy()
     bare.refiner, bare.force, bare.save_predictions = None, False, None
     return bare
+
+
+def build_upstream(cfg: DictConfig, config: dict[str, Any]) -> tuple[UpstreamTraining, ...]:
+    """Build how the runs are trained that a checked config's network builds upon, in order.
+
+    Upstream of a refiner is its network, and nothing else.
+
+    Args:
+        cfg: the config.
+        config: the same, resolved.
+    """
+    if cfg.refiner is not None:
+        return ()
+    if cfg.upstream is not None:
+        training = build_training(cfg, {})
+        assert isinstance(training, NetworkTraining)
+        return tuple(built(cfg.upstream).trainings(config, training))
+    if cfg.memory is None or not memory_class(cfg).uses_codes:
+        return ()
+    codes = {"frame": config["frame"], "vqvae": config["vqvae"]}
+    return (VQVAETraining(codes, seed=cfg.vqvae.seed, optim=partial(build_vqvae_optim, cfg)),)
 
 
 def build_training(cfg: DictConfig, metrics: dict[str, OwnMetric]) -> NetworkTraining | RefinerTraining:
@@ -143,7 +161,8 @@ def build_network(cfg: DictConfig) -> Architecture:
     space = {"coordinates": build_coordinates(cfg.frame.coordinates), "normalize": cfg.frame.normalize}
     vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in VQVAE_SETTINGS})
     if "_target_" in cfg.model:
-        return BaselineArchitecture(**space, vqvae=vqvae, network=built(cfg.model))
+        family = BaselineArchitecture if cfg.upstream is None else PartedArchitecture
+        return family(**space, vqvae=vqvae, network=built(cfg.model))
     memory, kind = built(cfg.memory), memory_class(cfg)
     return MemMLPArchitecture(
         **space,

@@ -6,7 +6,7 @@ from typing import Any
 
 from hydra.errors import InstantiationException
 from hydra.utils import get_object, instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from memmlp.common.errors import InputError
 
@@ -20,7 +20,8 @@ def built(node: DictConfig, **given: Any) -> Any:
     Raises:
         InputError: naming the class, where there is none or its constructor refuses the arguments.
     """
-    own = {key: value for key, value in node.items() if key != "name"}
+    resolved: dict[str, Any] = OmegaConf.to_container(node, resolve=True)  # type: ignore[assignment]
+    own = {key: value for key, value in resolved.items() if key != "name"}
     try:
         return instantiate(own, _convert_="all", **given)
     except InstantiationException as error:

@@ -75,15 +75,16 @@ def perform(path: Path, threads: int, plan: Plan, task: RunTask) -> None:
 
     from memmlp.config.build import build_experiment
     from memmlp.config.plugins import activate
-    from memmlp.pipeline.run_stages import run_experiment, vqvae_run
+    from memmlp.pipeline.run_stages import run_experiment, upstream_run
+    from memmlp.runs.identity import NETWORK
 
     activate(task.config.get("plugins") or ())
     experiment = build_experiment(OmegaConf.create(dict(task.config)))
     check_identity(experiment, task)
     if chosen := experiment.config["threads"] or threads:
         torch.set_num_threads(chosen)
-    if task.kind == "vqvae":
-        vqvae_run(experiment, experiment.data.prepare())
+    if task.kind != NETWORK:
+        upstream_run(experiment, experiment.data.prepare(), task.id)
     else:
         run_experiment(experiment, partial(check_wanted, path, task.id))
 

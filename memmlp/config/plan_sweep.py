@@ -150,12 +150,15 @@ def _experiments(sweep: Sweep, arm: Arm, outputs: Path) -> Iterable[tuple[int, E
 def tasks_of(experiment: Experiment, data: str) -> list[RunTask]:
     """Return the runs that an experiment needs on prepared data with this digest, its own run last."""
     own = experiment.identity(data)
-    above = own.upstream.id if own.upstream else None
-    upstream = [RunTask(above, "vqvae", experiment.config)] if above else []
+    upstream = [
+        RunTask(one.id, one.kind, experiment.config, one.upstream.id if one.upstream else None)
+        for one in experiment.above(data)
+    ]
     if experiment.base:  # the network's training is enough of it
         *upstream, network = tasks_of(experiment.base, data)
         upstream = [*upstream, replace(network, stages=())]
-    return [*upstream, RunTask(own.id, "memmlp", experiment.config, above, experiment.stages, own.what)]
+    above = upstream[-1].id if upstream else None
+    return [*upstream, RunTask(own.id, own.kind, experiment.config, above, experiment.stages, own.what)]
 
 
 def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[str, Any]]) -> str | None:

@@ -57,6 +57,18 @@ class Architecture:
         """
         raise NotImplementedError
 
+    def begun(self, normalizer: Normalizer, above: Path | None) -> WindowModel:
+        """Build the network as its training begins.
+
+        Args:
+            normalizer: converts between the world and network space.
+            above: weights of the run that its own builds upon; None for none.
+
+        Raises:
+            InputError: if their file is damaged.
+        """
+        return self.build(normalizer, self.load_vqvae(above) if above else None)
+
     def normalizer(self, manifest: Manifest, frames: Tensor) -> Normalizer:
         """Make the normalizer, with the statistics of the training frames (F, 252) if `normalize` is set."""
         rest = torch.as_tensor(np.asarray(manifest.rest), dtype=torch.float32)
@@ -138,6 +150,28 @@ class BaselineArchitecture(Architecture):
     def build(self, normalizer: Normalizer, codes: VQVAE | None) -> WindowModel:
         """Build the network with fresh weights; `codes` is not used."""
         return self.network(normalizer)
+
+
+@dataclass(frozen=True)
+class PartedArchitecture(BaselineArchitecture):
+    """How a network is built whose parts are trained one after the other, before it is as a whole.
+
+    Attributes:
+        finished: names of the parts that were trained and stay as they are, where others begin; empty where
+            the whole network goes on.
+    """
+
+    finished: tuple[str, ...] = ()
+
+    def begun(self, normalizer: Normalizer, above: Path | None) -> WindowModel:
+        """Build the network with the weights of its parts; see Architecture."""
+        assert above is not None
+        model, (tensors, _) = self.build(normalizer, None), checkpoint.read(above)
+        for name in self.finished:
+            checkpoint.load_module(f"model.{name}", model.get_submodule(name).requires_grad_(False), tensors)
+        if not self.finished:
+            checkpoint.load_module("model", model, tensors)
+        return model
 
 
 @dataclass(frozen=True)

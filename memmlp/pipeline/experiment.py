@@ -5,19 +5,45 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
-from memmlp.motion.preparing.source import MotionSource
+from memmlp.motion.preparing.source import MotionSource, Prepared
 from memmlp.networks.architecture import VQVAE_SETTINGS, Architecture
-from memmlp.runs.identity import Identity, deployment_id, evaluation_id
+from memmlp.runs.identity import NETWORK, Identity, deployment_id, evaluation_id
+from memmlp.runs.run import Run
 from memmlp.tracking.feed import Tracking
 from memmlp.training.network import NetworkTraining
 from memmlp.training.refiner import RefinerTraining
-from memmlp.training.vqvae import VQVAETraining
+
+
+class UpstreamTraining(Protocol):
+    """How a run is trained that others build upon, such as a VQ-VAE's; its result is a file of weights."""
+
+    @property
+    def kind(self) -> str:
+        """The kind of its run (see `Identity`)."""
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The part of the resolved config that determines the result."""
+
+    @property
+    def told(self) -> str:
+        """What is done, in words."""
+
+    def train(
+        self,
+        architecture: Architecture,
+        data: Prepared,
+        above: Path | None,
+        run: Run,
+        device: torch.device,
+    ) -> dict[str, float]:
+        """Train upon the weights `above`, from the run's checkpoint if there is one, and return its errors."""
 
 
 def unnamed(kind: str, config: Mapping[str, Any]) -> str:
@@ -36,7 +62,7 @@ class Experiment:
         force: whether a finished run is made again.
         data: the motion.
         architecture: builds the networks.
-        vqvae: how a frozen VQ-VAE is trained.
+        upstream: how the runs are trained that the network builds upon, each upon the one before.
         training: how the network is trained.
         evaluation: how it is evaluated.
         deployment: how it is exported and timed; None where it is not to be.
@@ -52,7 +78,7 @@ class Experiment:
     force: bool
     data: MotionSource
     architecture: Architecture
-    vqvae: VQVAETraining
+    upstream: tuple[UpstreamTraining, ...]
     training: NetworkTraining | RefinerTraining
     evaluation: Evaluation
     deployment: Deployment | None
@@ -76,9 +102,12 @@ class Experiment:
         """The identities of the evaluations and the deployment."""
         return (*self.evaluations.values(), *self.deployments)
 
-    def vqvae_identity(self, data: str) -> Identity | None:
-        """Return the identity of the VQ-VAE's run on data of that digest; None if the network uses none."""
-        return Identity("vqvae", self.vqvae.config, data) if self.architecture.uses_codes else None
+    def above(self, data: str) -> list[Identity]:
+        """Return the identities of the runs upstream, in order, on data of that digest."""
+        found: list[Identity] = []
+        for training in self.upstream:
+            found.append(Identity(training.kind, training.config, data, found[-1] if found else None))
+        return found
 
     def identity(self, data: str) -> Identity:
         """Return the identity of the network's run on data of that digest."""
@@ -87,5 +116,5 @@ class Experiment:
         own = {key: value for key, value in self.config.items() if key != "vqvae"}
         if self.architecture.trains_codes:
             own["vqvae"] = {key: self.config["vqvae"][key] for key in VQVAE_SETTINGS}
-        above = self.base.identity(data) if self.base else self.vqvae_identity(data)
-        return Identity("memmlp", own, data, above)
+        above = [self.base.identity(data)] if self.base else self.above(data)
+        return Identity(NETWORK, own, data, above[-1] if above else None)

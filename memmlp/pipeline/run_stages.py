@@ -25,10 +25,16 @@ from memmlp.live.latency import measure as pose_latency
 from memmlp.motion.preparing.manifest import ClipRecord
 from memmlp.motion.preparing.source import Prepared
 from memmlp.pipeline.devices import described
-from memmlp.pipeline.experiment import Experiment
+from memmlp.pipeline.experiment import Experiment, UpstreamTraining
 from memmlp.runs.environment import packages_of_ones_own
 from memmlp.runs.evaluation_file import read_report, write_report
-from memmlp.runs.identity import Identity, deployment_settings, evaluation_recipes, evaluation_settings
+from memmlp.runs.identity import (
+    NETWORK,
+    Identity,
+    deployment_settings,
+    evaluation_recipes,
+    evaluation_settings,
+)
 from memmlp.runs.run import Run
 from memmlp.tracking.feed import Tracking
 from memmlp.training.loop import Watch, unwatched
@@ -148,34 +154,55 @@ def clip_rows(experiment: Experiment, run: Run) -> list[dict[str, Any]]:
     return list(rows.values())
 
 
-def upstream_run(experiment: Experiment, data: Prepared) -> Run | None:
-    """Return the finished run that the experiment's own builds upon, made if necessary; None for none."""
+def upstream_run(experiment: Experiment, data: Prepared, last: str | None = None) -> Run | None:
+    """Return the finished run that the experiment's own builds upon, made if necessary; None for none.
+
+    What is upstream of it is made before it, in turn.
+
+    Args:
+        experiment: the experiment.
+        data: the prepared motion.
+        last: the id of the run upstream that is wanted; by default the last one.
+    """
     if experiment.base:
         return run_experiment(experiment.base).run
-    return vqvae_run(experiment, data) if experiment.architecture.uses_codes else None
+    run: Run | None = None
+    for training, identity in zip(experiment.upstream, experiment.above(data.digest), strict=True):
+        run = made_upstream(experiment, training, identity, data, run)
+        if run.id == last:
+            break
+    return run
 
 
-def vqvae_run(experiment: Experiment, data: Prepared) -> Run:
-    """Return the finished run of the VQ-VAE that the network uses, training it if necessary."""
-    identity = experiment.vqvae_identity(data.digest)
-    assert identity is not None
+def made_upstream(
+    experiment: Experiment, training: UpstreamTraining, identity: Identity, data: Prepared, above: Run | None
+) -> Run:
+    """Return the finished run upstream of that identity, training it if necessary."""
     run = Run.of(experiment.outputs, identity.id)
     with run.lock():
         if run.done:
             return run
         with shown(experiment, run):
-            train_vqvae(experiment, run, data, identity)
+            train_upstream(experiment, training, identity, data, run, above)
     return run
 
 
-def train_vqvae(experiment: Experiment, run: Run, data: Prepared, identity: Identity) -> None:
-    """Train the VQ-VAE of a run, and mark the run as done."""
-    begin(experiment, run, identity, experiment.vqvae.config)
+def train_upstream(
+    experiment: Experiment,
+    training: UpstreamTraining,
+    identity: Identity,
+    data: Prepared,
+    run: Run,
+    above: Run | None,
+) -> None:
+    """Train a run that others build upon, and mark it as done."""
+    begin(experiment, run, identity, training.config)
     run.write_manifest({"partial": partial_words(experiment, data)})
-    tell(f"VQ-VAE: train it, whose code-vectors the network's memory uses (run {run.id})")
-    parallel.of_first("vqvae")
+    tell(f"{training.told} (run {run.id})")
+    weights = above.weights() if above else None
+    parallel.of_first(training.kind)
     with timed(run, "train"):
-        errors = experiment.vqvae.train(experiment.architecture, data, run, experiment.device)
+        errors = training.train(experiment.architecture, data, weights, run, experiment.device)
     write_json(run.results_path, {"val": errors})
     run.finish(("model.safetensors", "results.json"))
 
@@ -212,7 +239,7 @@ def train_run(
     run.write_manifest({"body": data.manifest.body, "partial": partial_words(experiment, data)})
     run.clear_stages()
     weights = above.weights() if above else None
-    parallel.of_first("network")
+    parallel.of_first(NETWORK)
     with timed(run, "train"):
         experiment.training.train(experiment.architecture, data, weights, run, experiment.device, watch)
     run.finish(("model.safetensors",))

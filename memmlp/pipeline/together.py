@@ -34,12 +34,10 @@ def _train_along(experiment: Experiment) -> None:
     """Train the stages that the first process names, until it is at the end."""
     while (stage := parallel.of_first("")) != "end":
         data = experiment.data.prepare()  # the first process has prepared it
-        own = experiment.identity(data.digest)
-        codes = Run.of(experiment.outputs, own.upstream.id) if own.upstream else None
-        if stage == "vqvae":
-            assert codes is not None
-            experiment.vqvae.train(experiment.architecture, data, codes, experiment.device)
-        else:
-            weights, run = codes.weights() if codes else None, Run.of(experiment.outputs, own.id)
-            experiment.training.train(experiment.architecture, data, weights, run, experiment.device)
+        chain = [*experiment.above(data.digest), experiment.identity(data.digest)]
+        runs = [Run.of(experiment.outputs, identity.id) for identity in chain]
+        number = [identity.kind for identity in chain].index(stage)
+        training = (*experiment.upstream, experiment.training)[number]
+        weights = runs[number - 1].weights() if number else None
+        training.train(experiment.architecture, data, weights, runs[number], experiment.device)
     parallel.leave()

@@ -50,13 +50,16 @@ DEPLOYMENT = ("export",)
 INFERENCE = ("memory.blend", "memory.history", "model.sampling_steps", "model.offline")
 """Keys of the later stages; those of INFERENCE count for both, and for a training that rolls out."""
 
+NETWORK = "memmlp"
+"""The kind of the runs of motion networks, of baselines too. Runs of all other kinds are upstream of these."""
+
 ID = re.compile(r"[0-9a-f]{16}")
 """What the id of a run looks like."""
 
 DATA_PATH = re.compile(r"data\.(root|body|split\.folder|sources\..+\.root)")
 """The keys that say where data lies."""
 
-SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term", "refiner", "optim")
+SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term", "refiner", "upstream", "optim")
 
 UNNAMED = {"optim": "adamw"}
 """The options of slots that runs have from before these were slots; their names do not count."""
@@ -70,7 +73,8 @@ class Identity:
     """The identity of a run.
 
     Attributes:
-        kind: "vqvae", or "memmlp" for every motion network, baselines too; ids are digests of this word.
+        kind: NETWORK for every motion network, baselines too, or what it is upstream of one: "vqvae", or the
+            name of a part that is trained first; ids are digests of this word.
         config: the resolved config; only the keys that can change a training's result count.
         data: digest of the prepared data.
         upstream: the identity of the run whose artifact this one uses.
@@ -106,7 +110,7 @@ def run_id(kind: str, config: Mapping[str, Any], *, data: str, upstream: str | N
     """Return the identity of a training: 16 hex digits over all that can change its result.
 
     Args:
-        kind: "vqvae", or "memmlp" for every motion network, baselines too.
+        kind: see Identity.
         config: the resolved config; keys that are neutral or of a later stage do not count, and 1 counts as
             1.0.
         data: digest of the prepared data.
@@ -206,6 +210,13 @@ def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
         yield "schedule.milestones"
 
 
+def training_settings(kind: str, config: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the group of a config that says for how many steps a run of that kind is trained."""
+    if kind == "vqvae":
+        return config["vqvae"]
+    return config["optim"] if kind == NETWORK else config["upstream"][kind]
+
+
 def chosen(config: Mapping[str, Any], slot: str) -> str | None:
     """Return the name of the option in a slot; None for an empty slot, and for Mem-MLP in `model`."""
     return (config.get(slot) or {}).get("name", UNNAMED.get(slot))
@@ -268,7 +279,7 @@ def inference(config: Mapping[str, Any]) -> dict[str, Any]:
 def _rolls_out(config: Mapping[str, Any]) -> bool:
     """Return whether training runs the network as live use does, so that inference keys act in it too."""
     rollout = (config.get("rollout") or {}).get("name", "teacher_forcing")
-    return bool(config.get("refiner")) or rollout != "teacher_forcing"
+    return bool(config.get("refiner") or config.get("upstream")) or rollout != "teacher_forcing"
 
 
 def _unused(config: Mapping[str, Any]) -> Iterable[str]:

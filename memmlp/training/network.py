@@ -68,7 +68,7 @@ class NetworkTraining:
         Args:
             architecture: builds the network.
             data: the prepared motion.
-            above: weights of the frozen VQ-VAE, where the architecture uses one.
+            above: weights that it builds upon, of a frozen VQ-VAE for one; None for none.
             run: the run whose folder takes checkpoints, log and weights.
             device: the device to train on.
             watch: called after each validation; see `memmlp.training.loop.train`.
@@ -88,8 +88,8 @@ class NetworkTraining:
         """Make the task of training a network that is not yet trained; for the arguments see `train`."""
         dataset = data.open("train").to(device)
         torch.manual_seed(self.seed)
-        frozen = architecture.load_vqvae(above) if above else None
-        model = architecture.build(architecture.normalizer(data.manifest, dataset.frames), frozen).to(device)
+        normalizer = architecture.normalizer(data.manifest, dataset.frames)
+        model = architecture.begun(normalizer, above).to(device)
         self.rollout.begin(model)
         pieces = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)
         return MotionTask(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -34,11 +35,20 @@ class VQVAETraining:
     config: dict[str, Any]
     seed: int
     optim: Callable[[int], Optim]
+    kind: ClassVar[str] = "vqvae"
+    told: ClassVar[str] = "VQ-VAE: train it, whose code-vectors the network's memory uses"
 
     def train(
-        self, architecture: Architecture, data: Prepared, run: Run, device: torch.device
+        self,
+        architecture: Architecture,
+        data: Prepared,
+        above: Path | None,
+        run: Run,
+        device: torch.device,
     ) -> dict[str, float]:
         """Train the architecture's VQ-VAE, from the run's checkpoint if there is one, and write its weights.
+
+        Nothing is `above` it. For the other arguments see `NetworkTraining.train`.
 
         Returns:
             Its errors on the validation frames.

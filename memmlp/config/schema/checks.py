@@ -19,6 +19,7 @@ from memmlp.config.schema.network import (
     BoDiffusionConfig,
     RecurrentPoserConfig,
     RPMConfig,
+    SAGEConfig,
 )
 from memmlp.config.schema.training import (
     AGRoLLossConfig,
@@ -119,6 +120,9 @@ def _check_combinations(cfg: DictConfig) -> None:
         raise InputError(f"optim.final_lr={cfg.optim.final_lr}: allowed is at most optim.lr={cfg.optim.lr}")
     if cfg.optim.warmup > cfg.optim.steps:
         raise InputError(f"optim.warmup={cfg.optim.warmup}: allowed is at most optim.steps={cfg.optim.steps}")
+    if (cfg.upstream is not None) != _is(cfg.model, SAGEConfig):
+        needed = "upstream=sage" if cfg.upstream is None else "upstream=null"
+        raise InputError(f"upstream: of the parts of SAGE-Net; allowed with this model is {needed}")
     if _is(cfg.model, BaselineConfig):
         _check_baseline(cfg)
     else:
@@ -182,10 +186,13 @@ def _check_baseline(cfg: DictConfig) -> None:
             f"evaluation.ik={cfg.evaluation.ik} needs positions, and {name} has rotations alone: "
             "allowed is evaluation.ik=off"
         )
-    if cfg.model.width % cfg.model.get("heads", 1):
-        raise InputError(
-            f"model.heads={cfg.model.heads}: allowed is a divisor of model.width={cfg.model.width}"
-        )
+    for heads, width in (("heads", "width"), ("code_heads", "code_width")):
+        if heads in cfg.model and cfg.model[width] % cfg.model[heads]:
+            raise InputError(
+                f"model.{heads}={cfg.model[heads]}: allowed is a divisor of model.{width}={cfg.model[width]}"
+            )
+    if _is(cfg.model, SAGEConfig) and cfg.model.code_width % 2:
+        raise InputError(f"model.code_width={cfg.model.code_width}: allowed with SAGENet is an even number")
     if _is(cfg.model, AvatarJLMConfig) and cfg.model.width % 4:
         raise InputError(f"model.width={cfg.model.width}: allowed with AvatarJLM is a multiple of 4")
     if _is(cfg.model, RPMConfig) and cfg.model.frames < (least := cfg.model.context + cfg.model.horizon):

@@ -44,9 +44,12 @@ from memmlp.config.schema.network import (
     RotationOnlyConfig,
     RotationOnlyMemoryConfig,
     RPMConfig,
+    SAGEConfig,
     SAGERefinerConfig,
+    SAGEUpstreamConfig,
     TwoBranchConfig,
     TwoBranchMemoryConfig,
+    UpstreamConfig,
     VAEHMDConfig,
     VQVAEConfig,
 )
@@ -154,6 +157,20 @@ class ProfileConfig:
     bodiffusion_depth: Optional[int] = optional(Within(1))
     bodiffusion_heads: Optional[int] = optional(Within(1))
     bodiffusion_sampling_steps: Optional[int] = optional(Within(1))
+    sage_frames: Optional[int] = optional(Within(2))
+    sage_width: Optional[int] = optional(Within(1))
+    sage_depth: Optional[int] = optional(Within(1))
+    sage_heads: Optional[int] = optional(Within(1))
+    sage_code_width: Optional[int] = optional(Within(2))
+    sage_code_depth: Optional[int] = optional(Within(1))
+    sage_code_heads: Optional[int] = optional(Within(1))
+    sage_batch: Optional[int] = optional(Within(1))
+    sage_code_steps: Optional[int] = optional(Within(1))
+    sage_upper_steps: Optional[int] = optional(Within(1))
+    sage_lower_steps: Optional[int] = optional(Within(1))
+    sage_decoder_steps: Optional[int] = optional(Within(1))
+    sage_diffusion_lr: Optional[float] = optional(Within(0, strict=True))
+    sage_lr: Optional[float] = optional(Within(0, strict=True))
     rpm_frames: Optional[int] = optional(Within(2))
     rpm_width: Optional[int] = optional(Within(1))
     rpm_depth: Optional[int] = optional(Within(1))
@@ -238,6 +255,7 @@ class Config:
     hand: Optional[HandConfig] = None
     term: Optional[TermConfig] = None
     refiner: Optional[RefinerConfig] = None
+    upstream: Optional[UpstreamConfig] = None
     optim: OptimConfig = field(default_factory=OptimConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     export: ExportConfig = field(default_factory=ExportConfig)
@@ -263,6 +281,7 @@ SCHEMAS: dict[str, type] = {
     "model_avatar_jlm": AvatarJLMConfig,
     "model_vae_hmd": VAEHMDConfig,
     "model_recurrent_poser": RecurrentPoserConfig,
+    "model_sage": SAGEConfig,
     "model_manikin_s": ManikinSConfig,
     "model_manikin_l": ManikinLConfig,
     "predictor_two_branch": TwoBranchConfig,
@@ -289,6 +308,7 @@ SCHEMAS: dict[str, type] = {
     "hand_fk": HandFKConfig,
     "hand_off": NoHandConfig,
     "refiner_sage": SAGERefinerConfig,
+    "upstream_sage": SAGEUpstreamConfig,
     "optim": AdamWConfig,  # its name up to version 0.2, for configs of one's own
     "optim_adamw": AdamWConfig,
     "optim_muon": MuonConfig,
@@ -314,6 +334,7 @@ GROUPS = {
     "hand": HandConfig,
     "term": TermConfig,
     "refiner": RefinerConfig,
+    "upstream": UpstreamConfig,
     "optim": OptimConfig,
     "evaluation": EvaluationConfig,
     "export": ExportConfig,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Optional, Union
 
 from omegaconf import MISSING
@@ -139,6 +139,22 @@ class RecurrentPoserConfig(BaselineConfig):
 
 
 @dataclass
+class SAGEConfig(BaselineConfig):
+    name: str = called("sage")
+    _target_: str = target("memmlp.networks.baselines.sage_net.SAGENet")
+    width: int = at_least(1)
+    heads: int = at_least(1)
+    code_width: int = at_least(2)
+    code_depth: int = at_least(1)
+    code_heads: int = at_least(1)
+    dropout: float = fraction()
+    diffusion_steps: int = at_least(1)
+    sampling_steps: int = at_least(1)
+    noise: float = at_least(0)
+    noise_seed: int = at_least(0)
+
+
+@dataclass
 class ManikinSConfig(AvatarPoserConfig):
     name: str = called("manikin_s")
     _target_: str = target("memmlp.networks.baselines.manikin.ManikinS")
@@ -267,6 +283,36 @@ class SAGERefinerConfig(RefinerConfig):
     depth: int = at_least(1)
     frames: int = at_least(4)
     pieces: int = at_least(1)
+
+
+@dataclass
+class UpstreamConfig:
+    """What of a network is trained before the whole of it (conf/upstream); null for nothing."""
+
+    name: str = key(Text())
+    _target_: str = MISSING
+
+
+@dataclass
+class PartConfig:
+    """How a part of a network is trained: AdamW, whose learning rate falls at some steps."""
+
+    steps: int = at_least(1)
+    batch: int = at_least(1)
+    lr: float = positive()
+    drops: list[float] = key(EachOf(Within(0, 1), empty=True))
+    drop: float = positive()
+
+
+@dataclass
+class SAGEUpstreamConfig(UpstreamConfig):
+    name: str = called("sage")
+    _target_: str = target("memmlp.training.sage.SAGEUpstream")
+    upper_codes: PartConfig = field(default_factory=PartConfig)
+    lower_codes: PartConfig = field(default_factory=PartConfig)
+    upper_diffusion: PartConfig = field(default_factory=PartConfig)
+    lower_diffusion: PartConfig = field(default_factory=PartConfig)
+    decoder: PartConfig = field(default_factory=PartConfig)
 
 
 @dataclass
