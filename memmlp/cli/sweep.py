@@ -14,6 +14,7 @@ import click
 from memmlp.cli.options import config_dir_option, outputs_option, plugins_option
 from memmlp.cli.workers import Workers, hire, worker_options
 from memmlp.common.errors import InputError
+from memmlp.runs.identity import NETWORK
 
 if TYPE_CHECKING:
     from memmlp.cli.rounds import Shown
@@ -30,7 +31,9 @@ if TYPE_CHECKING:
     "--dry-run", is_flag=True, help="Show what would be run and how long it may take, and run nothing."
 )
 @click.option("--retry", is_flag=True, help="Run again what failed before.")
-@click.option("--again", is_flag=True, help="Train the sweep's finished networks again; their VQ-VAEs stay.")
+@click.option(
+    "--again", is_flag=True, help="Train the sweep's finished networks again, not what they build on."
+)
 @click.option("--fail-fast", is_flag=True, help="End the sweep with the first run that fails.")
 @click.option(
     "--until-decided", is_flag=True, help="Add seeds in rounds, to arms whose verdicts are open alone."
@@ -102,8 +105,8 @@ def sweep(
 
 
 def reset(plan: Plan) -> None:
-    """Remove what the plan's networks are so far, so that all of them are made again; VQ-VAEs stay."""
-    for run in {task.id: plan.run_of(task) for task in plan.tasks if task.kind != "vqvae"}.values():
+    """Remove what the plan's networks are so far, so that all are made again, not what they build on."""
+    for run in {task.id: plan.run_of(task) for task in plan.tasks if task.kind == NETWORK}.values():
         with run.lock():
             run.reset()
 
@@ -190,7 +193,7 @@ def report(shown: Shown, words: Sequence[str], chosen: Sweep) -> None:
     for entry in orphans(chosen, plan):
         click.echo(f"orphan: run {entry.id} was '{entry.label}' seed {entry.seed} in an earlier version")
     for task in failed:
-        reason = plan.run_of(task).failure or "its VQ-VAE failed"
+        reason = plan.run_of(task).failure or "what it builds upon failed"
         click.echo(f"failed: run {task.id}: {reason}", err=True)
     if failed:
         click.echo("again with: --retry", err=True)

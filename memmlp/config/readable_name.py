@@ -18,9 +18,9 @@ from omegaconf.errors import OmegaConfBaseException
 from memmlp.config.compose import VERSION_BASE
 from memmlp.config.packaged import packaged
 from memmlp.config.schema import register
-from memmlp.runs.identity import SLOTS, chosen, flatten, trained_by
+from memmlp.runs.identity import NETWORK, SLOTS, chosen, flatten, trained_by
+from memmlp.runs.name import kind_words
 
-KINDS = {"vqvae": "VQ-VAE"}
 MOST = 6  # words
 BETWEEN = " · "
 OF_MODELS = ("ema",)
@@ -34,10 +34,10 @@ def readable_name(kind: str, config: Mapping[str, Any]) -> str:
     part of it, nor is where and how the run is made.
 
     Args:
-        kind: "vqvae", or "memmlp" for every motion network.
+        kind: the kind of run (see `Identity`).
         config: the run's resolved config.
     """
-    words = [KINDS[kind]] if kind in KINDS else []
+    words = [] if kind == NETWORK else [kind_words(kind)]
     try:
         words += [*_profile(_sizes(config)), *_differences(config)]
     except (HydraException, OmegaConfBaseException):  # a name is no reason to stop a run

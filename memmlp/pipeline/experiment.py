@@ -43,7 +43,7 @@ class UpstreamTraining(Protocol):
         run: Run,
         device: torch.device,
     ) -> dict[str, float]:
-        """Train upon the weights `above`, from the run's checkpoint if there is one, and return its errors."""
+        """Train upon the weights `above`, from the run's checkpoint if there is one; return its errors."""
 
 
 def unnamed(kind: str, config: Mapping[str, Any]) -> str:

@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from memmlp.common.files import read_json
+from memmlp.runs.identity import NETWORK
 from memmlp.runs.lookup import list_runs
+from memmlp.runs.name import kind_words
 from memmlp.runs.notes import read_notes
 from memmlp.runs.recipes import outdated
 from memmlp.runs.run import Run
@@ -74,8 +76,8 @@ def _reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, str]:
 def _orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
     """Return by id why a run is an orphan.
 
-    Orphans are runs of earlier versions of a sweep that no plan has now, VQ-VAEs that no run uses, and
-    folders in which nothing began.
+    Orphans are runs of earlier versions of a sweep that no plan has now, VQ-VAEs and parts that no run uses,
+    and folders in which nothing began.
     """
     planned: set[str] = set()
     before: dict[str, str] = {}
@@ -86,10 +88,11 @@ def _orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
             entry["id"]: f"no longer in sweep {path.parent.name}" for entry in _listed(path, "entries")
         }
     used = {run.manifest.get("upstream") for run in runs} | planned
-    codes = [run for run in runs if run.manifest.get("kind") == "vqvae" and run.id not in used]
+    kinds = {run.id: str(run.manifest.get("kind") or NETWORK) for run in runs}
+    alone = [run_id for run_id, kind in kinds.items() if kind != NETWORK and run_id not in used]
     empty = [run for run in runs if not run.manifest]
     found = {run_id: reason for run_id, reason in before.items() if run_id not in planned}
-    found |= {run.id: "a VQ-VAE that no run uses" for run in codes}
+    found |= {run_id: f"a {kind_words(kinds[run_id])} that no run uses" for run_id in alone}
     return found | {run.id: "nothing began in it" for run in empty}
 
 

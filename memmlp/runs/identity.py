@@ -51,7 +51,7 @@ INFERENCE = ("memory.blend", "memory.history", "model.sampling_steps", "model.of
 """Keys of the later stages; those of INFERENCE count for both, and for a training that rolls out."""
 
 NETWORK = "memmlp"
-"""The kind of the runs of motion networks, of baselines too. Runs of all other kinds are upstream of these."""
+"""The kind of the runs of motion networks, of baselines too; all other kinds are upstream of these."""
 
 ID = re.compile(r"[0-9a-f]{16}")
 """What the id of a run looks like."""

@@ -9,6 +9,11 @@ SLOTS = ("model", "memory", "predictor")
 USUAL = {"model": "mem_mlp", "predictor": "two_branch"}
 
 
+def kind_words(kind: str) -> str:
+    """Return what people call a kind of run that networks build upon, such as "lower codes"."""
+    return "VQ-VAE" if kind == "vqvae" else kind.replace("_", " ")
+
+
 def run_name(manifest: Mapping[str, Any], config: Mapping[str, Any]) -> str:
     """Return the name that a run was given when it began: what its config has that a default one has not.
 

@@ -13,7 +13,9 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from memmlp.runs.identity import NETWORK, training_settings
 from memmlp.runs.metrics_log import Metrics
+from memmlp.runs.name import kind_words
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan, RunTask
 
@@ -84,20 +86,22 @@ def _change(plan: Plan, task: RunTask, state: str) -> str:
 
 
 def name(plan: Plan, task: RunTask) -> str:
-    """Return the task's name for people: arm and seed; for a VQ-VAE the seeds whose runs need it."""
+    """Return the task's name for people: arm and seed, or what it is and the seeds whose runs need it."""
     cells = [f"{entry.label} seed {entry.seed}" for entry in plan.entries if entry.key == task.key]
-    return cells[0] if cells else f"VQ-VAE {task.id}{_seeds(plan, task)}"
+    return cells[0] if cells else f"{kind_words(task.kind)} {task.id}{_seeds(plan, task)}"
 
 
 def _seeds(plan: Plan, upstream: RunTask) -> str:
     """Name the seeds of the entries that need an upstream run."""
-    users = {task.id for task in plan.tasks if task.upstream == upstream.id}
+    users = {upstream.id}
+    for task in plan.tasks:  # each after those that it needs
+        users |= {task.id} if task.upstream in users else set()
     seeds = sorted({entry.seed for entry in plan.entries if entry.id in users})
     return f" of seed {', '.join(map(str, seeds))}" if seeds else ""
 
 
 def render(plan: Plan, states: Mapping[str, str]) -> Group:
-    """Draw arms by seeds, the VQ-VAEs, the counts of states, and the reasons of what failed."""
+    """Draw arms by seeds, the runs upstream of them, the counts of states, and the reasons of what failed."""
     tasks = {task.key: task for task in plan.tasks}
     seeds = sorted({entry.seed for entry in plan.entries})
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=f"sweep {plan.name}", title_justify="left")
@@ -107,7 +111,7 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
     for label in dict.fromkeys(entry.label for entry in plan.entries):
         cells = {e.seed: cell(plan, tasks[e.key], states[e.key]) for e in plan.entries if e.label == label}
         table.add_row(Text(label), *(cells.get(seed, Text("-")) for seed in seeds))
-    below = [_upstream(plan, task, states[task.key]) for task in plan.tasks if task.kind == "vqvae"]
+    below = [_upstream(plan, task, states[task.key]) for task in plan.tasks if task.kind != NETWORK]
     running = [plan.run_of(task) for task in plan.tasks if states[task.key] == "running"]
     below += [Text(_counts(states)), *map(Text, devices(running))]
     below += [
@@ -140,7 +144,7 @@ def result(run: Run) -> str:
 
 def total_steps(task: RunTask) -> int:
     """Return the number of steps of the task's training."""
-    return int(task.config["vqvae" if task.kind == "vqvae" else "optim"]["steps"])
+    return int(training_settings(task.kind, task.config)["steps"])
 
 
 def progress_text(run: Run, total: int) -> str:

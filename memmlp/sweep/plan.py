@@ -24,7 +24,7 @@ class RunTask:
 
     Attributes:
         id: the run's id.
-        kind: "vqvae" or "memmlp" (see `Identity`).
+        kind: the kind of run (see `Identity`).
         config: the resolved config of an experiment that needs the run.
         upstream: the id of the run that must be done before; None for none.
         stages: identities of the evaluations and the deployment that are wanted of the run.
@@ -100,12 +100,17 @@ class Plan:
         return run.done and all(map(run.has, task.stages))
 
     def states(self) -> dict[str, str]:
-        """Return every task's state by its key: its run's, or "blocked" where its upstream run failed."""
-        states = {task.key: self.run_of(task).state(self.complete(task)) for task in self.tasks}
-        for task in self.tasks:
-            if states[task.key] != "done" and states.get(task.upstream or "") == "failed":
-                states[task.key] = "blocked"
-        return states
+        """Return every task's state by its key: its run's, or "blocked" where what is upstream failed."""
+        own = {task.key: self.run_of(task).state(self.complete(task)) for task in self.tasks}
+        return self.with_blocked(own)
+
+    def with_blocked(self, states: Mapping[str, str]) -> dict[str, str]:
+        """Return states by the tasks' keys with "blocked" for those that a failed run is upstream of."""
+        found = dict(states)
+        for task in self.tasks:  # those upstream come first
+            if found[task.key] != "done" and found.get(task.upstream or "") in ("failed", "blocked"):
+                found[task.key] = "blocked"
+        return found
 
     def left(self) -> list[RunTask]:
         """Return the tasks to be done: not done, failed, blocked or cancelled. A stopped plan has none."""

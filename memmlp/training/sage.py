@@ -7,39 +7,32 @@ whose file holds what was trained so far. Parts that are finished stay as they a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common import parallel
-from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.preparing.source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architecture import Architecture, PartedArchitecture
-from memmlp.networks.baselines.sage import HIDDEN, LOWER, UPPER, HalfVQVAE
+from memmlp.networks.baselines.sage import LOWER, UPPER
 from memmlp.networks.baselines.sage_net import SAGENet
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, train
-from memmlp.training.losses.terms import Body
 from memmlp.training.network import NetworkTraining
 from memmlp.training.optim import Optim
+from memmlp.training.sage_losses import Objective, objective
 
 PARTS = ("upper_codes", "lower_codes", "upper_diffusion", "lower_diffusion", "decoder")
 """In the order of their training; each builds upon the one before."""
 
-IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)  # the 6D rotation that turns nothing
-HIDDEN_SHARE = 0.5  # of a half's joints, which its VQ-VAE has to guess
-HIDDEN_COUNT = 2  # joints of the diffusion models' condition, drawn with replacement
-CODE_WEIGHTS = {"orientation": 0.2, "rotation": 1.0, "position": 5.0, "hand": 5.0, "codebook": 0.25}
 VALIDATION_WINDOWS = 256
 
 _SIZES = ("name", "frames", "code_width", "code_depth", "code_heads", "dropout")
@@ -74,7 +67,7 @@ class DroppingOptim(Optim):
 
 @dataclass(frozen=True)
 class SAGEUpstream:
-    """How long, and at which learning rates, each part is trained: `steps`, `batch`, `lr`, `drops`, `drop`."""
+    """How long, and at which learning rates, each part is trained: steps, batch, lr, drops and drop."""
 
     upper_codes: Mapping[str, Any]
     lower_codes: Mapping[str, Any]
@@ -89,7 +82,8 @@ class SAGEUpstream:
             config: the resolved config of the whole network.
             network: how that is trained; windows are drawn alike for its parts.
         """
-        often = {name: getattr(network.optim, name) for name in ("checkpoint_every", "log_every", "precision")}
+        same = ("checkpoint_every", "log_every", "precision")
+        often = {name: getattr(network.optim, name) for name in same}
         for kind in PARTS:
             own = getattr(self, kind)
             betas = (0.9, 0.99) if kind in ("upper_codes", "lower_codes") else (0.9, 0.999)
@@ -101,7 +95,8 @@ class SAGEUpstream:
 def acting(kind: str, config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the part of a network's config that determines the result of training a part of it."""
     upstream = {key: config["upstream"][key] for key in ("name", "_target_", kind)}
-    own = {key: config[key] for key in ("data", "frame", "seed", *(["loss"] if kind == "decoder" else []))}
+    own = {key: config[key] for key in ("profile", "data", "frame", "seed")}
+    own |= {"loss": config["loss"]} if kind == "decoder" else {}
     return {
         **own,
         "model": {key: config["model"][key] for key in ACTING[kind]},
@@ -153,7 +148,7 @@ class PartTraining:
         torch.manual_seed(self.network.seed)
         net = architecture.build(architecture.normalizer(data.manifest, dataset.frames), None)
         assert isinstance(net, SAGENet)
-        parts = {"codes.upper": net.codes(UPPER), "codes.lower": net.codes(LOWER)}
+        parts: dict[str, nn.Module] = {"codes.upper": net.codes(UPPER), "codes.lower": net.codes(LOWER)}
         parts |= {"model.upper": net.upper, "model.lower": net.lower}
         *earlier, (name, part) = islice(parts.items(), PARTS.index(self.kind) + 1)
         for finished, module in earlier:
@@ -207,10 +202,6 @@ class Windows:
         return self.dataset.segments(clips, end, self.frames), clips
 
 
-Objective = Callable[[Tensor, bool], dict[str, Tensor]]
-"""Maps world windows (B, T, 252), and whether it is for training, to weighted losses by name."""
-
-
 class PartTask:
     """The training task of a part: the sum of an objective's losses."""
 
@@ -236,126 +227,3 @@ class PartTask:
     def validate(self) -> dict[str, float]:
         """Compute the losses on the validation windows, where nothing is hidden and latents are sampled."""
         return {name: float(term) for name, term in self.objective(self.windows.validation, False).items()}
-
-
-def objective(kind: str, halves: nn.ModuleDict) -> Objective:
-    """Return what a part is trained by.
-
-    Args:
-        kind: one of PARTS, but the decoder.
-        halves: the network ("net"), and the VQ-VAE of each half ("upper", "lower").
-    """
-    half, of = kind.split("_")
-    net, codes = halves["net"], halves[half]
-    assert isinstance(net, SAGENet)
-    assert isinstance(codes, HalfVQVAE)
-    return partial(code_losses if of == "codes" else LATENT_LOSSES[half], net, codes)
-
-
-def code_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) -> dict[str, Tensor]:
-    """Return the losses of a VQ-VAE: of its last frame's rotations and joints, and of its codebooks.
-
-    In training it has to guess joints of its half other than the first. Hands count where they are of it.
-
-    Args:
-        net: the network, whose space the VQ-VAE works in.
-        codes: the VQ-VAE.
-        frames: world windows (B, T, 252).
-        training: whether joints are hidden.
-    """
-    rotation, encoded = seen(net, frames)
-    sixd = rotation.unflatten(-1, (N_JOINTS, 6))
-    hidden = parallel.drawn(torch.rand_like, sixd[:, 0, :, 0]) < HIDDEN_SHARE
-    hidden[:, codes.joints[0]] = False
-    shown = sixd.masked_fill(hidden[:, None, :, None], HIDDEN) if training else sixd
-    latent, codebook = codes.encode(shown.flatten(-2), encoded)
-    made = codes.decode(latent)[:, -1].unflatten(-1, (-1, 6))
-    errors = half_errors(net, codes.joints, made, frames[:, -1], sixd[:, -1])
-    return {name: CODE_WEIGHTS[name] * term for name, term in (errors | {"codebook": codebook}).items()}
-
-
-def half_errors(
-    net: SAGENet, joints: tuple[int, ...], made: Tensor, frame: Tensor, true: Tensor
-) -> dict[str, Tensor]:
-    """Return errors of a half's rotations and of what forward kinematics makes of them (smooth L1).
-
-    All other joints stand as in the rest pose, in both bodies.
-
-    Args:
-        net: the network, whose space the rotations are in.
-        joints: the half's joints.
-        made: its predicted rotations (B, J, 6).
-        frame: world frames (B, 252).
-        true: the true rotations (B, 22, 6) of all joints.
-    """
-    sparse, own = frame[:, None, :SPARSE_DIM], list(joints)
-    full = true.clone()
-    full[:, own] = made.to(true)
-    bodies = [standing(net, rotation, sparse, joints) for rotation in (full, true)]
-    (found, placed), (expected, true_placed) = [(one.sixd, one.posed[1]) for one in bodies]
-    errors = {
-        "orientation": F.smooth_l1_loss(found[..., ROOT, :], expected[..., ROOT, :]),
-        "rotation": F.smooth_l1_loss(found[..., own[1:], :], expected[..., own[1:], :]),
-        "position": F.smooth_l1_loss(placed[..., own, :], true_placed[..., own, :]),
-    }
-    if set(HANDS) <= set(joints):
-        head, *hands = sparse[..., SPARSE_POSITION].unflatten(-1, (-1, 3)).unbind(-2)
-        moved = placed + (head - placed[..., HEAD, :])[..., None, :]
-        errors["hand"] = F.smooth_l1_loss(moved[..., list(HANDS), :], torch.stack(hands, -2))
-    return errors
-
-
-def standing(net: SAGENet, rotation: Tensor, sparse: Tensor, joints: tuple[int, ...]) -> Body:
-    """Return the world's body of rotations (B, 22, 6) at inputs (B, 1, 54), all joints but these at rest."""
-    motion = net.normalizer.posed(rotation.flatten(-2)[:, None], sparse)
-    others = [joint for joint in range(N_JOINTS) if joint not in joints]
-    sixd = motion[..., ROTATION].unflatten(-1, (N_JOINTS, 6)).clone()
-    sixd[..., others, :] = sixd.new_tensor(IDENTITY)
-    return Body(torch.cat([sixd.flatten(-2), motion[..., ROTATION.stop :]], -1), net.normalizer)
-
-
-def upper_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) -> dict[str, Tensor]:
-    """Return the error of the upper half's latents (smooth L1); for the arguments see `code_losses`."""
-    rotation, encoded = seen(net, frames)
-    clean = latents(codes, rotation, encoded)
-    if not training:
-        return {"latent": F.smooth_l1_loss(net.upper_latent(encoded), clean)}
-    noisy, time, hidden = noised(net, clean)
-    return {"latent": F.smooth_l1_loss(net.upper(noisy, time, encoded, hidden), clean)}
-
-
-def lower_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) -> dict[str, Tensor]:
-    """Return the error of the lower half's latents (smooth L1), given the upper ones as they are sampled."""
-    rotation, encoded = seen(net, frames)
-    clean = latents(codes, rotation, encoded)
-    with torch.no_grad():
-        upper = net.upper_latent(encoded)
-    if not training:
-        return {"latent": F.smooth_l1_loss(net.lower_latent(upper, encoded), clean)}
-    noisy, time, hidden = noised(net, clean)
-    found = net.lower(net.lower.joined(noisy, upper), time, encoded, hidden)
-    return {"latent": F.smooth_l1_loss(found, clean)}
-
-
-LATENT_LOSSES = {"upper": upper_losses, "lower": lower_losses}
-
-
-def seen(net: SAGENet, frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Return rotations (B, T, 132) and inputs (B, T, 54) in network space of world windows (B, T, 252)."""
-    sparse, motion = net.normalizer.encode(frames).tensor_split([SPARSE_DIM], -1)
-    return motion[..., ROTATION], sparse
-
-
-@torch.no_grad()
-def latents(codes: HalfVQVAE, rotation: Tensor, encoded: Tensor) -> Tensor:
-    """Return a finished VQ-VAE's latents (B, T // 2, 384) of rotations (B, T, 132) and inputs (B, T, 54)."""
-    assert not codes.training
-    return codes.encode(rotation, encoded)[0]
-
-
-def noised(net: SAGENet, clean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return noisy latents (B, T // 2, 384) of times (B,) drawn for each, and which joints (B, 22) are hidden."""
-    time = parallel.drawn(net.diffusion.random_times, clean)
-    noisy = net.diffusion.noised(clean, time, parallel.drawn(torch.randn_like, clean))
-    drawn = parallel.drawn(lambda like: torch.rand_like(like[:, 0, :HIDDEN_COUNT]), clean) * N_JOINTS
-    return noisy, time, F.one_hot(drawn.long(), N_JOINTS).sum(1) > 0

@@ -14,7 +14,7 @@ import yaml
 
 from memmlp.common.files import plain, read_json
 from memmlp.runs.evaluation_file import current
-from memmlp.runs.identity import INFERENCE, flatten, used_as_configured
+from memmlp.runs.identity import INFERENCE, flatten, training_settings, used_as_configured
 from memmlp.runs.name import run_name
 from memmlp.runs.run import Run
 
@@ -108,8 +108,10 @@ def finite(value: float | None) -> float | None:
 
 def total_steps(kind: object, config: Mapping[str, Any]) -> int | None:
     """Return how many steps a run's training has; None where its config does not say."""
-    group = config.get("vqvae" if kind == "vqvae" else "optim")
-    steps = group.get("steps") if isinstance(group, Mapping) else None
+    try:
+        steps = training_settings(str(kind), config)["steps"]
+    except (KeyError, TypeError):
+        return None
     return steps if isinstance(steps, int) else None
 
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain
 from memmlp.evaluation.units import UNITS
+from memmlp.runs.identity import NETWORK, training_settings
 from memmlp.runs.run import STAGE_WORDS
 from memmlp.statistics import Verdict
 from memmlp.sweep.board import name as task_name
@@ -89,7 +90,7 @@ class Sweeps:
             "seeds": len({entry.seed for entry in plan.entries}),
             "tasks": len(_kinds(plan)["networks"]),
             "counts": dict(counts["networks"]),
-            "vqvaes": dict(counts["VQ-VAEs"]),
+            "above": dict(counts["upstream"]),
             "share": self._share(plan, states),
             "left": self._time_left(plan, states),
         }
@@ -104,7 +105,7 @@ class Sweeps:
         metric = next((metric for metric in sweep.metrics if metric in UNITS), "MPJPE")
         shown = {arm.label: f"stream.{arm.branch}.{metric}" for arm in sweep.arms}
         cells = [self._cell(plan, entry, states, shown.get(entry.label, "")) for entry in plan.entries]
-        upstream = [self._upstream(plan, task, states) for task in plan.tasks if task.kind == "vqvae"]
+        upstream = [self._upstream(plan, task, states) for task in plan.tasks if task.kind != NETWORK]
         branches = {arm.branch for arm in sweep.arms}
         made = self.made(plan)
         found = {
@@ -119,11 +120,7 @@ class Sweeps:
 
     def states(self, plan: Plan) -> dict[str, str]:
         """Return every task's state by its key, as `Plan.states` does, from what the index knows."""
-        states = {task.key: self._state(plan, task) for task in plan.tasks}
-        for task in plan.tasks:
-            if states[task.key] != "done" and states.get(task.upstream or "") == "failed":
-                states[task.key] = "blocked"
-        return states
+        return plan.with_blocked({task.key: self._state(plan, task) for task in plan.tasks})
 
     def _state(self, plan: Plan, task: RunTask) -> str:
         facts = self.index.runs.get(task.id)
@@ -148,7 +145,7 @@ class Sweeps:
 
     def _left(self, task: RunTask, state: str) -> int:
         """Return how many steps of a task's training are left."""
-        total = int(task.config["vqvae" if task.kind == "vqvae" else "optim"]["steps"] or 0)
+        total = int(training_settings(task.kind, task.config)["steps"] or 0)
         facts = self.index.runs.get(task.id)
         if state == "done" or facts is None or not facts["recent"]:
             return 0 if state == "done" else total
@@ -268,10 +265,10 @@ def table_words(table: Any) -> dict[str, Any]:
 
 
 def _kinds(plan: Plan) -> dict[str, list[RunTask]]:
-    """Return a plan's tasks: the networks, which are its arms and seeds, and the VQ-VAEs that these need."""
-    found: dict[str, list[RunTask]] = {"networks": [], "VQ-VAEs": []}
+    """Return a plan's tasks: the networks, which are its arms and seeds, and what these build upon."""
+    found: dict[str, list[RunTask]] = {"networks": [], "upstream": []}
     for task in plan.tasks:
-        found["VQ-VAEs" if task.kind == "vqvae" else "networks"].append(task)
+        found["networks" if task.kind == NETWORK else "upstream"].append(task)
     return found
 
 

@@ -76,7 +76,7 @@ def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_no_arm(outputs
     replace(plan, entries=entries, tasks=(vqvae, *tasks)).save(path)
     sweeps = sweeps_of(outputs)
     found = sweeps.progress(sweeps.known()[0])
-    assert (found["counts"], found["vqvaes"], found["tasks"]) == ({"trained": 1, "done": 5}, {"done": 1}, 6)
+    assert (found["counts"], found["above"], found["tasks"]) == ({"trained": 1, "done": 5}, {"done": 1}, 6)
     say = states(Plan.load(path))
     arm = next(arm for arm in kept(path.parent).runnable() if arm.label == first.label)
     assert say(arm, first.seed) == "trained, an evaluation or export is missing"

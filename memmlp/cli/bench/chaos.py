@@ -25,6 +25,7 @@ import yaml
 from memmlp.common.files import file_digest
 from memmlp.common.lease import Lock
 from memmlp.common.liveness import lives
+from memmlp.runs.identity import NETWORK
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
 
@@ -235,7 +236,7 @@ def examine(outputs: Path, trials: int) -> list[str]:
     problems += [f"trial {row['trial']}: {row['state']}" for row in rows if row["state"] not in ENDS]
     ids = Counter(name for row in rows for name in row["run"].split())
     problems += [f"run {name}: of {count} trials" for name, count in ids.items() if count > 1]
-    runs = {run.id: run for run in list_runs(outputs) if run.manifest.get("kind") != "vqvae"}
+    runs = {run.id: run for run in list_runs(outputs) if run.manifest.get("kind") in (None, NETWORK)}
     problems += [f"run {name}: of no trial" for name in runs.keys() - ids.keys()]
     for row in rows:
         if row["state"] == "complete":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -14,6 +15,8 @@ from rich.table import Table
 from memmlp.cli.options import outputs_option
 from memmlp.cli.runs.texts import age, console, number_text, plain_table, recorded, value_text
 from memmlp.evaluation.units import UNITS
+from memmlp.runs.identity import NETWORK
+from memmlp.runs.name import kind_words
 
 if TYPE_CHECKING:
     from memmlp.runs.query import Record
@@ -34,7 +37,9 @@ NAME = 36  # characters of a run's name in a line
 
 
 @click.command("list")
-@click.option("--all", "every", is_flag=True, help=f"List all: VQ-VAEs too, and more than {NEWEST}.")
+@click.option(
+    "--all", "every", is_flag=True, help=f"List all: VQ-VAEs and parts too, and more than {NEWEST}."
+)
 @click.option(
     "--where", help="List the runs that fulfil a condition, such as 'memory=gru and stream.MPJPE<6.3'."
 )
@@ -42,7 +47,7 @@ NAME = 36  # characters of a run's name in a line
 @click.option("--columns", help="Show these keys, separated by commas.  [default: config keys that differ]")
 @outputs_option
 def list_runs(every: bool, where: str | None, sort: str | None, columns: str | None, outputs: Path) -> None:
-    """List the runs, the newest first, without the finished ones of VQ-VAEs.
+    """List the runs, the newest first, without the finished ones that others build upon.
 
     Shown are their names and data, what differs between their configs, the MPJPE of the rotation branch in
     both modes, Jitter, and the latency of a frame. Keys are those of the config (`memory`, `optim.lr`),
@@ -57,7 +62,7 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
     if not there:
         click.echo(f"no runs in {outputs / 'runs'}; memmlp demo makes the first")
         return
-    found = there if every or query else [run for run in there if not is_finished_vqvae(run)]
+    found = there if every or query else [run for run in there if not is_finished_upstream(run)]
     limit = len(found) if every or query or sort else NEWEST
     records = {run.id: recorded(run) for run in found[:limit]}
     fits = query.of(list(records.values())) if query else [True] * len(records)
@@ -68,17 +73,18 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
     hidden = show_runs([{**records[run.id], "age": age(run)} for run in listed], keys, bool(columns))
     if hidden:
         click.echo(f"they differ in {', '.join(hidden)}, too: --columns shows it")
-    if vqvaes := len(there) - len(found):
-        click.echo(f"{vqvaes} finished VQ-VAE{'s' if vqvaes > 1 else ''}: memmlp runs list --all")
+    if upstream := Counter(kind_words(run.manifest["kind"]) for run in there if run not in found):
+        told = ", ".join(f"{count} finished {word}" for word, count in upstream.items())
+        click.echo(f"{told}: memmlp runs list --all")
     if len(found) > limit:
         click.echo(f"{len(found) - limit} older ones: memmlp runs list --all")
     elif query:
         click.echo(f"{len(listed)} of {len(found)} runs")
 
 
-def is_finished_vqvae(run: Run) -> bool:
-    """Whether it is a finished run of a VQ-VAE, which has none of the results that are listed."""
-    return run.manifest.get("kind") == "vqvae" and run.done
+def is_finished_upstream(run: Run) -> bool:
+    """Whether it is a finished run that others build upon, which has none of the results that are listed."""
+    return run.manifest.get("kind") not in (None, NETWORK) and run.done
 
 
 def sorted_by(listed: Sequence[Run], records: Mapping[str, Record], sort: str) -> list[Run]:

@@ -50,7 +50,7 @@ def _summary(run: Run) -> dict[str, Any]:
     facts |= {key: manifest[key] for key in SUMMARY if key in manifest}
     facts["data"] = " ".join(dict.fromkeys([str(one.get("data", "-")), str(one.get("data_digest", ""))[:8]]))
     if above := manifest.get("upstream"):
-        facts["VQ-VAE" if one.get("kind") == "memmlp" else "builds upon"] = above
+        facts["builds upon"] = above
     attempts = [f"{one['stage']} from step {one['step']}, {one['started']}" for one in _attempts(manifest)]
     if attempts:
         facts["worked on"] = "\n".join(attempts)

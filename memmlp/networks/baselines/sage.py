@@ -8,6 +8,7 @@ follows is memmlp.networks.refiner. All latents are (B, T // 2, 384).
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -135,13 +136,14 @@ class Lengthened(Stack):
         """Return features (B, 2 T, d) of features (B, T, d)."""
         return self.convolution(h.transpose(1, 2))[..., 1:].transpose(1, 2)
 
-    def last(self, h: Tensor, places: Tensor) -> Tensor:
-        """Map features (T, d) and their places (T, d) to the last of 2 T frames (1, d), without the others."""
+    def last(self, h: Tensor, at: Tensor) -> Tensor:
+        """Map features (T, d), at places (T, d), to the last of 2 T frames (1, d) without the others."""
         *earlier, block = self.blocks
-        h = h + places
+        h = h + at
         for one in earlier:
             h = one(h)
-        newest = block.newest(h, 1) @ self.convolution.weight[..., -1] + self.convolution.bias
+        newest = cast(Block, block).newest(h, 1)
+        newest = F.linear(newest, self.convolution.weight[..., -1].T, self.convolution.bias)
         return self.head(self.norm(newest))
 
 
@@ -302,9 +304,7 @@ class UpperDenoiser(nn.Module):
         """Mix the frames of latents (B, T // 2, 384)."""
         return self.align(latent.transpose(-1, -2)).transpose(-1, -2)
 
-    def forward(
-        self, noisy: Tensor, time: Tensor, encoded: Tensor, hidden: Tensor | None = None
-    ) -> Tensor:
+    def forward(self, noisy: Tensor, time: Tensor, encoded: Tensor, hidden: Tensor | None = None) -> Tensor:
         """Map noisy latents (B, T // 2, 384), times (B,) and inputs (B, T, 54) to clean latents.
 
         In training joints (B, 22) may be `hidden`; see Halved.
@@ -312,7 +312,7 @@ class UpperDenoiser(nn.Module):
         return self.denoise(noisy, time, self.condition(encoded, hidden))
 
     def denoise(self, noisy: Tensor, time: Tensor, condition: Tensor) -> Tensor:
-        """Map noisy latents (B, T // 2, 384), times (B,) and the condition (B, T // 2, d) to clean latents."""
+        """Map noisy latents (B, T // 2, 384), times (B,) and a condition (B, T // 2, d) to clean ones."""
         h = self.stem(torch.cat([condition, self.aligned(noisy)], -1))
         embedding = F.silu(self.time(time))
         for block in self.blocks:

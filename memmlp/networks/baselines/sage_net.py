@@ -1,4 +1,4 @@
-"""SAGE-Net (Feng et al., CVPR 2024) as a network: diffusion makes latents of the body's halves, a decoder the pose.
+"""SAGE-Net (Feng et al., CVPR 2024): diffusion makes latents of the body's halves, a decoder the pose.
 
 Its parts are trained one after the other (memmlp.training.sage) before they are as a whole.
 """

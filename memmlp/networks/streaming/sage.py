@@ -44,10 +44,12 @@ class SAGENetStream(StreamingGraph):
         nothing = torch.zeros(1, SPARSE_DIM).to(model.noises)
         offset = entering(nothing)
         self.sparse = linear((entering(torch.eye(SPARSE_DIM).to(nothing)) - offset).T, offset[0])
-        self.register_buffer("places", places(nothing.new_zeros(self.frames // 2, model.decoder.stem.out_features)))
+        self.register_buffer(
+            "places", places(nothing.new_zeros(self.frames // 2, model.decoder.stem.out_features))
+        )
 
     def windows(self) -> State:
-        """Return zeros (T, d + d + 384): what denoisers and decoder see of each frame, before time is mixed."""
+        """Return zeros (T, d + d + 384): what denoisers and decoder see of each frame on its own."""
         return {"seen": torch.zeros(self.frames, sum(self.widths))}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:

@@ -48,7 +48,7 @@ function facts(run) {
   const pairs = [
     ['id', code(run.id)], ['started', h('span', { title: ago(run.started) }, date(run.started))], ['took', duration(run.seconds)],
     ['data', code(dataName(run.data) || '–')], ['device', run.device || '–'], ['code', code(run.code || '–')],
-    run.upstream ? ['VQ-VAE', link(address('run', run.upstream), run.upstream.slice(0, 8))] : null,
+    run.upstream ? ['builds upon', link(address('run', run.upstream), run.upstream.slice(0, 8))] : null,
     run.control ? ['control', [link(address('run', run.control.id), nameOf(run.control)), ' · ', link(address('compare', '', { runs: `${run.id},${run.control.id}` }), 'compare')]] : null,
   ];
   return h('dl', { class: 'facts' }, pairs.filter(Boolean).map(([key, value]) => h('div', {}, h('dt', {}, key), h('dd', {}, value))));

@@ -26,9 +26,9 @@ export async function page() {
 function progress(sweep) {
   const parts = ORDER.filter(name => sweep.counts[name]).map(name => h('i', { class: look(name), style: `flex-grow:${sweep.counts[name]}` }));
   const told = counts => ORDER.filter(name => counts[name]).map(name => `${counts[name]} ${STATE_WORDS[name] ?? name}`).join(', ');
-  const above = told(sweep.vqvaes);
+  const above = told(sweep.above);
   const missing = sweep.counts.trained ? ' (trained: an evaluation or export is missing)' : '';
-  const words = `${told(sweep.counts)}${missing}${above ? `; VQ-VAEs: ${above}` : ''}`;
+  const words = `${told(sweep.counts)}${missing}${above ? `; what they build upon: ${above}` : ''}`;
   const left = sweep.left === null ? '' : ` · about ${duration(sweep.left)} of training left`;
   return h('span', { class: 'sweep-progress' }, h('span', { class: 'segments', role: 'img', 'aria-label': words }, parts), h('span', { class: 'n' }, `${Math.floor(100 * sweep.share)} %`), h('small', { class: 'faint' }, `${words}${left}`));
 }
@@ -76,7 +76,7 @@ function board(sweep) {
   return section('Runs', h('p', { class: 'faint' }, `${metricText(sweep.metric)}, stream mode${sweep.branch ? `, ${sweep.branch} branch` : ''}.`), h('div', { class: 'scroll short' }, h('table', { class: 'grid' },
     h('thead', {}, h('tr', {}, h('th', { scope: 'col' }, 'arm'), seeds.map(seed => h('th', { scope: 'col', class: 'n' }, `seed ${seed}`)))),
     h('tbody', {}, arms.map(arm => h('tr', {}, h('th', { scope: 'row' }, arm), seeds.map(seed => words(at(arm, seed)))))))),
-    above.length ? h('details', {}, h('summary', {}, `${above.length} VQ-VAEs`), h('ul', { class: 'remarks' }, above)) : null, failed);
+    above.length ? h('details', {}, h('summary', {}, `${above.length} runs that they build upon`), h('ul', { class: 'remarks' }, above)) : null, failed);
 }
 
 function effects(table, draw) {
