@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import tiny
 import torch
+from tiny_tasks import part_task
 from torch import Tensor, nn
 
 from memmlp.deploy import latency
@@ -69,6 +70,7 @@ from memmlp.training.network import MotionTask
 from memmlp.training.optim import Muon, Optim, ScheduleFree, vqvae_optim
 from memmlp.training.refiner import RefinerTask, RefinerTraining, sage_loss
 from memmlp.training.rollout import OwnPredictions, PersistentStreams, Rollout, TeacherForcing
+from memmlp.training.sage import PARTS, DroppingOptim, PartTask
 from memmlp.training.vqvae import VQVAETask
 
 PATH = Path(__file__).with_name("golden.json")
@@ -147,7 +149,7 @@ def vqvae(codebook: str = "ema") -> Numbers:
     return _trained(task, optim) | task.validate()
 
 
-def _trained(task: VQVAETask | MotionTask | RefinerTask, optim: Optim) -> Numbers:
+def _trained(task: VQVAETask | MotionTask | RefinerTask | PartTask, optim: Optim) -> Numbers:
     """The losses of three steps, and the weights after them."""
     optimiser, found = optim.build(task.parameter_groups()), {}
     average = optim.average(task.module, optimiser)
@@ -234,6 +236,17 @@ def refiner() -> Numbers:
     pieces = RefinerTraining(0, SAGERefiner(6, 2, 20, 6), optim, "frames").drawn(split)
     task = RefinerTask(model, sage_loss(), split, pieces, optim, validate=lambda: {})
     return _trained(task, optim) | summary("stream", evaluation.stream(model.eval(), [tiny.clip(25)])[0])
+
+
+def parts() -> Numbers:
+    """Three steps of each of SAGE-Net's parts that has a training of its own, and its errors then."""
+    optim = DroppingOptim(steps=3, batch=4, lr=1e-2, drops=(0.5,), drop=0.25)
+    found = {}
+    for kind in PARTS[:-1]:
+        task = part_task(kind, optim)
+        numbers = _trained(task, optim) | task.validate()
+        found |= {f"{kind} {name}": value for name, value in numbers.items()}
+    return found
 
 
 def rollout(make: Callable[[], Rollout]) -> Numbers:
@@ -378,6 +391,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
         }.items()
     },
     "refiner.sage": refiner,
+    "upstream.sage": parts,
     "vqvae": vqvae,
     **{f"codebook.{name}": partial(vqvae, name) for name in ("ema", "gradient")},
     "sampler": sampler,

@@ -6,15 +6,19 @@ from functools import partial
 
 import tiny
 import torch
+from torch import nn
 
 from memmlp.networks import checkpoint
+from memmlp.networks.baselines.sage import LOWER, UPPER
 from memmlp.networks.memory import JointCodeMemory
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.run import Run
 from memmlp.training.losses import HandPosition, MotionLoss, TermsLoss, Uncertainty
-from memmlp.training.network import MotionTask
+from memmlp.training.network import MotionTask, NetworkTraining
 from memmlp.training.optim import Optim
 from memmlp.training.rollout import OwnPredictions, PersistentStreams, TeacherForcing
+from memmlp.training.sage import PARTS, PartTask, Windows
+from memmlp.training.sage_losses import objective
 from memmlp.training.vqvae import VQVAETask
 
 OPTIM = Optim(steps=12, batch=4, lr=1e-3, final_lr=1e-4, schedule="cosine", checkpoint_every=5, log_every=4)
@@ -51,6 +55,19 @@ def vqvae_task(optim: Optim = OPTIM) -> VQVAETask:
     return VQVAETask(model, tiny.normalizer(), tiny.frames(), tiny.frames((30,), seed=9), optim, seed=0)
 
 
+def part_task(kind: str, optim: Optim = OPTIM, seed: int = 0) -> PartTask:
+    """The task of training one of SAGE-Net's parts; those before it have random weights."""
+    net = tiny.baseline("sage", seed=seed)
+    halves = nn.ModuleDict({"net": net, "upper": net.codes(UPPER), "lower": net.codes(LOWER)}).eval()
+    part = {"upper_diffusion": net.upper, "lower_diffusion": net.lower}.get(kind, halves[kind.split("_")[0]])
+    network = NetworkTraining(
+        seed, lambda branches: TermsLoss(rotation=1.0), TeacherForcing(), optim, "frames"
+    )
+    windows = Windows(network, tiny.frames(), tiny.frames((30,), seed=9), net.frames)
+    halves.requires_grad_(False)
+    return PartTask(part.requires_grad_(True), objective(kind, halves), windows)
+
+
 def weights(run: Run) -> dict[str, torch.Tensor]:
     return checkpoint.read(run.checkpoint)[0]
 
@@ -63,4 +80,5 @@ TASKS = {
     "schedule_free": partial(motion_task, "forced"),
     "vqvae": vqvae_task,
     "joint": partial(motion_task, kind=JointCodeMemory),
+    **{kind: partial(part_task, kind) for kind in PARTS if kind != "decoder"},
 }

@@ -79,6 +79,18 @@ PUBLISHED = {
         + 12 * 41 * 45 * (4 * 512**2 + 2 * 512 * 2048) + 6 * 41 * 45 * 2 * (45 + 41) * 512
         + 41 * 22 * 27 + 41 * SOLVED + BONES,
     ),
+    "sage": (
+        120_269_534,
+        120.27,
+        2 * (20 * (3 * 22 * 18 + 396 * 512) + 10 * 20 * 512)  # what the denoisers see, once
+        + 5  # calls of both
+        * (
+            2 * 12 * (10 * 12 * 512**2 + 2 * 10**2 * 512 + 6 * 512**2)
+            + 2 * (10 * (896 * 512 + 512 * 384) + 10 * 10 * 384 + 256 * 512 + 512**2) + 10 * 768 * 384
+        )
+        + 20 * (3 * 22 * 18 + 396 * 384) + 10 * 20 * 384 + 10 * 1152 * 256  # the decoder
+        + 4 * (10 * 12 * 256**2 + 2 * 10**2 * 256) + 10 * 3 * 256**2 + 20 * (3 * 256**2 + 256 * 132),
+    ),
     "rpm": (
         9_889_412 - 512 * 513,  # the released code has a layer that nothing uses
         9.63,
@@ -101,11 +113,12 @@ def test_paper_profile_has_the_published_size(name):
 def test_published_work():
     """Table 16 has the MACs of AGRoL-MLP, 0.88 G, and twice those of AvatarPoser, 0.33 G, as FLOPs.
 
-    Of BoDiffusion it has one call's, 0.46 G.
+    Of BoDiffusion it has one call's, 0.46 G; of SAGE-Net the MACs, 4.10 G.
     """
     assert PUBLISHED["agrol_mlp"][2] / 1e9 == pytest.approx(0.88, abs=0.015)
     assert PUBLISHED["bodiffusion"][2] / 25 / 1e9 == pytest.approx(0.46, abs=0.02)
     assert 2 * PUBLISHED["avatar_poser"][2] / 1e9 == pytest.approx(0.33, abs=0.015)
+    assert PUBLISHED["sage"][2] / 1e9 == pytest.approx(4.10, abs=0.06)
 
 
 def test_baselines_see_what_their_authors_give_them():
@@ -165,6 +178,11 @@ REFUSED = [
         "refiner: corrects a stream",
     ),
     (["model=bodiffusion", "model.noise=0"], "model.noise=0"),
+    (["model=sage", "upstream=null"], "allowed with this model is upstream=sage"),
+    (["upstream=sage"], "allowed with this model is upstream=null"),
+    (["model=sage", "model.code_heads=3"], "model.code_heads=3"),
+    (["model=sage", "model.code_width=21", "model.code_heads=1"], "model.code_width=21"),
+    (["model=sage", "upstream.decoder.drop=0"], "upstream.decoder.drop=0"),
     (["model=avatar_poser", "loss=own"], "loss=own: AvatarPoser"),
     (["loss=terms"], "loss=terms is of rotations alone"),
     (["model=agrol_mlp", "loss=terms", "loss.jerk=-1"], "loss.jerk=-1"),

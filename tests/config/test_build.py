@@ -22,7 +22,7 @@ from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.pipeline.experiment import Experiment
-from memmlp.pipeline.run_stages import vqvae_run
+from memmlp.pipeline.run_stages import upstream_run
 from memmlp.runs.run import Run
 
 TINY = [
@@ -121,9 +121,10 @@ def trained(overrides: list[str]) -> Arm:
 def train_and_stream(cfg: DictConfig) -> Arm:
     experiment = build_experiment(cfg)
     data = experiment.data.prepare()
-    codes = vqvae_run(experiment, data).model if experiment.architecture.uses_codes else None
+    above = upstream_run(experiment, data)
     run = Run(Path(mkdtemp(dir=".", prefix="arm-")))
-    model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)
+    weights = above.model if above else None
+    model = experiment.training.train(experiment.architecture, data, weights, run, experiment.device)
     test = data.open("test")
     short = MotionDataset(test.frames[:24], torch.tensor([0]), torch.tensor([24]), test.names[:1])
     torch.manual_seed(0)
@@ -345,4 +346,4 @@ def test_a_joint_vqvae_is_part_of_the_runs_identity_and_its_own_stage_is_not():
     base = identity()
     assert all(identity(change) != base for change in ("vqvae.codes=32", "vqvae.encoder_depth=2"))
     assert all(identity(change) == base for change in ("vqvae.steps=7", "vqvae.lr=0.5", "tracking=none"))
-    assert experiment_of().vqvae_identity("data") is None
+    assert experiment_of().above("data") == []

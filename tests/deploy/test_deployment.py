@@ -76,6 +76,7 @@ def test_inner_layers_are_int8_and_the_ends_are_not(step_files, tmp_path, networ
         "manikin_l": {"model.model.regressor.0.weight", "model.model.regressor.3.weight"},
         "avatar_jlm": {"model.model.regressor.0.weight", "model.model.regressor.3.weight"},
         "bodiffusion": {"model.sparse.weight", "model.motion.weight", "model.made.weight"},
+        "sage": {"model.sparse.weight", "model.decoder.heads.0.2.weight", "model.decoder.heads.1.2.weight"},
         "vae_hmd": {"model.model.encoder.stem.weight", "model.model.decoder.head.weight"},
     }.get(network, {"model.model.head.weight"})
     assert {kinds[name] for name in ends} == {onnx.TensorProto.FLOAT}

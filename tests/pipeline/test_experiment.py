@@ -21,7 +21,7 @@ from memmlp.deploy.deployment import GRAPHS
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline.experiment import Experiment
-from memmlp.pipeline.run_stages import vqvae_run
+from memmlp.pipeline.run_stages import upstream_run
 from memmlp.runs.identity import NEUTRAL, Identity, deployment_id, evaluation_id, flatten
 from memmlp.runs.run import Run
 from memmlp.tracking.feed import Tracking
@@ -69,6 +69,7 @@ UNTRIED = {
     "plugins": "changes no run by itself: tests/config/test_plugins.py",
     "term": "one of a package of one's own: tests/config/test_plugins.py",
     "evaluation.metrics": "of a package of one's own: tests/config/test_plugins.py",
+    "upstream": "parts of SAGE-Net, each a run of its own: tests/pipeline/test_sage.py",
     "refiner": "a run of its own, behind the network's: tests/pipeline/test_refiner.py",
     "vqvae.epochs": "steps by another name: the two exclude each other (tests/config/test_compose.py)",
 }
@@ -127,7 +128,7 @@ def outcome(folder: Path, overrides: list[str]) -> Outcome:
     experiment = replace(build_experiment(composed([*BASE, *overrides])), outputs=folder)
     data = experiment.data.prepare()
     identity = experiment.identity(data.digest)
-    codes = vqvae_run(replace(experiment, tracking=Tracking((), folder)), data).model
+    codes = upstream_run(replace(experiment, tracking=Tracking((), folder)), data).model
     run = Run(folder / "run")
     run.folder.mkdir(parents=True)
     model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)

@@ -24,7 +24,7 @@ from memmlp.config.packaged import packaged
 from memmlp.live.stream import Stream
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline import run_stages
-from memmlp.pipeline.run_stages import shown, vqvae_run
+from memmlp.pipeline.run_stages import shown, upstream_run
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.recipes import RECIPES
 from memmlp.runs.run import Run
@@ -72,7 +72,7 @@ def test_the_same_command_finds_the_run_and_others_share_the_vqvae(home, monkeyp
     assert len(codes) == 1
     monkeypatch.chdir(home)
     experiment = build_experiment(composed([*TINY, "seed=1"]))  # by default a VQ-VAE follows its run's seed
-    assert vqvae_run(experiment, experiment.data.prepare()).id not in codes
+    assert upstream_run(experiment, experiment.data.prepare()).id not in codes
 
 
 def test_eval_repeats_the_runs_numbers_and_saves_predictions(home):
@@ -225,10 +225,11 @@ def test_every_experiment_trains_and_streams(home, name, monkeypatch: pytest.Mon
     cfg = composed([f"experiment={name}", *TINY, "optim.steps=2"])
     experiment = build_experiment(cfg)
     data = experiment.data.prepare()
-    codes = vqvae_run(experiment, data).model if experiment.architecture.uses_codes else None
+    above = upstream_run(experiment, data)
     run = Run(home / "variants" / name)
     run.folder.mkdir(parents=True, exist_ok=True)
-    model = experiment.training.train(experiment.architecture, data, codes, run, experiment.device)
+    weights = above.model if above else None
+    model = experiment.training.train(experiment.architecture, data, weights, run, experiment.device)
     values = run.metrics()[-1].values
     assert all(np.isfinite(value) for value in values.values())
     assert len(data.open("test").names) > 0

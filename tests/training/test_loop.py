@@ -45,8 +45,11 @@ class Kill(Exception):
     """Raised where a process is killed."""
 
 
+PARTS = ["upper_codes", "lower_diffusion"]  # of SAGE-Net
+
+
 @pytest.mark.parametrize(
-    "make", [*ROLLOUTS, *tiny.BASELINES, "recurrent forced", "recurrent streams", "vqvae"]
+    "make", [*ROLLOUTS, *tiny.BASELINES, *PARTS, "recurrent forced", "recurrent streams", "vqvae"]
 )
 def test_a_resumed_run_is_the_same_run(make, tmp_path):
     """It is stopped at step 7 of 12, two steps after the last checkpoint, and resumed with new objects."""

@@ -74,6 +74,8 @@ KNOBS = [
     ("agrol_diffusion", {"noise_seed": 1}), ("agrol_diffusion", {"depth": 3}),
     ("bodiffusion", {"diffusion_steps": 60}), ("bodiffusion", {"sampling_steps": 2}),
     ("bodiffusion", {"noise_seed": 1}), ("bodiffusion", {"heads": 2}),
+    ("sage", {"noise": 1.0}), ("sage", {"sampling_steps": 2}), ("sage", {"diffusion_steps": 60}),
+    ("sage", {"heads": 1}), ("sage", {"code_heads": 1}), ("sage", {"code_depth": 1}), ("sage", {"depth": 1}),
     ("avatar_poser", {"frames": 6}), ("avatar_poser", {"heads": 2}), ("avatar_poser", {"feedforward": 16}),
     ("avatar_poser", {"depth": 3}),
     ("ego_poser", {"frames": 6}), ("ego_poser", {"heads": 2}), ("ego_poser", {"feedforward": 16}),

@@ -1,0 +1,144 @@
+"""How SAGE-Net's parts are trained: on their half alone, beside parts that stay as they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import tiny
+import torch
+from tiny_tasks import part_task
+from torch import nn
+
+from memmlp.motion.body import HEAD, N_JOINTS, ROTATION, SPARSE_DIM
+from memmlp.motion.coordinates import World
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks import checkpoint
+from memmlp.networks.architecture import PartedArchitecture
+from memmlp.networks.baselines.sage import LOWER, UPPER
+from memmlp.training import sage_losses
+from memmlp.training.loop import train_step
+from memmlp.training.sage import PARTS, DroppingOptim
+
+OPTIM = DroppingOptim(steps=4, batch=4, lr=1e-2, drops=(0.5, 0.75), drop=0.2)
+FRAMES = torch.stack([tiny.clip(8, seed) for seed in (1, 2)])
+JOINTS = {"upper": UPPER, "lower": LOWER}
+
+
+def parts(kind: str) -> tuple[nn.Module, nn.Module]:
+    """The network and the half's VQ-VAE of a part's task."""
+    net, codes = part_task(kind).objective.args
+    return net, codes
+
+
+@pytest.mark.parametrize("half", JOINTS)
+def test_a_vqvae_sees_and_is_scored_on_its_half_alone(half):
+    net, codes = parts(f"{half}_codes")
+    before = sage_losses.code_losses(net, codes, FRAMES, False)
+    others = [joint for joint in range(N_JOINTS) if joint not in JOINTS[half]]
+    for joints, same in ((others, True), (JOINTS[half][1:], False)):
+        turned = FRAMES.clone()
+        motion = turned[..., SPARSE_DIM:][..., ROTATION].unflatten(-1, (N_JOINTS, 6))
+        motion[..., list(joints), :] = motion[..., list(joints), :].roll(3, -1)
+        after = sage_losses.code_losses(net, codes, turned, False)
+        assert all(torch.equal(before[name], after[name]) for name in before) == same
+    assert ("hand" in before) == (half == "upper")
+
+
+@torch.no_grad()
+def test_a_true_pose_has_no_error_and_hands_are_where_the_trackers_are():
+    net = tiny.baseline("sage")
+    net.normalizer = Normalizer.raw(World(), tiny.REST)
+    true = FRAMES[:, -1, SPARSE_DIM:][..., ROTATION].unflatten(-1, (N_JOINTS, 6))
+    errors = sage_losses.half_errors(net, UPPER, true[:, list(UPPER)], FRAMES[:, -1], true)
+    assert {name: round(float(value), 6) for name, value in errors.items()} == dict.fromkeys(errors, 0.0)
+    turned = true.clone()
+    turned[:, HEAD] = turned[:, HEAD].roll(3, -1)  # joints hang on the head's tracker, and none on the head
+    found = sage_losses.half_errors(net, UPPER, turned[:, list(UPPER)], FRAMES[:, -1], true)
+    assert float(found["rotation"]) > 0.01
+    assert float(found["position"]) == pytest.approx(0, abs=1e-6)
+    assert float(found["hand"]) == pytest.approx(0, abs=1e-6)
+
+
+class Watched:
+    """Calls a function and keeps the arguments it was called with."""
+
+    def __init__(self, function):
+        self.function, self.calls = function, []
+
+    def __call__(self, *arguments):
+        self.calls.append(arguments)
+        return self.function(*arguments)
+
+
+def test_joints_are_hidden_in_training_alone_and_never_the_first():
+    net, codes = parts("upper_codes")
+    codes.encode = Watched(codes.encode)
+    for training in (True, False):
+        sage_losses.code_losses(net, codes, FRAMES, training)
+    seen = [rotation.unflatten(-1, (N_JOINTS, 6)) for rotation, _ in codes.encode.calls]
+    hidden, shown = ((one == sage_losses.HIDDEN).all(-1) for one in seen)
+    assert not shown.any()
+    assert not hidden[..., 0].any()
+    assert 0.2 < hidden[..., 1:].float().mean() < 0.8
+    assert (hidden == hidden[:, :1]).all()  # in all frames of a window
+    assert (sage_losses.noised(net, torch.zeros(99, 4, 384))[2].sum(1) <= 2).all()
+
+
+def every_tensor(*modules: nn.Module) -> dict[str, torch.Tensor]:
+    return {f"{i}.{name}": t for i, module in enumerate(modules) for name, t in module.state_dict().items()}
+
+
+@pytest.mark.parametrize("kind", PARTS[:-1])
+def test_a_step_changes_the_part_and_nothing_else(kind):
+    task = part_task(kind)
+    tensors = every_tensor(*task.objective.args)
+    before = {name: tensor.clone() for name, tensor in tensors.items()}
+    train_step(task, OPTIM, OPTIM.build(task.parameter_groups()), 0)
+    own = {tensor.data_ptr() for tensor in task.module.state_dict().values()}
+    changed = {name for name, tensor in tensors.items() if not torch.equal(tensor, before[name])}
+    assert changed
+    assert all(tensors[name].data_ptr() in own for name in changed)
+
+
+def test_the_lower_half_is_given_what_the_upper_one_samples():
+    """Never the true latents, which there are none of at inference."""
+    net, codes = parts("lower_diffusion")
+    encoded = net.normalizer.encode(FRAMES)[..., :SPARSE_DIM]
+    net.lower.joined = Watched(net.lower.joined)
+    with torch.no_grad():
+        for training in (True, False):
+            sage_losses.lower_losses(net, codes, FRAMES, training)
+        net.rotations(encoded)
+        expected = net.upper_latent(encoded)
+    assert len(net.lower.joined.calls) == 1 + 2 * len(net.diffusion.times)
+    assert all(torch.equal(upper, expected) for _, upper in net.lower.joined.calls)
+
+
+def test_the_whole_is_trained_through_both_samplers():
+    net = tiny.baseline("sage")
+    state = net.running_state(FRAMES[:, :-1, :SPARSE_DIM])
+    motion, _ = net.learn(FRAMES[:, -1:, :SPARSE_DIM], state, FRAMES)
+    assert motion.shape[1] == 1
+    motion[..., ROTATION].sum().backward()
+    assert all(part.stem.weight.grad.any() for part in (net.upper, net.lower, net.decoder))
+
+
+def test_it_begins_with_the_weights_of_its_parts(tmp_path: Path):
+    kept = tiny.baseline("sage", seed=1)
+    checkpoint.write(tmp_path / "model", checkpoint.module_tensors("model", kept), {})
+    network = tiny.BASELINES["sage"]
+    architecture = PartedArchitecture(World(), normalize=False, vqvae=tiny.vqvae, network=network)
+    for finished in ((), ("upper", "lower")):
+        net = replace(architecture, finished=finished).begun(tiny.normalizer(), tmp_path / "model")
+        stems = {name: net.get_submodule(name).stem.weight for name in ("upper", "lower", "decoder")}
+        same = {
+            name for name, stem in stems.items() if torch.equal(stem, kept.get_submodule(name).stem.weight)
+        }
+        assert same == (set(finished) or set(stems))
+        assert {name for name, stem in stems.items() if not stem.requires_grad} == set(finished)
+
+
+def test_the_learning_rate_falls_where_it_is_told():
+    assert [OPTIM.factor(step) for step in range(4)] == pytest.approx([1, 1, 0.2, 0.04])
