@@ -60,9 +60,7 @@ def part_task(kind: str, optim: Optim = OPTIM, seed: int = 0) -> PartTask:
     net = tiny.baseline("sage", seed=seed)
     halves = nn.ModuleDict({"net": net, "upper": net.codes(UPPER), "lower": net.codes(LOWER)}).eval()
     part = {"upper_diffusion": net.upper, "lower_diffusion": net.lower}.get(kind, halves[kind.split("_")[0]])
-    network = NetworkTraining(
-        seed, lambda branches: TermsLoss(rotation=1.0), TeacherForcing(), optim, "frames"
-    )
+    network = NetworkTraining(seed, lambda branches: TermsLoss(angle=1), TeacherForcing(), optim, "frames")
     windows = Windows(network, tiny.frames(), tiny.frames((30,), seed=9), net.frames)
     halves.requires_grad_(False)
     return PartTask(part.requires_grad_(True), objective(kind, halves), windows)

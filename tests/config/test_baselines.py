@@ -178,7 +178,7 @@ REFUSED = [
         "refiner: corrects a stream",
     ),
     (["model=bodiffusion", "model.noise=0"], "model.noise=0"),
-    (["model=sage", "upstream=null"], "allowed with this model is upstream=sage"),
+    (["model=sage", "upstream=null"], "upstream=null"),
     (["upstream=sage"], "allowed with this model is upstream=null"),
     (["model=sage", "model.code_heads=3"], "model.code_heads=3"),
     (["model=sage", "model.code_width=21", "model.code_heads=1"], "model.code_width=21"),

@@ -129,6 +129,10 @@ def test_what_needs_a_failed_run_is_blocked(tmp_path: Path):
     path = saved(tmp_path, CODES, ONE, ALONE)
     work(path, perform)
     assert Plan.load(path).states() == {CODES.id: "failed", ONE.id: "blocked", ALONE.id: "failed"}
+    further = RunTask("f" * 16, "memmlp", {}, ONE.id)
+    deeper = Plan.load(saved(tmp_path, CODES, ONE, further))
+    assert deeper.states() == {CODES.id: "failed", ONE.id: "blocked", further.id: "blocked"}
+    assert deeper.left() == []
 
 
 def test_a_cancelled_run_is_left_as_it_is(tmp_path: Path):

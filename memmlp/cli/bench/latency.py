@@ -31,8 +31,9 @@ MODELS: dict[str, tuple[str, ...]] = {
     "manikin_s": ("model=manikin_s",),
     "avatar_jlm": ("model=avatar_jlm",),
     "manikin_l": ("model=manikin_l",),
+    "sage": ("model=sage",),
 }
-SLOW = ("bodiffusion", "avatar_jlm", "manikin_l")
+SLOW = ("bodiffusion", "avatar_jlm", "manikin_l", "sage")
 """Seconds a step, or gigabytes of files: timed where they are asked for."""
 VARIANTS = ("naive", "streaming", "fp16", "int8")
 
