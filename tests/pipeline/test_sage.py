@@ -20,8 +20,8 @@ from memmlp.runs.lookup import check_trained, list_runs
 from memmlp.training.sage import PARTS
 
 SHORT = [
-    "model=sage", "profile=tiny", "data.synth.minutes=0.1", "tracking=none", "threads=1", "export.graph=off",
-    "optim.steps=2", *(f"upstream.{part}.steps=2" for part in PARTS), "model.sampling_steps=2",
+    "model=sage", "profile=tiny", "data.synth.minutes=0.05", "tracking=none", "threads=1", "export.graph=off",
+    "optim.steps=2", *(f"upstream.{part}.steps=2" for part in PARTS), "model.sampling_steps=1",
 ]  # fmt: skip
 
 
@@ -75,7 +75,7 @@ FIRST = {
     "upstream.lower_codes.lr": (0.1, 1),
     "model.width": (8, 2), "model.depth": (2, 2), "model.heads": (1, 2), "model.diffusion_steps": (99, 2),
     "upstream.upper_diffusion.batch": (9, 2), "upstream.upper_diffusion.drops": ([0.1], 2),
-    "model.sampling_steps": (3, 3), "model.noise": (0.1, 3), "model.noise_seed": (1, 3),
+    "model.sampling_steps": (2, 3), "model.noise": (0.1, 3), "model.noise_seed": (1, 3),
     "upstream.lower_diffusion.steps": (3, 3),
     "loss.orientation": (1.0, 4), "upstream.decoder.lr": (0.1, 4),
     "optim.steps": (3, 5), "optim.lr": (0.1, 5), "optim.clip_norm": (1.0, 5),
