@@ -18,7 +18,6 @@ from memmlp.networks.baselines.sage import HIDDEN, HalfVQVAE
 from memmlp.networks.baselines.sage_net import SAGENet
 from memmlp.training.losses.terms import Body
 
-IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)  # the 6D rotation that turns nothing
 HIDDEN_SHARE = 0.5  # of a half's joints, which its VQ-VAE has to guess
 HIDDEN_COUNT = 2  # joints of the diffusion models' condition, drawn with replacement
 CODE_WEIGHTS = {"orientation": 0.2, "rotation": 1.0, "position": 5.0, "hand": 5.0, "codebook": 0.25}
@@ -66,9 +65,9 @@ def code_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) 
 def half_errors(
     net: SAGENet, joints: tuple[int, ...], made: Tensor, frame: Tensor, true: Tensor
 ) -> dict[str, Tensor]:
-    """Return errors of a half's rotations and of what forward kinematics makes of them (smooth L1).
+    """Return errors of a half's rotations and of its joints by forward kinematics (smooth L1).
 
-    All other joints stand as in the rest pose, in both bodies.
+    A half has all that its joints hang on, so that the other joints' rotations don't matter.
 
     Args:
         net: the network, whose space the rotations are in.
@@ -80,7 +79,8 @@ def half_errors(
     sparse, own = frame[:, None, :SPARSE_DIM], list(joints)
     full = true.clone()
     full[:, own] = made.to(true)
-    bodies = [standing(net, rotation, sparse, joints) for rotation in (full, true)]
+    motions = [net.normalizer.posed(sixd.flatten(-2)[:, None], sparse) for sixd in (full, true)]
+    bodies = [Body(motion, net.normalizer) for motion in motions]
     (found, placed), (expected, true_placed) = [(one.sixd, one.posed[1]) for one in bodies]
     errors = {
         "orientation": F.smooth_l1_loss(found[..., ROOT, :], expected[..., ROOT, :]),
@@ -92,15 +92,6 @@ def half_errors(
         moved = placed + (head - placed[..., HEAD, :])[..., None, :]
         errors["hand"] = F.smooth_l1_loss(moved[..., list(HANDS), :], torch.stack(hands, -2))
     return errors
-
-
-def standing(net: SAGENet, rotation: Tensor, sparse: Tensor, joints: tuple[int, ...]) -> Body:
-    """Return the world's body of rotations (B, 22, 6) at inputs (B, 1, 54), all joints but these at rest."""
-    motion = net.normalizer.posed(rotation.flatten(-2)[:, None], sparse)
-    others = [joint for joint in range(N_JOINTS) if joint not in joints]
-    sixd = motion[..., ROTATION].unflatten(-1, (N_JOINTS, 6)).clone()
-    sixd[..., others, :] = sixd.new_tensor(IDENTITY)
-    return Body(torch.cat([sixd.flatten(-2), motion[..., ROTATION.stop :]], -1), net.normalizer)
 
 
 def upper_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) -> dict[str, Tensor]:

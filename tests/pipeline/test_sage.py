@@ -56,6 +56,8 @@ def test_one_command_trains_each_part_and_then_the_whole(memmlp, no_picture):
         assert not same(tensors(chain[4], prefix), tensors(whole, prefix))
     assert not same(tensors(chain[4], "model.decoder."), tensors(whole, "model.decoder."))
     assert not tensors(whole, "codes")
+    stems = [tensors(chain[1], f"codes.{half}.stem.weight") for half in ("upper", "lower")]
+    assert [stem.shape[1] for half in stems for stem in half.values()] == [14 * 24, 9 * 24]  # of each joint
     with pytest.raises(InputError, match="not a finished"):
         check_trained(chain[0])
     # a part alone that is gone is made again, with the same weights
