@@ -27,7 +27,6 @@ NETWORKS: dict[str, Callable[[], WindowModel]] = {
     **{name: partial(tiny.baseline, name, Heading(), depth=1) for name in tiny.BASELINES},
     **{name: partial(tiny.baseline, name, depth=1) for name in LARGEST},
     "bodiffusion": partial(tiny.baseline, "bodiffusion", Heading(), depth=1, sampling_steps=2),
-    "sage": partial(tiny.baseline, "sage", Heading(), depth=1, code_depth=1, sampling_steps=2),
 }
 """By name. Relative to the heading, which makes the larger graph, unless it is the largest anyway."""
 

@@ -132,8 +132,8 @@ BASELINES: dict[str, Callable[..., WindowModel]] = {
         turned=True, offline=False,
     ),
     "sage": partial(
-        SAGENet, frames=8, width=16, depth=2, heads=2, code_width=16, code_depth=2, code_heads=2, dropout=0.1,
-        diffusion_steps=50, sampling_steps=3, noise=0.01, noise_seed=0,
+        SAGENet, frames=8, width=16, depth=1, heads=2, code_width=16, code_depth=1, code_heads=2, dropout=0.1,
+        diffusion_steps=50, sampling_steps=2, noise=0.01, noise_seed=0,
     ),
 }  # fmt: skip
 WINDOWLESS = ["hmd_poser", "vae_hmd", "rpm"]

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from memmlp.networks.baselines import sage
+from memmlp.networks.layers import undivided
 
 SIZES = {
     "upper codes": (lambda: sage.HalfVQVAE(sage.UPPER), 7_239_436),
@@ -68,3 +69,9 @@ def test_codes_that_nothing_uses_come_alive_and_gradients_pass_straight_through(
     assert float((quantiser.vectors - before).detach().norm(dim=-1).median()) > 10
     loss.backward()
     assert quantiser.vectors.grad.any()
+
+
+def test_several_processes_would_count_codes_each_by_itself():
+    small = {"width": 16, "depth": 1, "heads": 2}
+    assert undivided(sage.HalfVQVAE(sage.LOWER, **small)) == ["ProductQuantiser"]
+    assert undivided(sage.LowerDenoiser(**small)) == []
