@@ -160,8 +160,7 @@ class PartTraining:
         train(task, self.network.optim, run, self.network.seed, self.kind.replace("_", " "))
         if parallel.first():
             checkpoint.write(run.model, before | checkpoint.module_tensors(name, part), {})
-        part.eval()
-        return task.validate()
+        return last_errors(run)
 
 
 @dataclass(frozen=True)
@@ -180,8 +179,13 @@ class DecoderTraining(PartTraining):
         assert isinstance(architecture, PartedArchitecture)
         fixed = replace(architecture, finished=("upper", "lower"))
         self.network.train(fixed, data, above, run, device)
-        values = [entry.values for entry in run.metrics() if entry.phase == "val"]
-        return dict(values[-1]) if values else {}
+        return last_errors(run)
+
+
+def last_errors(run: Run) -> dict[str, float]:
+    """Return the errors of a run's last validation; empty where another process does that."""
+    found = [entry.values for entry in run.metrics() if entry.phase == "val"]
+    return dict(found[-1]) if found else {}
 
 
 class Windows:
