@@ -96,7 +96,7 @@ class Deployment:
         test: Sequence[Tensor],
     ) -> dict[str, Any]:
         """Write the file of less precision beside the other; return its accuracy, times and size."""
-        path = {"int8": deployed.int8, "fp16": deployed.half}[self.precision]
+        path = deployed.file(self.precision)
         lower(self.precision, deployed.onnx, path, network.ends, train)
         cost = compared(deployed.onnx, path, self.precision, network.normalizer, test)
         measured = latency.measure(path, self.latency_steps)

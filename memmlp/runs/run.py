@@ -19,6 +19,7 @@ from memmlp.common import fences
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, file_digest, now, read_json, sync_folder, write_json
 from memmlp.common.lease import Lease, Lock
+from memmlp.runs import deployment_folder
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import changes, environment, host, sources
 from memmlp.runs.evaluation_file import current, intact, read_report
@@ -51,11 +52,10 @@ class Run:
         marker: the file that marks the run as done.
     """
 
+    STAGES = (*(f"deployments/*/{name}" for name in deployment_folder.FILES), "evaluations/*.json")
+    """The files of a run's evaluations and deployments."""
     FILES = (
-        "deployments/*/latency.json",
-        "deployments/*/step.onnx",
-        "deployments/*/step.int8.onnx",
-        "evaluations/*.json",
+        *STAGES,
         "checkpoint.safetensors",
         "model.safetensors",
         "results.json",
@@ -68,7 +68,6 @@ class Run:
         "manifest.json",
     )
     """A run's own files, in the order in which a reset removes them: results before what they are of."""
-    STAGES = FILES[:4]
 
     def __init__(self, folder: Path | str):
         self.folder = Path(folder)

@@ -14,6 +14,7 @@ from processes import finished
 import memmlp.runs.recipes
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
+from memmlp.runs.deployment_folder import ONNX_FILES
 from memmlp.runs.evaluation_file import intact, write_report
 from memmlp.runs.identity import (
     deployment_id,
@@ -145,6 +146,16 @@ def test_reset_removes_the_runs_files_and_no_others(tmp_path: Path):
     run.reset()
     assert [path.name for path in run.folder.iterdir()] == ["notes.txt"]
     assert not run.done
+
+
+def test_cleared_stages_leave_no_file_of_any_precision(tmp_path: Path):
+    """A file that stays would keep its folder, and seem to be of the next weights."""
+    run = complete(tmp_path)
+    for precision in ONNX_FILES:
+        run.deployment("int8-0").file(precision).touch()
+    run.clear_stages()
+    assert not run.deployments.exists()
+    assert not run.evaluations.exists()
 
 
 def test_a_reset_that_is_cut_short_leaves_no_results_of_what_is_gone(tmp_path: Path, monkeypatch):

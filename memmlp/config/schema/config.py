@@ -89,6 +89,7 @@ from memmlp.config.schema.training import (
     TermsLossConfig,
     UncertaintyConfig,
 )
+from memmlp.runs.deployment_folder import ONNX_FILES
 from memmlp.runs.identity import chosen
 
 # OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
@@ -183,7 +184,7 @@ class ExportConfig:
 
     latency_steps: int = at_least(1)
     graph: str = one_of("auto", "streaming", "naive", "off")
-    precision: str = one_of("fp32", "int8", "fp16")
+    precision: str = one_of(*ONNX_FILES)
     opset: int = standing(18, Within(15, 26))  # memmlp.deploy.opsets.OPSETS, without importing onnx
 
 
