@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.common.errors import LeaseLost, TrainingDiverged, of_the_disk
 from memmlp.common.files import write_json
 from memmlp.common.progress import tell
@@ -173,7 +173,7 @@ def train_vqvae(experiment: Experiment, run: Run, data: Prepared, identity: Iden
     begin(experiment, run, identity, experiment.vqvae.config)
     run.write_manifest({"partial": partial_words(experiment, data)})
     tell(f"VQ-VAE: train it, whose code-vectors the network's memory uses (run {run.id})")
-    parallel.of_first("vqvae")
+    distributed.of_first("vqvae")
     with timed(run, "train"):
         errors = experiment.vqvae.train(experiment.architecture, data, run, experiment.device)
     write_json(run.results_path, {"val": errors})
@@ -212,7 +212,7 @@ def train_run(
     run.write_manifest({"body": data.manifest.body, "partial": partial_words(experiment, data)})
     run.clear_stages()
     weights = above.weights() if above else None
-    parallel.of_first("network")
+    distributed.of_first("network")
     with timed(run, "train"):
         experiment.training.train(experiment.architecture, data, weights, run, experiment.device, watch)
     run.finish(("model.safetensors",))
@@ -262,7 +262,7 @@ def begin(experiment: Experiment, run: Run, identity: Identity, config: dict[str
     """Begin a training: write its config, and into its manifest its identity and what it runs on."""
     above = identity.upstream.id if identity.upstream else None
     facts = {"recipes": identity.recipes, "what": identity.what, **machine(experiment)}
-    facts |= {"processes": parallel.size(), **own_code(experiment)}
+    facts |= {"processes": distributed.size(), **own_code(experiment)}
     counting = {**(identity.upstream.config if identity.upstream else {}), **identity.config}
     facts |= {"name": experiment.called(identity.kind, counting), "user": user()}
     run.begin(identity.kind, config, data=identity.data, upstream=above, **facts)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment, config_of
 from memmlp.config.compose import composed
@@ -78,6 +78,6 @@ def test_a_sweep_trains_what_is_upstream_first():
 
 
 def test_several_processes_are_refused(monkeypatch):
-    monkeypatch.setattr(parallel, "size", lambda: 2)
+    monkeypatch.setattr(distributed, "size", lambda: 2)
     with pytest.raises(InputError, match="refiner: several processes"):
         run_together(experiment("refiner=sage"))
