@@ -1,7 +1,7 @@
 """The numbers that every component makes of fixed inputs, for tests/test_golden.py.
 
 `make golden` writes that file anew. It refuses where a component's numbers changed and its number in
-memmlp/runs/recipes.py did not: raise that first, in the same commit.
+memmlp/runs/recipe_numbers.py did not: raise that first, in the same commit.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from memmlp.networks.refiner import SAGERefiner
 from memmlp.networks.streaming import streaming
 from memmlp.networks.vqvae import VQVAE
 from memmlp.networks.window_model import WindowModel
-from memmlp.runs.recipes import RECIPES
+from memmlp.runs.recipe_numbers import RECIPES
 from memmlp.training.loop import seed_step, train_step
 from memmlp.training.losses import (
     AGRoLLoss,
@@ -466,7 +466,7 @@ def record() -> None:
     wrong = [case for case in same if changed(now[case]["numbers"], before[case]["numbers"], tolerance(case))]  # type: ignore[arg-type]
     if wrong:
         sys.exit(
-            f"raise the number of {', '.join(wrong)} in memmlp/runs/recipes.py: what they compute has changed"
+            f"raise the number of {', '.join(wrong)} in memmlp/runs/recipe_numbers.py: they compute other numbers"
         )
     kept = {case: before[case] if case in same else now[case] for case in CASES}
     PATH.write_text(json.dumps(kept, indent=1) + "\n")

@@ -1,11 +1,11 @@
-"""What components compute is what their recipe numbers stand for (memmlp/runs/recipes.py)."""
+"""What components compute is what their recipe numbers stand for (memmlp/runs/recipe_numbers.py)."""
 
 from __future__ import annotations
 
 import golden
 import pytest
 
-from memmlp.runs.recipes import RECIPES
+from memmlp.runs.recipe_numbers import RECIPES
 
 
 @pytest.mark.slow
@@ -17,7 +17,7 @@ def test_a_component_computes_what_its_recipe_number_stands_for(case: str):
     now = golden.numbers(case)
     wrong = golden.changed(now, known["numbers"], golden.tolerance(case))
     assert not wrong, (
-        f"raise the number of {case} in memmlp/runs/recipes.py: it computes other numbers ({wrong[:4]})"
+        f"raise the number of {case} in memmlp/runs/recipe_numbers.py: it differs in {wrong[:4]}"
     )
 
 

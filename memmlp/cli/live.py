@@ -178,8 +178,8 @@ class Room(NamedTuple):
 
 def check_options(feed: Feed, room: Room, send: bool) -> None:
     """Raise InputError for options that contradict each other, or need what is not installed."""
-    from memmlp.common.access import check_token
     from memmlp.common.errors import InputError
+    from memmlp.common.page_access import check_token
     from memmlp.live.player.packets import needs_osc
 
     ports = [number for number in (feed.udp, feed.osc) if number is not None]

@@ -150,7 +150,7 @@ def _table(kept: Kept, source: str | None = None) -> Table:
 
 def _outdated(kept: Kept) -> list[str]:
     """Return a flag that names the components whose recipe numbers have changed since, if any."""
-    from memmlp.runs.recipes import outdated
+    from memmlp.runs.recipe_numbers import outdated
 
     found = sorted({words for run in kept.every for words in outdated(run.origin.recipes)})
     return [f"made by an earlier recipe: {', '.join(found)}"] if found else []

@@ -1,8 +1,8 @@
 """Data-parallel training of one run by several processes, as torchrun starts them.
 
-Every process draws the whole batch of a step, from the same seed, and works on its own rows, its share. What is learned
-from is the mean over all, so that the run is the one that a single process trains. Without torchrun there is
-one process, and nothing here does anything.
+Every process draws the whole batch of a step, from the same seed, and works on its own rows, its share of the
+batch. What is learned from is the mean over all, so that the run is the one that a single process trains.
+Without torchrun there is one process, and nothing here does anything.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ from memmlp.config.packaged import packaged
 from memmlp.evaluation.units import HIGHER, SMALLEST, UNITS
 from memmlp.runs.environment import package_sources
 from memmlp.runs.identity import flatten
-from memmlp.runs.recipes import RECIPES
+from memmlp.runs.recipe_numbers import RECIPES
 
 GROUP = "memmlp.plugins"
 VARIABLE = "MEMMLP_PLUGINS"

@@ -10,11 +10,11 @@ from typing import Any
 from torch import Tensor
 
 from memmlp.deploy import latency
-from memmlp.deploy.cost import compared
 from memmlp.deploy.export import export
 from memmlp.deploy.half import halve
 from memmlp.deploy.opsets import NATIVE
 from memmlp.deploy.parity import TOLERANCE, parity
+from memmlp.deploy.precision_cost import compared
 from memmlp.deploy.quantization import quantise
 from memmlp.networks.streaming import StreamingGraph, has_stream, streaming
 from memmlp.networks.window_model import WindowModel

@@ -15,7 +15,7 @@ import onnx
 from onnx import ModelProto, NodeProto, helper, version_converter
 
 from memmlp.common.errors import InputError
-from memmlp.deploy.constants import Constants
+from memmlp.deploy.graph_constants import Constants
 
 NATIVE = 18
 """The opset that torch's exporter writes."""

@@ -18,7 +18,7 @@ from memmlp.evaluation.units import UNITS
 from memmlp.runs.run import STAGE_WORDS
 from memmlp.statistics import Verdict
 from memmlp.sweep.board import name as task_name
-from memmlp.sweep.kept import kept
+from memmlp.sweep.kept_sweep import kept
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.spec import Arm, Sweep, parse_sweep
 from memmlp.tables.build_table import collect, finished

@@ -23,7 +23,7 @@ from memmlp.common.errors import InputError
 from memmlp.config.perform_task import perform
 from memmlp.config.plan_sweep import find_sweep, orphans, planned
 from memmlp.runs.lookup import list_runs
-from memmlp.runs.recipes import RECIPES
+from memmlp.runs.recipe_numbers import RECIPES
 from memmlp.runs.run import Run
 from memmlp.sweep.board import name
 

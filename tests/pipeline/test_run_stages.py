@@ -26,7 +26,7 @@ from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline import run_stages
 from memmlp.pipeline.run_stages import shown, vqvae_run
 from memmlp.runs.lookup import list_runs
-from memmlp.runs.recipes import RECIPES
+from memmlp.runs.recipe_numbers import RECIPES
 from memmlp.runs.run import Run
 from memmlp.sweep.worker import Cancelled
 from memmlp.tables.measured_run import load

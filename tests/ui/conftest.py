@@ -9,7 +9,7 @@ import pytest
 from fake_runs import fake_run
 
 from memmlp.runs.run import Run
-from memmlp.sweep.kept import keep
+from memmlp.sweep.kept_sweep import keep
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.spec import Sweep, parse_sweep
 

@@ -16,7 +16,7 @@ from ui.test_replay import motion
 from memmlp.cli.rounds import look
 from memmlp.evaluation.units import UNITS
 from memmlp.runs.run import Run
-from memmlp.sweep.kept import kept
+from memmlp.sweep.kept_sweep import kept
 from memmlp.sweep.plan import Plan
 from memmlp.tables.build_table import collect, finished
 from memmlp.tables.measured_run import load

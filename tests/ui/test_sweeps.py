@@ -12,7 +12,7 @@ from ui.conftest import begun, run_of
 
 from memmlp.cli.rounds import look
 from memmlp.runs.run import Run
-from memmlp.sweep.kept import keep, kept
+from memmlp.sweep.kept_sweep import keep, kept
 from memmlp.sweep.plan import Plan, RunTask
 from memmlp.tables.build_table import collect, finished
 from memmlp.tables.formats import as_json

@@ -34,7 +34,7 @@ from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manif
 from memmlp.motion.preparing.splits import PARTS, Split
 from memmlp.motion.preparing.survey import Survey, survey
 from memmlp.motion.threads import one_thread
-from memmlp.runs.recipes import RECIPES
+from memmlp.runs.recipe_numbers import RECIPES
 
 FRAMES = 1  # number of a frame's content; a new one changes every digest, and so makes every run again
 CHUNK = 4096  # frames turned into features at a time
