@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 from filelock import FileLock, Timeout
 
 from memmlp.common.errors import LeaseLost
-from memmlp.common.fences import fenced, sweep
+from memmlp.common.fences import fenced, remove_unfinished
 from memmlp.common.files import now
 from memmlp.common.liveness import Changes, lives, myself, place
 
@@ -302,7 +302,7 @@ class Lock:
             self.claims.path(number).unlink(missing_ok=True)
             return None
         self.claims.remove_below(number)
-        sweep(self._held_folder, number)
+        remove_unfinished(self._held_folder, number)
         return Lease(self.claims, number, self._what)
 
     def _take_kernels(self, stack: ExitStack) -> bool:

@@ -65,7 +65,7 @@ def sweep_folder(sweep: Sweep, outputs: Path) -> Path:
     return outputs / "sweeps" / f"{sweep.name}{key}"
 
 
-def planned(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
+def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
     """Return the plan of a sweep, the kept one where it still holds.
 
     A look at a sweep that was never started leaves nothing in the outputs.

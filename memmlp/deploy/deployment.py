@@ -77,7 +77,7 @@ class Deployment:
             raise RuntimeError(
                 f"{deployed.onnx}: ONNX Runtime differs from torch by {worst:.2e} (> {TOLERANCE:.0e})"
             )
-        record = latency.measure(deployed.onnx, self.latency_steps) | latency.size(
+        record = latency.measure_step(deployed.onnx, self.latency_steps) | latency.size(
             model, network, deployed.onnx
         )
         record |= {
@@ -99,7 +99,7 @@ class Deployment:
         path = deployed.file(self.precision)
         lower(self.precision, deployed.onnx, path, network.ends, train)
         cost = compared(deployed.onnx, path, self.precision, network.normalizer, test)
-        measured = latency.measure(path, self.latency_steps)
+        measured = latency.measure_step(path, self.latency_steps)
         return {**cost, **measured, "onnx_bytes": path.stat().st_size}
 
 

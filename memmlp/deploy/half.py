@@ -65,7 +65,7 @@ def halved(model: ModelProto, ends: Sequence[str]) -> ModelProto:
     del graph.node[:]
     graph.node.extend(nodes)
     del graph.value_info[:]
-    constants.sweep()
+    constants.remove_unused()
     return model
 
 

@@ -21,7 +21,7 @@ from memmlp.common.files import write_json
 from memmlp.common.progress import tell
 from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
-from memmlp.live.latency import measure as pose_latency
+from memmlp.live.latency import measure_pose
 from memmlp.motion.preparing.manifest import ClipRecord
 from memmlp.motion.preparing.source import Prepared
 from memmlp.pipeline.devices import described
@@ -249,10 +249,10 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared, name: str) -> N
         deployed.latency.unlink(missing_ok=True)  # it lacks a file and is made again, from the start
         deployment = experiment.deployments[name]
         record = deployment.deploy(model, deployed, run.id, *clips)
-        record |= pose_latency(deployed.onnx, deployment.latency_steps)
+        record |= measure_pose(deployed.onnx, deployment.latency_steps)
         for precision, path in (("int8", deployed.int8), ("fp16", deployed.half)):
             if precision in record:
-                record[precision] |= pose_latency(path, deployment.latency_steps)
+                record[precision] |= measure_pose(path, deployment.latency_steps)
         deployed.finish(
             {"run": run.manifest["id"], "settings": deployment_settings(experiment.config), **record}
         )

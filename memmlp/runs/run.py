@@ -197,7 +197,7 @@ class Run:
         attempts = self.manifest.get("attempts", [])
         if self.failure and attempts:
             self.write_manifest({"forgiven": len(attempts)})
-        fences.check(self.folder)
+        fences.check_owner(self.folder)
         (self.folder / "FAILED").unlink(missing_ok=True)
 
     def begin(
@@ -351,7 +351,7 @@ class Run:
         """Remove the run's own files, the marker first, and nothing else."""
         if not self.folder.exists():
             return
-        fences.check(self.folder)
+        fences.check_owner(self.folder)
         self.marker.unlink(missing_ok=True)
         sync_folder(self.folder)
         self._remove((*self.FILES, self.marker.name))
@@ -361,7 +361,7 @@ class Run:
         self._remove(self.STAGES)
 
     def _remove(self, names: Iterable[str]) -> None:
-        fences.check(self.folder)
+        fences.check_owner(self.folder)
         for name in names:
             temporary = str(Path(name).with_name(f".{Path(name).name}.*.tmp"))
             for path in (*self.folder.glob(name), *self.folder.glob(temporary)):

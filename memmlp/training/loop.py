@@ -97,7 +97,7 @@ def train(
         TrainingDiverged: if the loss is NaN or infinite.
         InputError: if several processes can't train the task as one would.
     """
-    check_shares(task, optim, description)
+    check_divisible(task, optim, description)
     optimiser = optim.build(task.parameter_groups())
     average = optim.average(task.module, optimiser)
     start = resume(task, optimiser, average, run)
@@ -113,10 +113,10 @@ def train(
                 save(task, optimiser, average, run, step + 1)
             if validation:
                 watch(step + 1, validation)
-    average.show()
+    average.put_in_place()
 
 
-def check_shares(task: TrainingTask, optim: Optim, description: str) -> None:
+def check_divisible(task: TrainingTask, optim: Optim, description: str) -> None:
     """Raise InputError if shares of a batch, one for each process, don't add up to what one process does."""
     count = distributed.size()
     if optim.batch % count:
@@ -199,16 +199,16 @@ def record(
         count.note(f"loss {loss:.3g}")
     count.advance()
     if step % optim.validate_every == 0 or last:
-        values = validated(task, average)
+        values = validate(task, average)
         run.log(step, values, phase="val")
         return values
     return {}
 
 
-def validated(task: TrainingTask, average: Average) -> dict[str, float]:
+def validate(task: TrainingTask, average: Average) -> dict[str, float]:
     """Return the task's validation of the weights that count."""
     task.module.eval()
-    with average.shown(), stage("validation"):
+    with average.in_place(), stage("validation"):
         return task.validate()
 
 

@@ -234,7 +234,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, tuple(found), ())
 
-    monkeypatch.setattr("memmlp.config.plan_sweep.planned", plan)
+    monkeypatch.setattr("memmlp.config.plan_sweep.make_plan", plan)
 
 
 @pytest.mark.slow

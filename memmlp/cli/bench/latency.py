@@ -147,12 +147,12 @@ def timed(paths: dict[tuple[str, str], Path], rounds: int, steps: int) -> list[d
     import numpy as np
 
     from memmlp.deploy.latency import interleaved
-    from memmlp.live.latency import measure
+    from memmlp.live.latency import measure_pose
 
     seconds = interleaved(paths, rounds, steps)
     base = np.median(seconds[BASE], 1)
     return [
-        row(model, variant, times, np.median(times, 1) / base) | measure(paths[model, variant], steps)
+        row(model, variant, times, np.median(times, 1) / base) | measure_pose(paths[model, variant], steps)
         for (model, variant), times in seconds.items()
     ]
 

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from memmlp.motion.body import PARENTS
-from memmlp.motion.geometry import matrix_to_quaternion
+from memmlp.motion.geometry import matrix_to_wxyz
 
 BASES, MIDDLES, ENDS = (16, 17, 1, 2), (18, 19, 4, 5), (20, 21, 7, 8)
 ANKLES, TOES = ENDS[2:], (10, 11)
@@ -154,7 +154,7 @@ def untwisting(local: Tensor, bone: Tensor, axis: Tensor) -> Tensor:
         bone: the upper bones' unit vectors (4, 3) in the rest pose.
         axis: the unit vectors (..., 4, 3) from base to end, as the bases' parents see them.
     """
-    real, vector = matrix_to_quaternion(local).split([1, 3], -1)
+    real, vector = matrix_to_wxyz(local).split([1, 3], -1)
     limit = (local.new_tensor(TWIST) * (math.pi / 360)).tan()[:, None]
     turned = dot(vector, bone)
     by_sine = real * dot(axis, bone) + dot(cross(axis, vector), bone)
