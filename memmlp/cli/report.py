@@ -45,7 +45,7 @@ def report(
     from memmlp.config.packaged import packaged
     from memmlp.report.html import fragment, page, published
     from memmlp.runs.environment import environment
-    from memmlp.sweep.spec import load_sweep
+    from memmlp.sweep.parsing import load_sweep
 
     names = [word for word in words if "=" not in word and not word.startswith("~")] or EVERY
     chapters = chapters_of(names, [word for word in words if word not in names], outputs)

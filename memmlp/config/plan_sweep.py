@@ -16,8 +16,9 @@ from memmlp.common.files import digest, read_json, write_json
 from memmlp.config.packaged import packaged
 from memmlp.config.plugins import activate, named, texts
 from memmlp.sweep.kept_sweep import keep
+from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
-from memmlp.sweep.spec import Arm, Sweep, load_sweep
+from memmlp.sweep.spec import Arm, Sweep
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

@@ -19,8 +19,9 @@ from memmlp.runs.run import STAGE_WORDS
 from memmlp.statistics import Verdict
 from memmlp.sweep.board import name as task_name
 from memmlp.sweep.kept_sweep import kept
+from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
-from memmlp.sweep.spec import Arm, Sweep, parse_sweep
+from memmlp.sweep.spec import Arm, Sweep
 from memmlp.tables.build_table import collect, finished_runs
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import Measured, load

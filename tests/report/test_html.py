@@ -17,8 +17,9 @@ from processes import finished
 from memmlp.common.errors import InputError
 from memmlp.report import figures
 from memmlp.report.html import Chapter, page, published
+from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.plan import Entry, Plan
-from memmlp.sweep.spec import Sweep, load_sweep
+from memmlp.sweep.spec import Sweep
 from memmlp.tables.build_table import without_runs
 from memmlp.tables.distributions import distributions
 from memmlp.tables.table_text import caption

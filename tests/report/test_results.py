@@ -17,7 +17,8 @@ from memmlp.report.kept_results import Kept, dumps, load_kept, overrides_of, sav
 from memmlp.report.markdown import KeptTable, Words, origin_words, pages
 from memmlp.report.unbacked_claims import NEVER, WORDS, claims
 from memmlp.statistics import Verdict, holm, paired_effects
-from memmlp.sweep.spec import Sweep, load_sweep
+from memmlp.sweep.parsing import load_sweep
+from memmlp.sweep.spec import Sweep
 from memmlp.tables.build_table import collect
 from memmlp.tables.table_text import MINUS
 
