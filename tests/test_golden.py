@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import golden
 import pytest
+from golden_numbers import changed, tolerance
 
 from memmlp.runs.recipe_numbers import RECIPES
 
@@ -15,7 +16,7 @@ def test_a_component_computes_what_its_recipe_number_stands_for(case: str):
     known = golden.stored()[case]
     assert known["recipe"] == RECIPES[case], f"record the numbers of {case}: make golden"
     now = golden.numbers(case)
-    wrong = golden.changed(now, known["numbers"], golden.tolerance(case))
+    wrong = changed(now, known["numbers"], tolerance(case))
     assert not wrong, (
         f"raise the number of {case} in memmlp/runs/recipe_numbers.py: it differs in {wrong[:4]}"
     )
