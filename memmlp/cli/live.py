@@ -373,5 +373,5 @@ def write_avatar(feed: InputOptions, path: Path) -> None:
 
 
 def note(line: str) -> None:
-    """Tell a line that is no result."""
+    """Print a remark to stderr."""
     click.echo(line, err=True)

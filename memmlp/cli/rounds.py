@@ -182,7 +182,7 @@ def sweep_to_show(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> Swee
 
 
 def of_another(kept: Rounds, sweep: Sweep, chosen: bool = False) -> str | None:
-    """Return a flag where looks were of something else than the sweep is now; None where they are of it.
+    """Return a flag if the kept looks were taken of a different sweep than today's; else None.
 
     `chosen` says that the sweep's seeds were chosen by hand.
     """
@@ -197,7 +197,7 @@ def of_another(kept: Rounds, sweep: Sweep, chosen: bool = False) -> str | None:
 
 
 def spent_before(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
-    """Return a flag for verdicts of a fixed number of seeds, where rounds were taken of the sweep before."""
+    """Return a flag for a table of a fixed number of seeds if rounds were taken of the sweep before."""
     from memmlp.tables.rounds_file import read
 
     kept = read(rounds_path(sweep, outputs))

@@ -106,7 +106,7 @@ def sweep(
 
 
 def reset(plan: Plan) -> None:
-    """Remove what the plan's networks are so far, so that all of them are made again; VQ-VAEs stay."""
+    """Remove the plan's networks, trained or begun, so that they are trained again; VQ-VAEs stay."""
     for run in {task.id: plan.run_of(task) for task in plan.tasks if task.kind != "vqvae"}.values():
         with run.lock():
             run.reset()

@@ -21,7 +21,7 @@ FENCED = re.compile(r"^\..*\.lease-(\d+)\.[0-9a-f]+\.tmp$")
 
 
 class Fence(Protocol):
-    """What stands between a process and a folder that it may have lost."""
+    """Checks, before a process publishes in a folder, that the folder is still its own."""
 
     number: int
 

@@ -122,7 +122,7 @@ class Claims:
         return True
 
     def remove_below(self, number: int) -> None:
-        """Remove the claims that were superseded, in ascending order, so that no earlier one seems last."""
+        """Remove superseded claims in ascending order: cut short, it leaves no earlier one as the last."""
         for old in self.numbers():
             if old < number:
                 self.path(old).unlink(missing_ok=True)

@@ -1,4 +1,7 @@
-"""What a worker of a sweep does with a task: it builds the experiment and brings its run to its end."""
+"""What a worker of a sweep does with a task: it builds the experiment and brings its run to its end.
+
+It lies in config because only config builds experiments from configs.
+"""
 
 from __future__ import annotations
 

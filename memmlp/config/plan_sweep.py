@@ -1,5 +1,7 @@
 """Make the plan of a sweep file: every arm is composed, checked and given its run's identity.
 
+It lies in config because only config composes.
+
 Composing takes a moment for each arm. So the plan of a sweep that was started is kept, and used again as long
 as the sweep, the configs, the code and the data are unchanged.
 """

@@ -142,7 +142,7 @@ def findings(model: ModelProto, listed: Published) -> list[UnsupportedOperator]:
 
 
 def remarks(model: ModelProto, listed: Published) -> list[str]:
-    """Return what a list says beside of the operators that a graph has."""
+    """Return a list's remarks on the operators that a graph uses."""
     used = sorted({_name(node) for node in _nodes(model.graph)})
     rules = {name: listed.operators[name] for name in used if name in listed.operators}
     lacking = [f"{name}: not on {', '.join(rule.not_on)}" for name, rule in rules.items() if rule.not_on]
@@ -150,7 +150,7 @@ def remarks(model: ModelProto, listed: Published) -> list[str]:
 
 
 def load_graph(path: Path) -> ModelProto:
-    """Read an ONNX file. Raises InputError if there is none, or it is none."""
+    """Read an ONNX file. Raises InputError for a missing or damaged file."""
     try:
         model = onnx.load(path)
     except FileNotFoundError:

@@ -115,7 +115,7 @@ class Dropout(nn.Dropout):
 
 
 def undivided(module: nn.Module) -> list[str]:
-    """Name the kinds of layers that don't do the same to a row of a batch whose other rows lie elsewhere."""
+    """Name the layers whose result for a row depends on the other rows of the batch."""
     found = [layer for layer in module.modules() if _counts(layer) or (_draws(layer) and layer.p)]
     found += [layer for layer in module.modules() if isinstance(layer, nn.RNNBase) and layer.dropout]
     return sorted({type(layer).__name__ for layer in found})

@@ -31,7 +31,7 @@ DEEPEST = 50  # parentheses and "not"s in one another
 
 
 def record(run: Run) -> dict[str, Any]:
-    """Return what may be asked of a run, by key.
+    """Return the values that conditions can use for a run, by key.
 
     These are its id, kind, status, name, started, tag, note and step; its data by name (`data`) and by digest
     (`data_digest`); the keys of its config, slots also by their name alone (`memory` for `memory.name`); and

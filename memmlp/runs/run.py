@@ -111,7 +111,7 @@ class Run:
         return self.deployment_used(self.config)
 
     def deployment_used(self, config: Mapping[str, Any]) -> DeploymentFolder:
-        """Return the same for a config that was read already."""
+        """Return the preferred deployment, given the run's config as it was read already."""
         made = [DeploymentFolder(path.parent) for path in self.deployments.glob("*/latency.json")]
         own = [one for one in made if one.done and used_as_configured(one.settings, config)]
         best = max(own, key=lambda one: (one.current, one.prefers_int8, one.made), default=None)

@@ -136,7 +136,7 @@ class ScheduleFreeAverage(Average):
 
     @contextlib.contextmanager
     def in_place(self) -> Iterator[None]:
-        """Have the average in the module herein, and then the last step's weights again, to the bit.
+        """Give the module the average within the context; then the last step's weights, to the bit.
 
         The optimiser can go back to them by itself, but not to the bit.
         """

@@ -1,4 +1,4 @@
-"""`memmlp bench train`: how soon a recipe reaches the validation error that today's ends with."""
+"""`memmlp bench train`: how fast a changed recipe reaches the final validation error of today's."""
 
 from __future__ import annotations
 

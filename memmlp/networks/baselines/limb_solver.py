@@ -74,7 +74,7 @@ def frame(first: Tensor, second: Tensor) -> Tensor:
 
 
 def circle(axis: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the directions (..., 3) from which, and towards which, swivels are counted.
+    """Return the directions (..., 3) of a swivel of 0 and of 90 degrees.
 
     Args:
         axis: unit vectors (..., 3) from base to end.
@@ -115,7 +115,7 @@ def bones(rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def flexed(upper: Tensor, lower: Tensor, axis: Tensor, reach: Tensor) -> Tensor:
-    """Return the rotations (..., 4, 3, 3) of middles that bring the ends to a distance from their bases.
+    """Return the rotations (..., 4, 3, 3) of elbows and knees that bring hands and feet to a given reach.
 
     Of the two ways to bend, each limb takes the one about its own axis of flexion. A limb that is asked to
     reach further, or less far, than it can is as straight, or as bent, as can be.

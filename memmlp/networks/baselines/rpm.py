@@ -168,7 +168,7 @@ class RPM(StreamModel):
         return self.normalizer.posed(made, sparse[:, now:]), state
 
     def begun(self, fresh: State, encoded: Tensor, truth: Tensor) -> State:
-        """Return the state after true frames; for a share of the windows it stays a fresh start.
+        """Return the state after true frames; a drawn share of the windows gets a fresh start instead.
 
         Args:
             fresh: a fresh start.
