@@ -110,10 +110,10 @@ def run_training(cfg: DictConfig) -> None:
 
     from memmlp.cli.train_summary import show
     from memmlp.config.build import build_experiment
-    from memmlp.pipeline.together import run_together
+    from memmlp.pipeline.distributed import run_distributed
 
     check(cfg)
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
-    if outcome := run_together(build_experiment(cfg)):
+    if outcome := run_distributed(build_experiment(cfg)):
         show(outcome)

@@ -76,11 +76,11 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
         if experiment.force:
             run.reset()
         made = []
-        with shown(experiment, run):
+        with recording_outcome(experiment, run):
             if not run.done:
                 train_run(experiment, run, data, above, watch)
                 made.append("training")
-            made += finish(experiment, run, data)
+            made += make_missing_stages(experiment, run, data)
         if experiment.predictions is not None:
             model = experiment.architecture.load(run.weights()).to(experiment.device)
             test = data.open("test").to(experiment.device)
@@ -102,14 +102,14 @@ def complete_stages(
     Returns:
         The results, and the names of the stages that were made.
     """
-    with run.lock(), shown(experiment, run, again):
+    with run.lock(), recording_outcome(experiment, run, again):
         if again:
             evaluate_run(experiment, run, data, experiment.evaluation.modes)
-        made = [*(["evaluation"] if again else []), *finish(experiment, run, data)]
+        made = [*(["evaluation"] if again else []), *make_missing_stages(experiment, run, data)]
     return results_of(experiment, run), made
 
 
-def finish(experiment: Experiment, run: Run, data: Prepared) -> list[str]:
+def make_missing_stages(experiment: Experiment, run: Run, data: Prepared) -> list[str]:
     """Make what is missing of a trained run's evaluations and deployment.
 
     Returns:
@@ -163,7 +163,7 @@ def vqvae_run(experiment: Experiment, data: Prepared) -> Run:
     with run.lock():
         if run.done:
             return run
-        with shown(experiment, run):
+        with recording_outcome(experiment, run):
             train_vqvae(experiment, run, data, identity)
     return run
 
@@ -181,8 +181,8 @@ def train_vqvae(experiment: Experiment, run: Run, data: Prepared, identity: Iden
 
 
 @contextlib.contextmanager
-def shown(experiment: Experiment, run: Run, again: bool = False) -> Iterator[None]:
-    """Show work on a run elsewhere while it goes on, if there is any; its failure is kept with the run.
+def recording_outcome(experiment: Experiment, run: Run, again: bool = False) -> Iterator[None]:
+    """Follow work on a run in the trackers, and record its failure in the run's folder.
 
     Only failures of the work itself count: bad input, interruptions, a full disk and the loss of the run to
     another process leave it as it is.

@@ -9,7 +9,7 @@ from memmlp.pipeline.run_stages import Outcome, run_experiment
 from memmlp.runs.run import Run
 
 
-def run_together(experiment: Experiment) -> Outcome | None:
+def run_distributed(experiment: Experiment) -> Outcome | None:
     """Bring the experiment's run to its end; without torchrun that is `run_experiment`.
 
     The first process holds the run's lock, prepares the data, writes, evaluates and deploys. It tells the
