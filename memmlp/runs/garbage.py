@@ -10,7 +10,7 @@ from typing import NamedTuple
 from memmlp.common.files import read_json
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.notes import read_notes
-from memmlp.runs.recipes import outdated
+from memmlp.runs.recipe_numbers import outdated
 from memmlp.runs.run import Run
 
 REASONS = ("failed", "old", "orphaned")

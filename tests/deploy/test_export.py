@@ -92,7 +92,7 @@ def test_zeros_are_a_fresh_start(exported):
 
 def test_latency_and_size(exported):
     model, path = exported
-    measured = latency.measure(path, steps=1)
+    measured = latency.measure_step(path, steps=1)
     assert measured["steps"] == 200
     assert 0 < measured["median_ms"] <= measured["p95_ms"]
     assert measured["ratio_to_yardstick"] > 0
