@@ -31,6 +31,7 @@ def home(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:unclosed file .*DEBUG:ResourceWarning")  # submitit leaves its logs open
 def test_every_command_knows_where_a_clip_is_from(home):
     assert "none" in run(home, "sweep", "both.yaml", *TINY, "executor=debug")
     (made,) = list_runs(home / "outputs")

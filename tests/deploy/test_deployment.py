@@ -20,7 +20,7 @@ from memmlp.deploy.deployment import GRAPHS, Deployment
 from memmlp.deploy.parity import streamed
 from memmlp.deploy.quantization import quantise
 from memmlp.deploy.session import OnnxStream
-from memmlp.networks.memory import CodeMemory, NoMemory
+from memmlp.networks.memory import CodeMemory
 from memmlp.networks.streaming import StreamingGraph, streaming
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.lookup import list_runs
@@ -137,7 +137,7 @@ def test_the_naive_graph_by_switch(tmp_path):
     deployed = {}
     for graph in ("naive", "auto"):
         place = DeploymentFolder(tmp_path / graph)
-        deployed[graph] = Deployment(1, graph).deploy(tiny.model(NoMemory), place, "0" * 16, CLIPS, CLIPS)
+        deployed[graph] = Deployment(1, graph).deploy(tiny.model(), place, "0" * 16, CLIPS, CLIPS)
     assert [record["graph"] for record in deployed.values()] == ["naive", "streaming"]
     assert deployed["naive"]["step_macs"] == deployed["naive"]["macs"] == deployed["auto"]["macs"]
     assert deployed["auto"]["step_macs"] < deployed["auto"]["macs"]
