@@ -75,8 +75,10 @@ class View:
         """Draw an arrow between two points of the world, with a word beyond its head."""
         a, b = self.place(start), self.place(end)
         flipped = [(float(x), self.sheet.height - float(y)) for x, y in (a, b)]
-        style = {"arrowstyle": "-|>", "mutation_scale": 11, "lw": 2, "shrinkA": 0, "shrinkB": 0}
-        arrow = FancyArrowPatch(*flipped, color=colour, transform=IdentityTransform(), **style)  # type: ignore[arg-type]
+        arrow = FancyArrowPatch(
+            *flipped, arrowstyle="-|>", mutation_scale=11, lw=2, shrinkA=0, shrinkB=0, color=colour,
+            transform=IdentityTransform(),
+        )  # fmt: skip
         self.sheet.figure.add_artist(arrow)
         if word:
             beyond = b + 11 * (b - a) / max(float(np.hypot(*(b - a))), 8.0)

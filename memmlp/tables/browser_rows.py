@@ -135,8 +135,7 @@ def _row(table: Table, measured: Measured, row: Mapping[str, Any], base: Mapping
 
     def cell(metric: str) -> Cell:
         value, other = costs.get(metric), others.get(metric)
-        known = value is not None and other is not None
-        effect = Effect(value - other) if known else None  # type: ignore[operator]
+        effect = None if value is None or other is None else Effect(value - other)
         return Cell({} if value is None else {0: value}, effect=effect)
 
     return Row(

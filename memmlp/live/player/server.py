@@ -245,8 +245,8 @@ class Server(ThreadingHTTPServer):
         """Bind to the address, without asking a name server for its name."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
-        self.server_address = self.socket.getsockname()
-        self.server_name, self.server_port = self.server_address[:2]  # type: ignore[assignment]
+        self.server_address = name, port, *_ = self.socket.getsockname()
+        self.server_name, self.server_port = name, port
 
     @property
     def url(self) -> str:

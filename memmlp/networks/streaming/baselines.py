@@ -129,9 +129,8 @@ class EgoPoserStream(StreamingGraph):
 class AGRoLStream(StreamingGraph):
     """The base of the streaming graphs of AGRoL's networks; it carries the stem's outputs."""
 
-    ends = ("model.stem", "model.head")
+    ends: tuple[str, ...] = ("model.stem", "model.head")
     width: int
-    blocks: list[MLPBlock]
 
     def windows(self) -> State:
         """Return zeros (T - 1, d): the stem's share of each earlier frame's inputs."""
@@ -156,6 +155,7 @@ class AGRoLMLPStream(AGRoLStream):
     """The streaming graph of AGRoL's MLP."""
 
     model: AGRoLMLP
+    blocks: list[MLPBlock]
 
     def build(self, model: WindowModel) -> None:
         """Make the graph's parts from a copy of the network."""
@@ -183,6 +183,7 @@ class AGRoLDiffusionStream(AGRoLStream):
     """
 
     model: AGRoLDiffusion
+    blocks: list[MLPBlock]
     shifts: Tensor
 
     def build(self, model: WindowModel) -> None:

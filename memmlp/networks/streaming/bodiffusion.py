@@ -23,9 +23,9 @@ class BoDiffusionStream(AGRoLStream):
     frame alone is made.
     """
 
-    ends: tuple[str, ...] = ("sparse", "motion", "made")  # type: ignore[assignment]
+    ends = ("sparse", "motion", "made")
     model: BoDiffusion
-    blocks: list[DiTBlock]  # type: ignore[assignment]
+    blocks: list[DiTBlock]
     modulations: Tensor
 
     def build(self, model: WindowModel) -> None:

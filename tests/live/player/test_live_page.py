@@ -97,7 +97,7 @@ class Worn(ClipSource):
 def test_the_wearer_fits_the_stream_from_the_page(browser: Browser, network: Path, clip: TrackedClip):
     stopped, source, stream = threading.Event(), Worn(clip, 60), Stream(network)
     hub = Hub(greeting(source, "tiny"))
-    fitting = Fitting(stream, "amass", None, hub.tell)
+    fitting = Fitting(stream, "amass", None, hub.tell, clock=lambda: 0.0)  # a countdown ends when cancelled
     with Server(hub, 0, ask=fitting.ask) as server:
         parts = (stream, source, hub.publish, stopped, None, fitting)
         loop = threading.Thread(target=play, args=parts, daemon=True)
