@@ -18,7 +18,8 @@ demo: $(STAMP)
 	$(BIN)/memmlp demo
 
 # Twice as many processes as small machines have cores: some tests wait for others' processes.
-PYTEST := $(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
+# What they compile is kept, whatever the environment says: dozens of interpreters are started.
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 test: $(STAMP)
 	$(PYTEST)

@@ -6,11 +6,12 @@ import contextlib
 import io
 import os
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from processes import finished
+from processes import forked
 
 from memmlp.cli.main import main
 
@@ -55,7 +56,10 @@ def in_folder(folder: Path, *arguments: str) -> None:
 
 
 def run_apart(folder: Path, *arguments: str, code: int = 0) -> str:
-    """The same in a process of its own."""
-    ran = finished([*MAIN, *arguments], cwd=folder)
-    assert ran.returncode == code, ran.stdout + ran.stderr
-    return ran.stdout + ran.stderr
+    """The same in a process of its own, which has torch loaded already; the environment is this one's."""
+    with tempfile.NamedTemporaryFile("r", encoding="utf-8") as said:
+        with forked(in_folder, folder, *arguments, said=said.name, **os.environ) as process:
+            left = process.wait()
+        text = said.read()
+    assert left == code, text
+    return text

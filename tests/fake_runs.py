@@ -12,7 +12,7 @@ import numpy as np
 
 from memmlp.runs.run import Run
 from memmlp.sweep.spec import MODES, Arm, Sweep
-from memmlp.tables.build_table import collect, finished
+from memmlp.tables.build_table import collect, finished_runs
 from memmlp.tables.effects import Runs
 from memmlp.tables.measured_run import Measured, load
 from memmlp.tables.table import Table
@@ -109,7 +109,7 @@ def runs_of(sweep: Sweep, find: Find, read: Callable[[Path], Measured] = load) -
         run = find(arm, seed)
         return read(run.folder) if run is not None and run.done else None
 
-    return finished(sweep, measured)
+    return finished_runs(sweep, measured)
 
 
 def table_of(sweep: Sweep, find: Find, command: str | None = None, modes: Sequence[str] = MODES) -> Table:

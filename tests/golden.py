@@ -1,30 +1,24 @@
 """The numbers that every component makes of fixed inputs, for tests/test_golden.py.
 
 `make golden` writes that file anew. It refuses where a component's numbers changed and its number in
-memmlp/runs/recipes.py did not: raise that first, in the same commit.
+memmlp/runs/recipe_numbers.py did not: raise that first, in the same commit.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-import tempfile
-from collections.abc import Callable, Mapping
-from functools import cache, partial
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
-import numpy as np
 import tiny
 import torch
+from golden_deployed import deployed, fp16, int8
+from golden_numbers import Numbers, changed, summary, tolerance
 from tiny_tasks import part_task
 from torch import Tensor, nn
 
-from memmlp.deploy import latency
-from memmlp.deploy.export import export
-from memmlp.deploy.half import halve
-from memmlp.deploy.parity import streamed
-from memmlp.deploy.quantization import quantise
-from memmlp.deploy.session import OnnxStream
 from memmlp.evaluation import metrics
 from memmlp.evaluation import modes as evaluation
 from memmlp.evaluation.ik import LBFGS
@@ -45,10 +39,9 @@ from memmlp.networks.memory import (
 )
 from memmlp.networks.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
 from memmlp.networks.refiner import SAGERefiner
-from memmlp.networks.streaming import streaming
 from memmlp.networks.vqvae import VQVAE
 from memmlp.networks.window_model import WindowModel
-from memmlp.runs.recipes import RECIPES
+from memmlp.runs.recipe_numbers import RECIPES
 from memmlp.training.loop import seed_step, train_step
 from memmlp.training.losses import (
     AGRoLLoss,
@@ -75,19 +68,6 @@ from memmlp.training.vqvae import VQVAETask
 
 PATH = Path(__file__).with_name("golden.json")
 BOTH = frozenset({"rotation", "position"})
-Numbers = dict[str, float]
-
-
-def summary(name: str, values: Tensor) -> Numbers:
-    """Four numbers of a tensor that hardly any change of it leaves as they were."""
-    flat = values.detach().double().flatten()
-    ramp = torch.linspace(-1, 1, len(flat), dtype=torch.double)
-    return {
-        f"{name} mean": float(flat.mean()),
-        f"{name} size": float(flat.abs().mean()),
-        f"{name} spread": float(flat.square().mean()),
-        f"{name} tilt": float((flat * ramp).mean()),
-    }
 
 
 def frames() -> MotionDataset:
@@ -158,7 +138,7 @@ def _trained(task: VQVAETask | MotionTask | RefinerTask | PartTask, optim: Optim
         result = train_step(task, optim, optimiser, step)
         average.update(step + 1)
         found |= {f"{name} {step}": float(term.detach()) for name, term in result.terms.items()}
-    average.show()
+    average.put_in_place()
     weights = torch.cat([p.detach().flatten() for p in task.module.parameters()])
     return found | summary("weights", weights)
 
@@ -320,46 +300,6 @@ def ik() -> Numbers:
     return summary("solved", solved)
 
 
-GRAPHS: dict[str, Callable] = {"graph.streaming": streaming, "graph.naive": lambda network: network}
-
-
-def deployed(graph: str) -> Numbers:
-    """An exported stream on a clip, and what its sizes are."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "step.onnx"
-        path.write_bytes(exported(graph))
-        motion = streamed(OnnxStream(path), tiny.clip(25))
-    return summary("motion", motion) | {"macs": float(latency.macs(GRAPHS[graph](tiny.model())))}
-
-
-@cache
-def exported(graph: str) -> bytes:
-    """The ONNX file of a graph of the first tiny network."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "step.onnx"
-        export(GRAPHS[graph](tiny.model()), path, "0" * 16)
-        return path.read_bytes()
-
-
-def int8() -> Numbers:
-    """An exported stream in int8."""
-    stream = streaming(tiny.model())
-    with tempfile.TemporaryDirectory() as folder:
-        exact, quantised = (Path(folder) / f"{name}.onnx" for name in ("exact", "quantised"))
-        exact.write_bytes(exported("graph.streaming"))
-        quantise(exact, quantised, stream.ends, [tiny.clip(40)])
-        return summary("motion", streamed(OnnxStream(quantised), tiny.clip(25)))
-
-
-def fp16() -> Numbers:
-    """An exported stream in fp16."""
-    with tempfile.TemporaryDirectory() as folder:
-        exact, half = (Path(folder) / f"{name}.onnx" for name in ("exact", "half"))
-        exact.write_bytes(exported("graph.streaming"))
-        halve(exact, half, streaming(tiny.model()).ends)
-        return summary("motion", streamed(OnnxStream(half), tiny.clip(25)))
-
-
 CASES: dict[str, Callable[[], Numbers]] = {
     "features": features,
     **{
@@ -454,20 +394,6 @@ def numbers(case: str) -> Numbers:
         torch.set_num_threads(threads)
 
 
-def changed(now: Mapping[str, float], before: Mapping[str, float], tolerance: float) -> list[str]:
-    """The names of the numbers that are not what they were, beyond what processors differ by."""
-    close = {
-        name: np.isclose(now[name], before[name], rtol=tolerance, atol=1e-2 * tolerance)
-        for name in now.keys() & before.keys()
-    }
-    return sorted((now.keys() ^ before.keys()) | {name for name, same in close.items() if not same})
-
-
-def tolerance(case: str) -> float:
-    """How far processors' numbers may differ: where few bits are left, they round by one more or less."""
-    return 2e-2 if case in ("int8", "fp16", "optim.muon") else 2e-4
-
-
 def stored() -> dict[str, dict[str, object]]:
     """What golden.json holds: a recipe number and numbers by component."""
     return json.loads(PATH.read_text()) if PATH.exists() else {}
@@ -479,9 +405,7 @@ def record() -> None:
     same = [case for case in CASES if case in before and before[case]["recipe"] == RECIPES[case]]
     wrong = [case for case in same if changed(now[case]["numbers"], before[case]["numbers"], tolerance(case))]  # type: ignore[arg-type]
     if wrong:
-        sys.exit(
-            f"raise the number of {', '.join(wrong)} in memmlp/runs/recipes.py: what they compute has changed"
-        )
+        sys.exit(f"raise the number of {', '.join(wrong)} in memmlp/runs/recipe_numbers.py: they changed")
     kept = {case: before[case] if case in same else now[case] for case in CASES}
     PATH.write_text(json.dumps(kept, indent=1) + "\n")
 

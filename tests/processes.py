@@ -68,16 +68,24 @@ def started(line: Sequence[str], **options: Any) -> Iterator[subprocess.Popen]:
 
 
 class Forked:
-    """A process that calls a function, with what tests need of `subprocess.Popen`, and says nothing.
+    """A process that calls a function, with what tests need of `subprocess.Popen`.
 
-    It is forked off a server that has imported torch and memmlp once, which takes seconds of CPU time.
+    What it says goes into the file `said`, by default nowhere. It is forked off a server that has imported
+    torch and memmlp once, which takes seconds of CPU time.
     """
 
-    def __init__(self, work: Callable[..., object], *arguments: Any, **environment: str):
+    def __init__(
+        self, work: Callable[..., object], *arguments: Any, said: str = os.devnull, **environment: str
+    ):
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload(["memmlp.config.build", "memmlp.pipeline.run_stages", "torch.onnx"])
-        self._process = context.Process(target=_quietly, args=(environment, work, arguments))
+        self._process = context.Process(target=_saying, args=(said, environment, work, arguments))
         self._process.start()
+
+    @property
+    def pid(self) -> int | None:
+        """The process' number."""
+        return self._process.pid
 
     @property
     def returncode(self) -> int | None:
@@ -98,11 +106,13 @@ class Forked:
         return self.returncode
 
 
-def _quietly(environment: dict[str, str], work: Callable[..., object], arguments: Sequence[Any]) -> None:
+def _saying(
+    said: str, environment: dict[str, str], work: Callable[..., object], arguments: Sequence[Any]
+) -> None:
     os.environ.update(environment)
-    nowhere = os.open(os.devnull, os.O_WRONLY)
+    file = os.open(said, os.O_WRONLY | os.O_APPEND)
     for stream in (1, 2):
-        os.dup2(nowhere, stream)
+        os.dup2(file, stream)
     work(*arguments)
 
 

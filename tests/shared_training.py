@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from tiny_tasks import OPTIM, TASKS, motion_task
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.runs.run import Run
 from memmlp.training.loop import TrainingTask, train
 from memmlp.training.optim import Muon, Optim, ScheduleFree
@@ -48,11 +48,11 @@ def together(folder: Path, *names: str) -> None:
     Each task is trained in FOLDER/TASK, from the checkpoint that is there. In the one that is named last as
     die=TASK the second process is killed on the way.
     """
-    parallel.connect("cpu")
+    distributed.connect("cpu")
     for word in names:
         name = word.removeprefix("die=")
         task = precise(name)
-        if name != word and parallel.rank() == 1:
+        if name != word and distributed.rank() == 1:
             task.step = dying(task.step, partial(os.kill, os.getpid(), signal.SIGKILL))
         train(task, optim_of(name), Run(folder / name), 0, name)
 

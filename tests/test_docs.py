@@ -22,7 +22,7 @@ from memmlp.config.compose import composed
 from memmlp.config.plugins import activate
 from memmlp.motion.importing.skeleton import SkeletonMap
 from memmlp.runs.identity import flatten
-from memmlp.sweep.spec import load_sweep
+from memmlp.sweep.parsing import load_sweep
 
 DOCS = ROOT / "docs"
 MADE = ("reference", "earlier", "templates")  # by the code, kept for the record, or not yet pages

@@ -8,9 +8,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from command_line import MAIN, run, run_apart
+from command_line import MAIN, in_folder, run, run_apart
 from own_package import EXAMPLE, KILLED, PACKAGE, TINY
-from processes import started, until
+from processes import finished, forked, until
 
 from memmlp.runs.lookup import list_runs
 
@@ -25,7 +25,7 @@ def test_components_of_ones_own_go_through_everything(
     home = tmp_path
     # trained, killed, resumed
     words = ["train", *OWN, *KILLED]
-    with started([*MAIN, *words], cwd=home) as process:
+    with forked(in_folder, home, *words, **os.environ) as process:
         found = until(lambda: [*home.glob("outputs/runs/*/checkpoint.safetensors")], "a checkpoint", process)
         process.kill()
     said = run(home, *words)
@@ -65,8 +65,9 @@ def test_components_of_ones_own_go_through_everything(
     # somewhere else, without the package
     paths = os.environ["PYTHONPATH"].split(":")
     monkeypatch.setenv("PYTHONPATH", ":".join(path for path in paths if path != str(EXAMPLE)))
-    line = run_apart(home, "eval", made.id, code=2)
-    assert line == (
+    ran = finished([*MAIN, "eval", made.id], cwd=home)
+    assert ran.returncode == 2
+    assert ran.stderr == (
         f"memmlp: run {made.id}: made with the package {PACKAGE} 0.1.0, which is not here; install it, or "
         "put its folder on PYTHONPATH\n"
     )

@@ -1,11 +1,12 @@
-"""What components compute is what their recipe numbers stand for (memmlp/runs/recipes.py)."""
+"""What components compute is what their recipe numbers stand for (memmlp/runs/recipe_numbers.py)."""
 
 from __future__ import annotations
 
 import golden
 import pytest
+from golden_numbers import changed, tolerance
 
-from memmlp.runs.recipes import RECIPES
+from memmlp.runs.recipe_numbers import RECIPES
 
 
 @pytest.mark.slow
@@ -15,9 +16,9 @@ def test_a_component_computes_what_its_recipe_number_stands_for(case: str):
     known = golden.stored()[case]
     assert known["recipe"] == RECIPES[case], f"record the numbers of {case}: make golden"
     now = golden.numbers(case)
-    wrong = golden.changed(now, known["numbers"], golden.tolerance(case))
+    wrong = changed(now, known["numbers"], tolerance(case))
     assert not wrong, (
-        f"raise the number of {case} in memmlp/runs/recipes.py: it computes other numbers ({wrong[:4]})"
+        f"raise the number of {case} in memmlp/runs/recipe_numbers.py: it differs in {wrong[:4]}"
     )
 
 

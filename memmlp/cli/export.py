@@ -259,8 +259,8 @@ def write_less_precise(
     """
     import tempfile
 
-    from memmlp.deploy.cost import compared
     from memmlp.deploy.deployment import lower
+    from memmlp.deploy.precision_cost import compared
 
     precision = form.precision
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:

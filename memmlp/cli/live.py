@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from memmlp.live.calibration import Calibration
     from memmlp.live.outputs.output import Output, Outputs
     from memmlp.live.player.server import File
-    from memmlp.live.player.sources import ClipSource, PoseSource, TrackedClip
+    from memmlp.live.player.sources import ClipSource, TrackedClip, TrackerSource
     from memmlp.live.spaces import SpaceName
     from memmlp.live.stream import Stream
 
@@ -132,19 +132,19 @@ def live(network: str, send: bool, save_avatar: Path | None, **options: Any) -> 
     """
     from memmlp.common.ending import termination_interrupts
 
-    feed = Feed(network=network, **{key: options.pop(key) for key in FED})
-    room = Room(**options)
+    feed = InputOptions(network=network, **{key: options.pop(key) for key in FED})
+    room = ShowOptions(**options)
     check_options(feed, room, send)
     with contextlib.suppress(KeyboardInterrupt), termination_interrupts():
         if save_avatar is not None:
-            avatar_saved(feed, save_avatar)
+            write_avatar(feed, save_avatar)
         elif send:
-            sent(feed)
+            send_clip(feed)
         else:
-            watched(feed, room)
+            serve(feed, room)
 
 
-class Feed(NamedTuple):
+class InputOptions(NamedTuple):
     """What the command's options name: a network, and the poses that it is fed."""
 
     network: str
@@ -157,10 +157,10 @@ class Feed(NamedTuple):
     outputs: Path
 
 
-FED = Feed._fields[1:]
+FED = InputOptions._fields[1:]
 
 
-class Room(NamedTuple):
+class ShowOptions(NamedTuple):
     """What the command's options say of the wearer, and of where the body goes."""
 
     height: float | None
@@ -176,10 +176,10 @@ class Room(NamedTuple):
     no_browser: bool
 
 
-def check_options(feed: Feed, room: Room, send: bool) -> None:
+def check_options(feed: InputOptions, room: ShowOptions, send: bool) -> None:
     """Raise InputError for options that contradict each other, or need what is not installed."""
-    from memmlp.common.access import check_token
     from memmlp.common.errors import InputError
+    from memmlp.common.page_access import check_token
     from memmlp.live.player.packets import needs_osc
 
     ports = [number for number in (feed.udp, feed.osc) if number is not None]
@@ -207,26 +207,26 @@ def check_options(feed: Feed, room: Room, send: bool) -> None:
     check_token(room.host, room.token)
 
 
-def source_of(feed: Feed) -> PoseSource:
+def source_of(feed: InputOptions) -> TrackerSource:
     """Return the source of the poses: packets at a port, or a clip that is repeated."""
     from memmlp.live.player.packets import from_json, from_osc
     from memmlp.live.player.sources import PacketSource
 
     if feed.udp is not None:
-        return PacketSource("UDP", feed.udp, from_json, feed.space, feed.senders, noted)
+        return PacketSource("UDP", feed.udp, from_json, feed.space, feed.senders, note)
     if feed.osc is not None:
-        return PacketSource("OSC", feed.osc, from_osc, feed.space, feed.senders, noted)
+        return PacketSource("OSC", feed.osc, from_osc, feed.space, feed.senders, note)
     return clip_source(feed)
 
 
-def clip_source(feed: Feed, rounds: float = float("inf")) -> ClipSource:
+def clip_source(feed: InputOptions, rounds: float = float("inf")) -> ClipSource:
     """Return a source that plays the clip in real time, `rounds` times."""
     from memmlp.live.player.sources import ClipSource
 
-    return ClipSource(clip_of(feed), feed.hz, rounds)
+    return ClipSource(load_clip(feed), feed.hz, rounds)
 
 
-def clip_of(feed: Feed) -> TrackedClip:
+def load_clip(feed: InputOptions) -> TrackedClip:
     """Load the clip of --clip: an AMASS npz on the built-in body, or a test clip of the run.
 
     Raises:
@@ -248,7 +248,7 @@ def clip_of(feed: Feed) -> TrackedClip:
     return TrackedClip(test.names[index], test.clip(index).numpy())
 
 
-def sent(feed: Feed) -> None:
+def send_clip(feed: InputOptions) -> None:
     """Send the clip's packets once to the port of the options, in the frame of reference of --space."""
     from memmlp.live.player.packets import to_json, to_osc
     from memmlp.live.player.sources import send
@@ -261,7 +261,7 @@ def sent(feed: Feed) -> None:
     click.echo(f"{send(source, port, pack, space_of(feed.space))} packets sent")
 
 
-def watched(feed: Feed, room: Room) -> None:
+def serve(feed: InputOptions, room: ShowOptions) -> None:
     """Play the source through the network to the outputs, and serve the page, until Ctrl-C."""
     import threading
     import webbrowser
@@ -272,7 +272,7 @@ def watched(feed: Feed, room: Room) -> None:
     from memmlp.live.player.server import Hub, Server
 
     with contextlib.closing(source_of(feed)) as source:
-        stream, name = opened(feed, source.space, room)
+        stream, name = open_stream(feed, source.space, room)
         files = page_files(room.avatar, stream)
         outputs = outputs_of(room, stream)
         words = greeting(source, name, outputs)
@@ -289,7 +289,7 @@ def watched(feed: Feed, room: Room) -> None:
             play(stream, source, hub.publish, stopped, outputs, fitting, room.avatar is not None)
 
 
-def opened(feed: Feed, space: SpaceName, room: Room) -> tuple[Stream, str]:
+def open_stream(feed: InputOptions, space: SpaceName, room: ShowOptions) -> tuple[Stream, str]:
     """Return the stream of the network, fitted to its wearer, and the network's name."""
     from memmlp.live.stream import Stream
 
@@ -301,7 +301,7 @@ def opened(feed: Feed, space: SpaceName, room: Room) -> tuple[Stream, str]:
     return stream, name
 
 
-def network_file(feed: Feed) -> tuple[Path, str]:
+def network_file(feed: InputOptions) -> tuple[Path, str]:
     """Return the ONNX file of the network, and its name."""
     from memmlp.runs.lookup import find_run
 
@@ -311,7 +311,7 @@ def network_file(feed: Feed) -> tuple[Path, str]:
     return run.preferred_onnx, f"run {run.id[:8]}"
 
 
-def known_of(room: Room, space: SpaceName, stream: Stream) -> Calibration:
+def known_of(room: ShowOptions, space: SpaceName, stream: Stream) -> Calibration:
     """Return what is known of the wearer: by the file of --calibration, and by the options before it."""
     from memmlp.live.calibration import Calibration, read_calibration
     from memmlp.live.wearer import stature
@@ -324,23 +324,23 @@ def known_of(room: Room, space: SpaceName, stream: Stream) -> Calibration:
     floor = known.floor if room.floor is None else room.floor / 100
     if known.offsets is not None and abs((height or body) - (known.height or body)) > 0.005:
         was = 100 * (known.height or body)
-        noted(f"{room.calibration}: its calibration is of a height of {was:.0f} cm; calibrate again")
+        note(f"{room.calibration}: its calibration is of a height of {was:.0f} cm; calibrate again")
     return Calibration(space, body, known.offsets, height, floor)
 
 
-def outputs_of(room: Room, stream: Stream) -> Outputs:
+def outputs_of(room: ShowOptions, stream: Stream) -> Outputs:
     """Return the outputs that the options name."""
     from memmlp.live.outputs import vmc, vrchat
     from memmlp.live.outputs.osc import Receiver
     from memmlp.live.outputs.output import Outputs
-    from memmlp.live.outputs.recording import Recording
+    from memmlp.live.outputs.recording import Recorder
 
     found: list[Output] = [vmc.VMC(Receiver(host, port or vmc.PORT, "--vmc")) for host, port in room.vmc]
     found += [vrchat.VRChat(Receiver(host, port or vrchat.PORT, "--vrchat")) for host, port in room.vrchat]
     if room.record:
         network = stream.network
-        found.append(Recording(room.record, network.skeleton.rest, network.fps, noted))
-    return Outputs(found, noted)
+        found.append(Recorder(room.record, network.skeleton.rest, network.fps, note))
+    return Outputs(found, note)
 
 
 def page_files(avatar: str | None, stream: Stream) -> Mapping[str, File]:
@@ -354,7 +354,7 @@ def page_files(avatar: str | None, stream: Stream) -> Mapping[str, File]:
     return avatar_files(mannequin_vrm(stream.rest) if avatar == OWN else read_vrm(Path(avatar)))
 
 
-def avatar_saved(feed: Feed, path: Path) -> None:
+def write_avatar(feed: InputOptions, path: Path) -> None:
     """Write this project's own avatar with the network's body."""
     from memmlp.common.errors import InputError
     from memmlp.live.exported import ExportedNetwork
@@ -372,6 +372,6 @@ def avatar_saved(feed: Feed, path: Path) -> None:
     click.echo(f"{path}: an avatar of VRM 1.0, which anybody may use (CC0)")
 
 
-def noted(line: str) -> None:
-    """Tell a line that is no result."""
+def note(line: str) -> None:
+    """Print a remark to stderr."""
     click.echo(line, err=True)

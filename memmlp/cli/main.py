@@ -13,7 +13,7 @@ from typing import NamedTuple, NoReturn
 import click
 
 import memmlp
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.common.progress import telling
 
@@ -121,7 +121,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _run(arguments: list[str]) -> None:
-    if parallel.size() > 1 and arguments[:1] != ["train"]:
+    if distributed.size() > 1 and arguments[:1] != ["train"]:
         raise InputError("torchrun: allowed are several processes for memmlp train alone")
     if arguments[:1] in (["-sc"], ["--shell-completion"]):
         _complete(arguments)

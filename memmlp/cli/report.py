@@ -45,7 +45,7 @@ def report(
     from memmlp.config.packaged import packaged
     from memmlp.report.html import fragment, page, published
     from memmlp.runs.environment import environment
-    from memmlp.sweep.spec import load_sweep
+    from memmlp.sweep.parsing import load_sweep
 
     names = [word for word in words if "=" not in word and not word.startswith("~")] or EVERY
     chapters = chapters_of(names, [word for word in words if word not in names], outputs)
@@ -66,12 +66,12 @@ def one_file(chapters: Sequence[Chapter], outputs: Path, extra: str, replays: bo
     from memmlp.cli.ui import predict
     from memmlp.config.plan_sweep import sweep_folder
     from memmlp.ui.answers import Answers
-    from memmlp.ui.one_file import Shown, written
+    from memmlp.ui.one_file import ReportedSweep, page_text
 
     answers = Answers(outputs, predict, kept=False)
-    shown = [Shown(sweep_folder(one.sweep, outputs).name, one.table) for one in chapters]
+    shown = [ReportedSweep(sweep_folder(one.sweep, outputs).name, one.table) for one in chapters]
     try:
-        return written(answers, shown, extra, replays)
+        return page_text(answers, shown, extra, replays)
     finally:
         answers.close()
 

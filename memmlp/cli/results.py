@@ -47,18 +47,18 @@ def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | N
     They are the per-clip results of its finished runs. SWEEP and OVERRIDES are those of `memmlp sweep`.
     Results that the file already has of other arms and seeds stay.
     """
-    from memmlp.cli.rounds import shown
+    from memmlp.cli.rounds import sweep_to_show
     from memmlp.common.files import plain
     from memmlp.config.plan_sweep import find_sweep, is_path
     from memmlp.report.kept_results import Kept, load_kept, overrides_of, save, without_paths
-    from memmlp.tables.build_table import finished
+    from memmlp.tables.build_table import finished_runs
     from memmlp.tables.measured_run import load
     from memmlp.tables.rounds import as_json
     from memmlp.tables.runs_of_plan import finder
 
     sweep = find_sweep(name, overrides)
-    known = shown(sweep, overrides, outputs.absolute())
-    found = finished(known.sweep, finder(known.plan, functools.cache(load)))
+    known = sweep_to_show(sweep, overrides, outputs.absolute())
+    found = finished_runs(known.sweep, finder(known.plan, functools.cache(load)))
     words = tuple(word for word in overrides if not word.startswith("seed="))
     rounds = plain(as_json(known.rounds)) if known.rounds else None
     source = name if is_path(name) else sweep.name
@@ -150,7 +150,7 @@ def _table(kept: Kept, source: str | None = None) -> Table:
 
 def _outdated(kept: Kept) -> list[str]:
     """Return a flag that names the components whose recipe numbers have changed since, if any."""
-    from memmlp.runs.recipes import outdated
+    from memmlp.runs.recipe_numbers import outdated
 
     found = sorted({words for run in kept.every for words in outdated(run.origin.recipes)})
     return [f"made by an earlier recipe: {', '.join(found)}"] if found else []

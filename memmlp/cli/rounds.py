@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from memmlp.tables.rounds import Look, Rounds
 
 
-def record(sweep: Sweep, outputs: Path) -> Path:
+def rounds_path(sweep: Sweep, outputs: Path) -> Path:
     """Return the file where a sweep's rounds are kept."""
     from memmlp.config.plan_sweep import sweep_folder
     from memmlp.tables.rounds_file import NAME
@@ -26,7 +26,7 @@ def record(sweep: Sweep, outputs: Path) -> Path:
     return sweep_folder(sweep, outputs) / NAME
 
 
-def begun(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
+def current_rounds(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
     """Return the rounds of a sweep as far as they went; new ones where no look was taken yet.
 
     Args:
@@ -40,7 +40,7 @@ def begun(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
     from memmlp.tables.rounds import MOST, begin
     from memmlp.tables.rounds_file import read
 
-    path = record(sweep, outputs)
+    path = rounds_path(sweep, outputs)
     kept = read(path)
     if kept is None or not kept.taken:
         return begin(sweep, most or MOST)
@@ -80,13 +80,13 @@ def until_decided(
     """
     from dataclasses import replace
 
-    from memmlp.config.plan_sweep import planned
+    from memmlp.config.plan_sweep import make_plan
     from memmlp.tables.rounds_file import same_runs
 
     while True:
         spent = rounds.spent(sweep)
-        plan = replace(planned(spent, outputs, prepare=True), fail_fast=fail_fast)
-        same_runs(rounds, sweep, plan, record(sweep, outputs))
+        plan = replace(make_plan(spent, outputs, prepare=True), fail_fast=fail_fast)
+        same_runs(rounds, sweep, plan, rounds_path(sweep, outputs))
         if plan.left():
             work(spent, plan)
         if plan.stopped:
@@ -105,18 +105,18 @@ def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
     """
     from memmlp.common.files import write_json
     from memmlp.common.lease import Lock
-    from memmlp.tables.build_table import finished
+    from memmlp.tables.build_table import finished_runs
     from memmlp.tables.measured_run import load
     from memmlp.tables.rounds import advanced, as_json
     from memmlp.tables.rounds_file import read
     from memmlp.tables.runs_of_plan import finder
 
-    path = record(sweep, outputs)
+    path = rounds_path(sweep, outputs)
     with Lock(path.parent).hold():
         kept = read(path)
         if kept is not None and len(kept.taken) > len(rounds.taken):
             return kept
-        runs: dict[str, Runs] = finished(rounds.spent(sweep), finder(plan, load))
+        runs: dict[str, Runs] = finished_runs(rounds.spent(sweep), finder(plan, load))
         after = advanced(rounds, sweep, runs, names(rounds, sweep, plan))
         write_json(path, as_json(after))
     return after
@@ -139,7 +139,7 @@ def _difference(kept: Rounds, wanted: Rounds) -> str | None:
     return next((key for key, value in wanted.subject.items() if kept.subject.get(key) != value), None)
 
 
-class Shown(NamedTuple):
+class SweepToShow(NamedTuple):
     """What a table shows of a sweep whose seeds may have been spent in rounds.
 
     Attributes:
@@ -155,32 +155,34 @@ class Shown(NamedTuple):
     flags: tuple[str, ...] = ()
 
 
-def shown(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> Shown:
+def sweep_to_show(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> SweepToShow:
     """Return the sweep with its rounds, where rounds were taken and fit what the sweep is now.
 
     Otherwise the sweep is shown with its own seeds, and a flag says so where rounds were taken.
     """
-    from memmlp.config.plan_sweep import planned
+    from memmlp.config.plan_sweep import make_plan
     from memmlp.tables.rounds_file import read, same_runs
 
-    path = record(sweep, outputs)
+    path = rounds_path(sweep, outputs)
     kept = read(path)
     if kept is None or not kept.taken:
-        return Shown(sweep, planned(sweep, outputs), None)
+        return SweepToShow(sweep, make_plan(sweep, outputs), None)
     chosen = any(word.startswith("seed=") for word in overrides)
     if flag := of_another(kept, sweep, chosen):
-        return Shown(sweep, planned(sweep, outputs), None, (flag,))
+        return SweepToShow(sweep, make_plan(sweep, outputs), None, (flag,))
     spent = kept.spent(sweep)
-    plan = planned(spent, outputs)
+    plan = make_plan(spent, outputs)
     try:
         same_runs(kept, sweep, plan, path)
     except InputError as error:
-        return Shown(spent, plan, None, (f"seeds were spent in rounds, but not of these runs: {error}",))
-    return Shown(spent, plan, kept)
+        return SweepToShow(
+            spent, plan, None, (f"seeds were spent in rounds, but not of these runs: {error}",)
+        )
+    return SweepToShow(spent, plan, kept)
 
 
 def of_another(kept: Rounds, sweep: Sweep, chosen: bool = False) -> str | None:
-    """Return a flag where looks were of something else than the sweep is now; None where they are of it.
+    """Return a flag if the kept looks were taken of a different sweep than today's; else None.
 
     `chosen` says that the sweep's seeds were chosen by hand.
     """
@@ -195,10 +197,10 @@ def of_another(kept: Rounds, sweep: Sweep, chosen: bool = False) -> str | None:
 
 
 def spent_before(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
-    """Return a flag for verdicts of a fixed number of seeds, where rounds were taken of the sweep before."""
+    """Return a flag for a table of a fixed number of seeds if rounds were taken of the sweep before."""
     from memmlp.tables.rounds_file import read
 
-    kept = read(record(sweep, outputs))
+    kept = read(rounds_path(sweep, outputs))
     if kept is None or not kept.taken:
         return ()
     return ("seeds were spent in rounds before; memmlp table has their verdicts, these do not keep the 5 %",)

@@ -17,7 +17,7 @@ from memmlp.common.errors import InputError
 from memmlp.runs.identity import NETWORK
 
 if TYPE_CHECKING:
-    from memmlp.cli.rounds import Shown
+    from memmlp.cli.rounds import SweepToShow
     from memmlp.sweep.plan import Plan
     from memmlp.sweep.spec import Sweep
 
@@ -70,16 +70,16 @@ def sweep(
     controls, get more, up to --max-seeds.
     """
     from memmlp.cli import rounds
-    from memmlp.config.plan_sweep import find_sweep, planned, sweep_folder
+    from memmlp.config.plan_sweep import find_sweep, make_plan, sweep_folder
 
     rounds.check(overrides, until_decided, max_seeds)
     if again and (until_decided or status or dry_run):
         raise InputError("--again: allowed is without --until-decided, --status and --dry-run")
     chosen = find_sweep(name, overrides)
     outputs = outputs.absolute()
-    known = rounds.begun(chosen, outputs, max_seeds) if until_decided else None
+    known = rounds.current_rounds(chosen, outputs, max_seeds) if until_decided else None
     spent = known.spent(chosen) if known else chosen
-    plan = planned(spent, outputs, prepare=not (status or dry_run))
+    plan = make_plan(spent, outputs, prepare=not (status or dry_run))
     if status or dry_run:
         show(spent, plan)
         if known:
@@ -93,25 +93,29 @@ def sweep(
             plan.run_of(task).retry()
     if again:
         reset(plan)
-    work = partial(bring_to_end, workers=workers)
+    work = partial(run_workers, workers=workers)
     if known:
         known, plan = rounds.until_decided(chosen, outputs, known, work, fail_fast)
-        report(rounds.Shown(known.spent(chosen), plan, known), [name, *overrides], chosen)
+        report(rounds.SweepToShow(known.spent(chosen), plan, known), [name, *overrides], chosen)
         return
     plan = replace(plan, fail_fast=fail_fast)
     if plan.left():
         work(chosen, plan)
-    report(rounds.Shown(chosen, plan, None, rounds.spent_before(chosen, outputs)), [name, *overrides], chosen)
+    report(
+        rounds.SweepToShow(chosen, plan, None, rounds.spent_before(chosen, outputs)),
+        [name, *overrides],
+        chosen,
+    )
 
 
 def reset(plan: Plan) -> None:
-    """Remove what the plan's networks are so far, so that all are made again, not what they build on."""
+    """Remove the plan's networks, trained or begun, so that they are trained again; upstream runs stay."""
     for run in {task.id: plan.run_of(task) for task in plan.tasks if task.kind == NETWORK}.values():
         with run.lock():
             run.reset()
 
 
-def bring_to_end(chosen: Sweep, plan: Plan, workers: Workers) -> None:
+def run_workers(chosen: Sweep, plan: Plan, workers: Workers) -> None:
     """Start workers, and wait until they have done the plan's runs."""
     from memmlp.config.plan_sweep import sweep_folder
     from memmlp.sweep.board import Board
@@ -168,13 +172,13 @@ def _seconds(plan: Plan, kind: str) -> list[float]:
     return [sum(seconds.values()) if isinstance(seconds, dict) else seconds for seconds in found]
 
 
-def report(shown: Shown, words: Sequence[str], chosen: Sweep) -> None:
+def report(shown: SweepToShow, words: Sequence[str], chosen: Sweep) -> None:
     """Print the table, what is done, what failed, and the next command.
 
     Exits with 1 where something failed.
     """
     from memmlp.cli.rounds import closing
-    from memmlp.cli.table import SHOWN_MODES, of_plan, on_screen
+    from memmlp.cli.table import SHOWN_MODES, on_screen, table_of_plan
     from memmlp.cli.track import show_in_trackers
     from memmlp.config import plugins
     from memmlp.config.plan_sweep import orphans, sweep_folder
@@ -184,7 +188,7 @@ def report(shown: Shown, words: Sequence[str], chosen: Sweep) -> None:
     states = plan.states()
     failed = [task for task in plan.tasks if states[task.key] in ("failed", "blocked")]
     command = " ".join(["memmlp sweep", *words])
-    found = of_plan(shown, SHOWN_MODES["both"], command, load)
+    found = table_of_plan(shown, SHOWN_MODES["both"], command, load)
     show_in_trackers(plan, sweep_folder(chosen, plan.outputs), found.table)
     on_screen([found.table])
     for line in closing(known, chosen, found.runs) if known else ():

@@ -17,7 +17,7 @@ from memmlp.common.errors import InputError
 from memmlp.sweep.spec import BRANCHES
 
 if TYPE_CHECKING:
-    from memmlp.cli.rounds import Shown
+    from memmlp.cli.rounds import SweepToShow
     from memmlp.sweep.spec import Sweep
     from memmlp.tables.effects import Runs
     from memmlp.tables.runs_of_plan import Read
@@ -121,7 +121,7 @@ def _uncollected() -> Iterator[None]:
         gc.enable()
 
 
-class Found(NamedTuple):
+class SweepTable(NamedTuple):
     """A sweep, the finished runs of its arms by seed, and its table."""
 
     sweep: Sweep
@@ -137,7 +137,7 @@ def gathered(
     read: Read,
     branch: str | None = None,
     source: str | None = None,
-) -> list[Found]:
+) -> list[SweepTable]:
     """Gather the tables that some names stand for.
 
     A table of the paper whose config lacks something (such as the folder of AMASS) shows the paper's values
@@ -155,40 +155,42 @@ def gathered(
     Raises:
         InputError: where none of them can be composed with the command line's overrides.
     """
-    from memmlp.cli.rounds import shown
+    from memmlp.cli.rounds import sweep_to_show
     from memmlp.tables.build_table import without_runs
 
     found, failures = [], []
     for sweep, command in chosen(names, overrides):
         sweep = sweep.with_branch(branch) if branch else sweep
         try:
-            known = shown(sweep, overrides, outputs.absolute())
-            found.append(of_plan(known, modes, command, read, source))
+            known = sweep_to_show(sweep, overrides, outputs.absolute())
+            found.append(table_of_plan(known, modes, command, read, source))
         except InputError as error:
             failures.append(error)
             table = without_runs(sweep, modes, f"nothing measured: {error}")
-            found.append(Found(sweep, {arm.label: {} for arm in sweep.runnable()}, table))
+            found.append(SweepTable(sweep, {arm.label: {} for arm in sweep.runnable()}, table))
     if failures and (overrides or found[0].sweep.table is None) and len(failures) == len(found):
         raise failures[0]
     return found
 
 
-def of_plan(shown: Shown, modes: Sequence[str], command: str, read: Read, source: str | None = None) -> Found:
+def table_of_plan(
+    shown: SweepToShow, modes: Sequence[str], command: str, read: Read, source: str | None = None
+) -> SweepTable:
     """Return a planned sweep's finished runs and its table, of one source's test clips where it is given."""
-    from memmlp.tables.build_table import collect, finished, on_source, titled
+    from memmlp.tables.build_table import collect, finished_runs, on_source, titled
     from memmlp.tables.runs_of_plan import finder, older, states
 
     sweep, plan, rounds, flags = shown
     if source and rounds:
         raise InputError(f"--source {source}: allowed for a fixed number of seeds, not for --until-decided")
-    runs = finished(sweep, finder(plan, read))
+    runs = finished_runs(sweep, finder(plan, read))
     if source:
         sweep, runs, left_out = on_source(sweep, runs, source)
         flags = (*left_out, *flags)
     command = f"{command} --until-decided" if rounds else command
     table = collect(sweep, runs, modes, command, states(plan), older(plan), rounds)
     table = titled(table, source) if source else table
-    return Found(sweep, runs, replace(table, flags=(*table.flags, *flags)))
+    return SweepTable(sweep, runs, replace(table, flags=(*table.flags, *flags)))
 
 
 def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
@@ -215,7 +217,7 @@ def on_screen(tables: Sequence[Table]) -> None:
         show(one, console)
 
 
-def plans_on_screen(found: Sequence[Found], modes: Sequence[str]) -> None:
+def plans_on_screen(found: Sequence[SweepTable], modes: Sequence[str]) -> None:
     """Print, sweep by sweep, how many seeds the paper's effects would need."""
     from memmlp.tables.seeds_needed import needs
     from memmlp.tables.table_text import caption

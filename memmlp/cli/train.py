@@ -13,7 +13,7 @@ from hydra import version
 from hydra._internal.utils import _run_hydra
 from omegaconf import DictConfig
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.config.compose import CONFIG, VERSION_BASE, help_text, parse, preflight
 from memmlp.config.explain import explain
@@ -49,7 +49,7 @@ def train(argv: Sequence[str], job: Callable[[DictConfig], object] | None = None
         click.echo(help_text(args))
         return
     jobs = preflight(args) if _runs(args) else []
-    if len(jobs) > 1 and parallel.size() > 1:
+    if len(jobs) > 1 and distributed.size() > 1:
         raise InputError("torchrun: several processes train one run; allowed is no multirun")
     failures: list[Exception] = []
     with _raising(args.overrides):
@@ -110,10 +110,10 @@ def run_training(cfg: DictConfig) -> None:
 
     from memmlp.cli.train_summary import show
     from memmlp.config.build import build_experiment
-    from memmlp.pipeline.together import run_together
+    from memmlp.pipeline.distributed import run_distributed
 
     check(cfg)
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
-    if outcome := run_together(build_experiment(cfg)):
+    if outcome := run_distributed(build_experiment(cfg)):
         show(outcome)

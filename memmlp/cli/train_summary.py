@@ -64,7 +64,7 @@ def size(measured: Mapping[str, Any]) -> str:
 
 
 def said(outcome: Outcome) -> str:
-    """Say which stages were done now, and which were found done."""
+    """Say which stages were made now and which existed already."""
     if not outcome.made:
         return f"run {outcome.run.id} is finished already; nothing was done (force=true does it again)"
     wanted = [stage for stage in STAGES if stage != "deployment" or "latency" in outcome.results]

@@ -46,7 +46,7 @@ def tune(
     from memmlp.common.files import write_json
     from memmlp.search.study import Study
 
-    setup = prepared(overrides, config_dir, outputs.absolute())
+    setup = prepare_search(overrides, config_dir, outputs.absolute())
     if status:
         show(setup)
         return
@@ -87,7 +87,7 @@ class Setup(NamedTuple):
         return ["export.graph=off", *self.search.base, *self.words, *self.search.overrides(values)]
 
 
-def prepared(words: Sequence[str], config_dir: Path | None, outputs: Path) -> Setup:
+def prepare_search(words: Sequence[str], config_dir: Path | None, outputs: Path) -> Setup:
     """Return the search of a command line, its keys and ranges checked against the config.
 
     Raises:

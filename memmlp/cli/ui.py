@@ -31,7 +31,7 @@ def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path)
     """
     import webbrowser
 
-    from memmlp.common.access import check_token
+    from memmlp.common.page_access import check_token
     from memmlp.ui.answers import Answers
     from memmlp.ui.server import Server
 

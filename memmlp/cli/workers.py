@@ -232,7 +232,7 @@ def hire(folder: Path, plan: Plan, workers: Workers, devices: Iterable[str]) -> 
     Raises:
         InputError: where workers can't have the GPUs that are asked for.
     """
-    from memmlp.config.perform_task import work, work_alone
+    from memmlp.config.perform_task import start_lone_worker, start_worker
     from memmlp.sweep.controller import Fleet
     from memmlp.sweep.worker import Presence
 
@@ -247,7 +247,7 @@ def hire(folder: Path, plan: Plan, workers: Workers, devices: Iterable[str]) -> 
     gpu = made.gpus and not named <= WITHOUT
     if workers.engine == "local":
         threads = max((os.cpu_count() or 1) // count, 1)
-        task = partial(work, str(path), threads, str(presence.path), gpu)
+        task = partial(start_worker, str(path), threads, str(presence.path), gpu)
     else:
-        task = partial(work_alone, str(path), gpu)
+        task = partial(start_lone_worker, str(path), gpu)
     return path, Fleet(made, task, count, folder / "workers", presence)

@@ -17,7 +17,7 @@ class Closing(Protocol):
 
 @contextlib.contextmanager
 def closed_in_peace(thing: Closing) -> Iterator[None]:
-    """Close a thing at the end, whatever ends it; another Ctrl-C or termination does not interrupt that."""
+    """Close an object at the end of the context; a further Ctrl-C or SIGTERM does not interrupt that."""
     try:
         yield
     finally:

@@ -21,7 +21,7 @@ FENCED = re.compile(r"^\..*\.lease-(\d+)\.[0-9a-f]+\.tmp$")
 
 
 class Fence(Protocol):
-    """What stands between a process and a folder that it may have lost."""
+    """Checks, before a process publishes in a folder, that the folder is still its own."""
 
     number: int
 
@@ -49,7 +49,7 @@ def fence_of(path: Path) -> Fence | None:
     return next((_FENCES[folder] for folder in (real, *real.parents) if folder in _FENCES), None)
 
 
-def check(path: Path) -> None:
+def check_owner(path: Path) -> None:
     """Raise LeaseLost if this process held the path's folder and has lost it.
 
     To be called before a file is appended to or removed. A freeze after the check is not noticed there.
@@ -75,15 +75,15 @@ def publish(unfinished: Path, path: Path) -> None:
     Raises:
         LeaseLost: if this process held the path's folder and has lost it.
     """
-    check(path)
+    check_owner(path)
     try:
         os.replace(unfinished, path)
     except FileNotFoundError:
-        check(path)  # the next owner removed it
+        check_owner(path)  # the next owner removed it
         raise
 
 
-def sweep(folder: Path, number: int) -> None:
+def remove_unfinished(folder: Path, number: int) -> None:
     """Remove what owners with lower numbers left unfinished of a folder, and below it."""
     for path in [*folder.rglob(".*.tmp"), *folder.parent.glob(f".{folder.name}.*.tmp")]:
         found = FENCED.match(path.name)

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 from filelock import FileLock, Timeout
 
 from memmlp.common.errors import LeaseLost
-from memmlp.common.fences import fenced, sweep
+from memmlp.common.fences import fenced, remove_unfinished
 from memmlp.common.files import now
 from memmlp.common.liveness import Changes, lives, myself, place
 
@@ -122,7 +122,7 @@ class Claims:
         return True
 
     def remove_below(self, number: int) -> None:
-        """Remove the claims that were superseded, in ascending order, so that no earlier one seems last."""
+        """Remove superseded claims in ascending order: cut short, it leaves no earlier one as the last."""
         for old in self.numbers():
             if old < number:
                 self.path(old).unlink(missing_ok=True)
@@ -302,7 +302,7 @@ class Lock:
             self.claims.path(number).unlink(missing_ok=True)
             return None
         self.claims.remove_below(number)
-        sweep(self._held_folder, number)
+        remove_unfinished(self._held_folder, number)
         return Lease(self.claims, number, self._what)
 
     def _take_kernels(self, stack: ExitStack) -> bool:

@@ -21,7 +21,7 @@ DEAD = ("Z", "X")  # states of a process that is over, though its parent has not
 
 @functools.cache
 def place() -> str:
-    """Return 12 hex digits that stand for where process numbers mean the same: machine, start, container."""
+    """Return a digest of machine, start and container: within one, a number means one process."""
     words = [platform.node(), _text(PROC / "sys/kernel/random/boot_id"), _link(PROC / "self/ns/pid")]
     return hashlib.sha256("\n".join(words).encode()).hexdigest()[:12]
 
@@ -40,7 +40,7 @@ def lives(process: Mapping[str, Any]) -> bool | None:
 
 
 class Changes:
-    """For how long this process has seen things without a change, by a clock of its own that never jumps."""
+    """Measures how long values have stayed unchanged, by this process' clock, which never jumps."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic):
         self.clock = clock

@@ -37,7 +37,8 @@ class Metric:
 
 @dataclass(frozen=True)
 class Plugin:
-    """What a package has, in an attribute `plugin` of its module; a package without one just may be imported.
+    """What a package adds, in an attribute `plugin` of its module. A package without one adds nothing, but
+    configs may name its classes.
 
     Attributes:
         conf: the folder of configs inside the package, whose options are beside memmlp's; it need not exist.

@@ -1,4 +1,7 @@
-"""Open a finished run with its experiment and data, for the commands that look at it again."""
+"""Open a finished run with its experiment and data, for the commands that look at it again.
+
+It lies in config because only config builds experiments from configs.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +58,7 @@ def open_run(outputs: Path, name: str, device_name: str = "cpu", overrides: Sequ
 
 
 def open_found(run: Run, device_name: str = "cpu", overrides: Sequence[str] = ()) -> OpenedRun:
-    """The same of a run that was found already."""
+    """Open a run that was found already; see `open_run`."""
     experiment = experiment_of(run, device_name, overrides)
     return OpenedRun(run, experiment, data_of(run, experiment))
 

@@ -1,4 +1,7 @@
-"""What a worker of a sweep does with a task: it builds the experiment and brings its run to its end."""
+"""What a worker of a sweep does with a task: it builds the experiment and brings its run to its end.
+
+It lies in config because only config builds experiments from configs.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +11,13 @@ from typing import TYPE_CHECKING
 
 from memmlp.common.errors import InputError
 from memmlp.sweep.plan import Plan, RunTask
-from memmlp.sweep.worker import Cancelled, Presence, directed
-from memmlp.sweep.worker import work as work_on
+from memmlp.sweep.worker import Cancelled, Presence, directed, work_off
 
 if TYPE_CHECKING:
     from memmlp.pipeline.experiment import Experiment
 
 
-def work(path: str, threads: int, controller: str, gpu: bool) -> str | None:
+def start_worker(path: str, threads: int, controller: str, gpu: bool) -> str | None:
     """Work on the tasks of the plan in that file for as long as the process of its controller lives.
 
     Args:
@@ -29,11 +31,11 @@ def work(path: str, threads: int, controller: str, gpu: bool) -> str | None:
     """
     if gpu and (line := missing_gpu()):
         return line
-    work_on(Path(path), partial(perform, Path(path), threads), lambda: Presence.of(Path(controller)))
+    work_off(Path(path), partial(perform, Path(path), threads), lambda: Presence.of(Path(controller)))
     return None
 
 
-def work_alone(path: str, gpu: bool) -> str | None:
+def start_lone_worker(path: str, gpu: bool) -> str | None:
     """Work on the tasks of the plan in that file until none is left, on a machine apart from the controller.
 
     A worker on a cluster outlives the process that started it: a closed plan (a sweep's) is worked to its
@@ -48,7 +50,7 @@ def work_alone(path: str, gpu: bool) -> str | None:
     """
     if gpu and (line := missing_gpu()):
         return line
-    work_on(Path(path), partial(perform, Path(path), 0), lambda: directed(Path(path)))
+    work_off(Path(path), partial(perform, Path(path), 0), lambda: directed(Path(path)))
     return None
 
 

@@ -1,5 +1,7 @@
 """Make the plan of a sweep file: every arm is composed, checked and given its run's identity.
 
+It lies in config because only config composes.
+
 Composing takes a moment for each arm. So the plan of a sweep that was started is kept, and used again as long
 as the sweep, the configs, the code and the data are unchanged.
 """
@@ -15,9 +17,10 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import digest, read_json, write_json
 from memmlp.config.packaged import packaged
 from memmlp.config.plugins import activate, named, texts
-from memmlp.sweep.kept import keep
+from memmlp.sweep.kept_sweep import keep
+from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
-from memmlp.sweep.spec import Arm, Sweep, load_sweep
+from memmlp.sweep.spec import Arm, Sweep
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -65,7 +68,7 @@ def sweep_folder(sweep: Sweep, outputs: Path) -> Path:
     return outputs / "sweeps" / f"{sweep.name}{key}"
 
 
-def planned(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
+def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
     """Return the plan of a sweep, the kept one where it still holds.
 
     A look at a sweep that was never started leaves nothing in the outputs.

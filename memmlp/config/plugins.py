@@ -31,7 +31,7 @@ from memmlp.config.packaged import packaged
 from memmlp.evaluation.units import HIGHER, SMALLEST, UNITS
 from memmlp.runs.environment import package_sources
 from memmlp.runs.identity import flatten
-from memmlp.runs.recipes import RECIPES
+from memmlp.runs.recipe_numbers import RECIPES
 
 GROUP = "memmlp.plugins"
 VARIABLE = "MEMMLP_PLUGINS"
@@ -105,13 +105,13 @@ def searching(folder: Path | None) -> Iterator[None]:
 
 
 def words() -> list[str]:
-    """Return the words of a command line that search the same folder."""
+    """Return the words `--config-dir FOLDER` for a command that is to search the same folder, or none."""
     own = _own.get()
     return ["--config-dir", str(own)] if own else []
 
 
 def texts() -> list[tuple[str, str]]:
-    """Return what is one's own that a plan follows from: code and configs, a name and a text each."""
+    """Return code and configs that are no part of memmlp, as (name, text): a plan depends on them."""
     found = [(f"{name}:{file}", text) for name in _active for file, text in package_sources(name).items()]
     paths = [path for _, folder in folders() for path in sorted(folder.rglob("*.yaml"))]
     return [*found, *((str(path), path.read_text(encoding="utf-8")) for path in paths)]

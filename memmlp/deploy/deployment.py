@@ -10,11 +10,11 @@ from typing import Any
 from torch import Tensor
 
 from memmlp.deploy import latency
-from memmlp.deploy.cost import compared
 from memmlp.deploy.export import export
 from memmlp.deploy.half import halve
 from memmlp.deploy.opsets import NATIVE
 from memmlp.deploy.parity import TOLERANCE, parity
+from memmlp.deploy.precision_cost import compared
 from memmlp.deploy.quantization import quantise
 from memmlp.networks.streaming import StreamingGraph, has_stream, streaming
 from memmlp.networks.window_model import WindowModel
@@ -77,7 +77,7 @@ class Deployment:
             raise RuntimeError(
                 f"{deployed.onnx}: ONNX Runtime differs from torch by {worst:.2e} (> {TOLERANCE:.0e})"
             )
-        record = latency.measure(deployed.onnx, self.latency_steps) | latency.size(
+        record = latency.measure_step(deployed.onnx, self.latency_steps) | latency.size(
             model, network, deployed.onnx
         )
         record |= {
@@ -96,10 +96,10 @@ class Deployment:
         test: Sequence[Tensor],
     ) -> dict[str, Any]:
         """Write the file of less precision beside the other; return its accuracy, times and size."""
-        path = {"int8": deployed.int8, "fp16": deployed.half}[self.precision]
+        path = deployed.file(self.precision)
         lower(self.precision, deployed.onnx, path, network.ends, train)
         cost = compared(deployed.onnx, path, self.precision, network.normalizer, test)
-        measured = latency.measure(path, self.latency_steps)
+        measured = latency.measure_step(path, self.latency_steps)
         return {**cost, **measured, "onnx_bytes": path.stat().st_size}
 
 

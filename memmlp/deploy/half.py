@@ -18,7 +18,7 @@ from onnx import ModelProto, NodeProto, TensorProto, helper
 
 from memmlp.common.errors import InputError
 from memmlp.common.fences import publish, temporary
-from memmlp.deploy.constants import Constants
+from memmlp.deploy.graph_constants import Constants
 from memmlp.deploy.quantization import inner_layers
 
 LARGEST = float(np.finfo(np.float16).max)
@@ -65,7 +65,7 @@ def halved(model: ModelProto, ends: Sequence[str]) -> ModelProto:
     del graph.node[:]
     graph.node.extend(nodes)
     del graph.value_info[:]
-    constants.sweep()
+    constants.remove_unused()
     return model
 
 

@@ -28,7 +28,7 @@ Key = TypeVar("Key", bound=Hashable)
 YARDSTICK_SHAPE = (41, 512, 8)  # rows, width, layers: 86 M multiply-adds of plain matrix products
 
 
-def measure(path: Path, steps: int = 200) -> dict[str, Any]:
+def measure_step(path: Path, steps: int = 200) -> dict[str, Any]:
     """Time one step of an exported file on one thread: median and 95th percentile, in milliseconds.
 
     The step and the yardstick are timed in turn, step by step, in the same minute, so that their ratio

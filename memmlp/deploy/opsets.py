@@ -15,7 +15,7 @@ import onnx
 from onnx import ModelProto, NodeProto, helper, version_converter
 
 from memmlp.common.errors import InputError
-from memmlp.deploy.constants import Constants
+from memmlp.deploy.graph_constants import Constants
 
 NATIVE = 18
 """The opset that torch's exporter writes."""
@@ -56,7 +56,7 @@ def _lowered(model: ModelProto, opset: int) -> ModelProto:
     del made.opset_import[:]
     made.opset_import.append(helper.make_opsetid("", opset))
     made.ir_version = helper.find_min_ir_version_for(made.opset_import)
-    constants.sweep()
+    constants.remove_unused()
     return made
 
 

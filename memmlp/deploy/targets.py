@@ -99,7 +99,7 @@ class Published:
         return f"{self.title}, {self.version}{dated}{where}"
 
 
-class Finding(NamedTuple):
+class UnsupportedOperator(NamedTuple):
     """Something of a graph that a list does not have.
 
     Attributes:
@@ -125,7 +125,7 @@ def published(name: str) -> Published:
     return Published(**found)
 
 
-def findings(model: ModelProto, listed: Published) -> list[Finding]:
+def findings(model: ModelProto, listed: Published) -> list[UnsupportedOperator]:
     """Return what of a graph lies outside a list; each operator once for each reason."""
     opset = next((o.version for o in model.opset_import if o.domain in ("", "ai.onnx")), 0)
     outside = Counter[tuple[str, str]]()
@@ -134,15 +134,15 @@ def findings(model: ModelProto, listed: Published) -> list[Finding]:
         version = _version(node, opset)
         for why in _reasons(node, version, listed, facts):
             outside[f"{_name(node)} (version {version})", why] += 1
-    found = [Finding(what, count, why) for (what, why), count in sorted(outside.items())]
+    found = [UnsupportedOperator(what, count, why) for (what, why), count in sorted(outside.items())]
     if listed.opsets and not listed.opsets[0] <= opset <= listed.opsets[1]:
         first, last = listed.opsets
-        found.insert(0, Finding(f"opset {opset}", 0, f"published are {first} to {last}"))
+        found.insert(0, UnsupportedOperator(f"opset {opset}", 0, f"published are {first} to {last}"))
     return found
 
 
 def remarks(model: ModelProto, listed: Published) -> list[str]:
-    """Return what a list says beside of the operators that a graph has."""
+    """Return a list's remarks on the operators that a graph uses."""
     used = sorted({_name(node) for node in _nodes(model.graph)})
     rules = {name: listed.operators[name] for name in used if name in listed.operators}
     lacking = [f"{name}: not on {', '.join(rule.not_on)}" for name, rule in rules.items() if rule.not_on]
@@ -150,7 +150,7 @@ def remarks(model: ModelProto, listed: Published) -> list[str]:
 
 
 def load_graph(path: Path) -> ModelProto:
-    """Read an ONNX file. Raises InputError if there is none, or it is none."""
+    """Read an ONNX file. Raises InputError for a missing or damaged file."""
     try:
         model = onnx.load(path)
     except FileNotFoundError:

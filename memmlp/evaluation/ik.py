@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -77,6 +78,9 @@ class LBFGS:
 IK = NoIK | LBFGS
 
 
+LEVER = 0.1  # m^2, bounds the unit of a joint whose turn moves little
+
+
 class JointDistance:
     """The objective: the sum over joints of the squared distance (m^2) to targets relative to the head.
 
@@ -86,22 +90,13 @@ class JointDistance:
         rest: rest positions (22, 3), metres.
     """
 
-    LEVER = 0.1  # m^2, bounds the unit of a joint whose turn moves little
-
     def __init__(self, start: Tensor, target: Tensor, rest: Tensor):
         self.start, self.target, self.rest = start, target, rest
-        # Turning a hip moves more than turning a wrist. Each variable gets a unit in which the objective's
-        # curvature is about the same, so that few iterations get far and neighbouring frames go the same way
-        # (without: 1.19 cm, Jitter 24).
-        still = torch.eye(3).to(start).expand(1, N_JOINTS, 3, 3)
-        moved = jacobian(
-            lambda turn: self.joints(still, turn[None])[0].flatten(), torch.zeros_like(start[0, ..., 0])
-        )
-        self.unit = (2 * moved.square().sum(0).mean(-1, keepdim=True) + self.LEVER).rsqrt()
+        self.unit = _units(tuple(rest.flatten().tolist()), rest.dtype, rest.device)
 
     def __call__(self, increment: Tensor, rows: Tensor) -> Tensor:
         """Return the objective (n,) at increments (n, 66) of the rows (n,) of `start` and `target`."""
-        joints = self.joints(self.start[rows], self.turn(increment))
+        joints = _joints(self.start[rows], self.turn(increment), self.rest)
         return (joints - self.target[rows]).square().sum((1, 2))
 
     def turned(self, increment: Tensor) -> Tensor:
@@ -112,16 +107,32 @@ class JointDistance:
         """Convert increments (n, 66) to axis-angle (n, 22, 3), radians."""
         return increment.unflatten(-1, (N_JOINTS, 3)) * self.unit
 
-    def joints(self, start: Tensor, turn: Tensor) -> Tensor:
-        """Return the joints' positions (n, 22, 3) relative to the head.
 
-        Args:
-            start: local rotations (n, 22, 3, 3).
-            turn: axis-angle increments (n, 22, 3), applied on their right.
-        """
-        local = start @ axis_angle_to_matrix(turn)
-        _, positions = forward_kinematics(local, torch.zeros_like(local[:, 0, 0]), self.rest)
-        return positions - positions[:, HEAD : HEAD + 1]
+def _joints(start: Tensor, turn: Tensor, rest: Tensor) -> Tensor:
+    """Return the joints' positions (n, 22, 3) relative to the head, metres.
+
+    Args:
+        start: local rotations (n, 22, 3, 3).
+        turn: axis-angle increments (n, 22, 3), applied on their right.
+        rest: rest positions (22, 3), metres.
+    """
+    local = start @ axis_angle_to_matrix(turn)
+    _, positions = forward_kinematics(local, torch.zeros_like(local[:, 0, 0]), rest)
+    return positions - positions[:, HEAD : HEAD + 1]
+
+
+@lru_cache(maxsize=8)
+def _units(rest: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return each joint's unit of turning (22, 1) for 66 coordinates of a rest pose; made once for each.
+
+    Turning a hip moves more than turning a wrist. Each variable gets a unit in which the objective's
+    curvature is about the same, so that few iterations get far and neighbouring frames go the same way
+    (without: 1.19 cm, Jitter 24).
+    """
+    still = torch.eye(3, dtype=dtype, device=device).expand(1, N_JOINTS, 3, 3)
+    pose = torch.tensor(rest, dtype=dtype, device=device).unflatten(0, (N_JOINTS, 3))
+    moved = jacobian(lambda turn: _joints(still, turn[None], pose)[0].flatten(), torch.zeros_like(pose))
+    return (2 * moved.square().sum(0).mean(-1, keepdim=True) + LEVER).rsqrt()
 
 
 class Curvature(NamedTuple):

@@ -37,7 +37,7 @@ class Evaluable(Protocol):
 
     @property
     def shift(self) -> int:
-        """By how many frames the network's own past, which it sees, ends before the newest frame; else 0."""
+        """How many frames before the newest one the recalled past ends; 0 for a network that recalls none."""
 
     @property
     def windowless(self) -> bool:

@@ -19,7 +19,7 @@ from memmlp.evaluation.ik import IK, NoIK
 from memmlp.motion.body import FPS, SPARSE_DIM
 from memmlp.motion.clip import Clip, resample
 from memmlp.motion.dataset import MotionDataset
-from memmlp.motion.exporting.folder import ExportReport, Plan, Target, read_motion, read_targets
+from memmlp.motion.exporting.folder import ExportPlan, ExportReport, Target, read_motion, read_targets
 from memmlp.motion.exporting.write import write_motion
 from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.preparing.cache import frame_blocks
@@ -118,7 +118,7 @@ class Predictor:
         kind = BRANCHES[self.branch]
         return motion_clip(name, arrays[f"{kind}_rotations"], arrays[f"{kind}_positions"], self.rest)
 
-    def export(self, plan: Plan, *, strict: bool = False) -> ExportReport:
+    def export(self, plan: ExportPlan, *, strict: bool = False) -> ExportReport:
         """Write what the network makes of a plan's clips.
 
         Args:

@@ -62,7 +62,7 @@ def as_they_are(rotations: Tensor) -> Tensor:
 def quaternions(rotations: Tensor) -> Tensor:
     """Convert matrices (..., 3, 3) to unit quaternions (..., 4), xyzw, w not negative; accurate everywhere.
 
-    As `memmlp.motion.geometry.matrix_to_quaternion`, but of the four forms the well conditioned one is found
+    As `memmlp.motion.geometry.matrix_to_wxyz`, but of the four forms the well conditioned one is found
     by comparing two at a time, which needs no computed index.
     """
     m = rotations.flatten(-2).split(1, -1)

@@ -16,7 +16,7 @@ WARM_UP = 30  # samples before the timed ones
 LEAST = 200  # samples are timed, however few are asked for
 
 
-def measure(path: Path, steps: int) -> dict[str, float]:
+def measure_pose(path: Path, steps: int) -> dict[str, float]:
     """Time whole poses of an exported network on one thread: median and 95th percentile, in milliseconds.
 
     A pose is a call of `Stream.step`: features, conversions and forward kinematics, with the network's step

@@ -78,7 +78,7 @@ class Offsets(NamedTuple):
     rotations: np.ndarray
 
 
-OUTPUTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+ROTATION_FORMATS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "matrix": lambda matrices: matrices,
     "quaternion": matrix_to_quaternion,
 }
@@ -122,8 +122,8 @@ class Stream:
         ik: LBFGS | None = None,
     ):
         self.space = space_of(space)
-        if rotations not in OUTPUTS:
-            raise InputError(f"rotations={rotations}: allowed: {', '.join(OUTPUTS)}")
+        if rotations not in ROTATION_FORMATS:
+            raise InputError(f"rotations={rotations}: allowed: {', '.join(ROTATION_FORMATS)}")
         self.network = ExportedNetwork(_file(source))
         if ik is not None and "position" not in self.network.branches:
             raise InputError(f"ik: {self.network.path} has no position branch to fit to; allowed is ik=None")
@@ -131,7 +131,7 @@ class Stream:
         self.wearer = wearer(self.network.skeleton, height, floor)
         self.network_seconds = 0.0
         self.solve = None if ik is None else Solver(ik, self.network.skeleton.rest)
-        self._output = OUTPUTS[rotations]
+        self._output = ROTATION_FORMATS[rotations]
         self._trackers = TrackerFrames(self.network.skeleton, self.network.fps)
         self._features = Features()
         self._sparse = self.network.sparse[0]

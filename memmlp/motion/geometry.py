@@ -27,7 +27,7 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
     return identity + sine * cross + cosine * (cross @ cross)
 
 
-def matrix_to_quaternion(matrix: Tensor) -> Tensor:
+def matrix_to_wxyz(matrix: Tensor) -> Tensor:
     """Convert matrices (..., 3, 3) to unit quaternions (..., 4), the real part first and not negative."""
     m = matrix
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
@@ -49,7 +49,7 @@ def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
 
     It goes by a quaternion, which is accurate at 0 and near pi.
     """
-    quaternion = matrix_to_quaternion(matrix)
+    quaternion = matrix_to_wxyz(matrix)
     vector = quaternion[..., 1:]
     sine = vector.norm(dim=-1, keepdim=True)
     angle = 2 * torch.atan2(sine, quaternion[..., :1])

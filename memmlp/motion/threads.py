@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Keep torch to one thread: on clips of seconds others only wait for one another, and busily at that."""
+    """Limit torch to one thread: on short clips more threads only spin, waiting for one another."""
     import torch
 
     before = torch.get_num_threads()

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 from torch.nn.modules.dropout import _DropoutNd
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 
 
 class TimeMix(nn.Module):
@@ -109,13 +109,13 @@ class Dropout(nn.Dropout):
 
     def forward(self, h: Tensor) -> Tensor:
         """Set random elements of features (B, ...) to 0 in training, and scale the others up."""
-        if not (self.training and parallel.shared()):
+        if not (self.training and distributed.shared()):
             return super().forward(h)
-        return h * parallel.drawn(lambda like: F.dropout(torch.ones_like(like), self.p), h)
+        return h * distributed.drawn(lambda like: F.dropout(torch.ones_like(like), self.p), h)
 
 
 def undivided(module: nn.Module) -> list[str]:
-    """Name the kinds of layers that don't do the same to a row of a batch whose other rows lie elsewhere."""
+    """Name the layers whose result for a row depends on the other rows of the batch."""
     found = [layer for layer in module.modules() if _counts(layer) or (_draws(layer) and layer.p)]
     found += [layer for layer in module.modules() if isinstance(layer, nn.RNNBase) and layer.dropout]
     return sorted({type(layer).__name__ for layer in found})

@@ -43,7 +43,7 @@ class MemMLP(WindowModel):
 
     @property
     def shift(self) -> int:
-        """By how many frames what the memory recalls ends before the newest frame; 0 without a memory."""
+        """How many frames before the newest one the memory's recall ends; 0 without a memory."""
         return self.memory.shift
 
     @property

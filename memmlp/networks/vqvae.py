@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.motion.body import FRAME_DIM, ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 
@@ -90,7 +90,7 @@ class EMACodebook(Codebook):
 
         The running means are those of the whole batch, where several processes share it.
         """
-        latent = parallel.whole(latent)
+        latent = distributed.whole(latent)
         if not self.started:
             self._restart(torch.ones_like(self.counts, dtype=torch.bool), latent)
             self.started.fill_(True)
@@ -100,7 +100,7 @@ class EMACodebook(Codebook):
         self.sums.lerp_(chosen.T @ latent, 1 - self.decay)
         self._restart(self.counts < self.DEAD, latent)
         self.vectors.copy_(self.sums / self.counts[:, None])
-        return parallel.own(codes), parallel.own(index)
+        return distributed.own(codes), distributed.own(index)
 
     def _restart(self, dead: Tensor, latent: Tensor) -> None:
         """Put the codes that are `dead` (K,) onto random latents of the batch (B, width)."""

@@ -34,12 +34,12 @@ class WindowModel(nn.Module):
 
     @property
     def shift(self) -> int:
-        """By how many frames the network's own past, which it sees, ends before the newest frame; else 0."""
+        """How many frames before the newest one the recalled past ends; 0 for a network that recalls none."""
         return 0
 
     @property
     def settled(self) -> bool:
-        """Whether what the network recalls of a frame never changes, so that a live stream can carry it."""
+        """Whether a past frame's recalled values never change again, so that a live stream may keep them."""
         return True
 
     @property
@@ -49,7 +49,7 @@ class WindowModel(nn.Module):
 
     @property
     def streams(self) -> bool:
-        """Whether a frame is made without later ones; else it is evaluated in window mode alone."""
+        """Whether each frame is predicted without later ones; if not, only window mode can evaluate it."""
         return True
 
     @property
@@ -81,7 +81,7 @@ class WindowModel(nn.Module):
         return fresh | {"sparse": sparse, "started": torch.ones_like(fresh["started"])}
 
     def true_state(self, frames: Tensor) -> State:
-        """Return the state after world frames [X | Theta] (B, length, 252), the truth being its history."""
+        """Return the state after true world frames [X | Theta] (B, length, 252), its history being true."""
         return self.running_state(frames[..., :SPARSE_DIM])
 
     def taken_in(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
@@ -114,7 +114,7 @@ class WindowModel(nn.Module):
         raise NotImplementedError
 
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
-        """Make a training call; it is `advance` for networks that learn by what they do live.
+        """Make a training call; by default this is `advance`.
 
         Args:
             sparse: see `advance`.

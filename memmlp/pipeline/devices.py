@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.common.errors import InputError
 
 
@@ -29,7 +29,7 @@ def device(name: str) -> torch.device:
         if kind == "cuda":
             raise InputError(f"device={name}: there is no CUDA device; allowed here is cpu or auto")
         return torch.device("cpu")
-    return torch.device("cuda", _checked(name, int(index)) if index else parallel.local_rank())
+    return torch.device("cuda", _checked(name, int(index)) if index else distributed.local_rank())
 
 
 def _checked(name: str, index: int) -> int:
@@ -37,7 +37,7 @@ def _checked(name: str, index: int) -> int:
     count = torch.cuda.device_count()
     if index >= count:
         raise InputError(f"device={name}: allowed here is cuda:0{f' to cuda:{count - 1}' * (count > 1)}")
-    if parallel.size() > 1:
+    if distributed.size() > 1:
         raise InputError(f"device={name}: allowed with several processes is device=cuda, one GPU for each")
     return index
 

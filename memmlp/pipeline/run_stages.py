@@ -15,13 +15,13 @@ from typing import Any
 
 import torch
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.common.errors import LeaseLost, TrainingDiverged, of_the_disk
 from memmlp.common.files import write_json
 from memmlp.common.progress import tell
 from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
-from memmlp.live.latency import measure as pose_latency
+from memmlp.live.latency import measure_pose
 from memmlp.motion.preparing.manifest import ClipRecord
 from memmlp.motion.preparing.source import Prepared
 from memmlp.pipeline.devices import described
@@ -82,11 +82,11 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
         if experiment.force:
             run.reset()
         made = []
-        with shown(experiment, run):
+        with recording_outcome(experiment, run):
             if not run.done:
                 train_run(experiment, run, data, above, watch)
                 made.append("training")
-            made += finish(experiment, run, data)
+            made += make_missing_stages(experiment, run, data)
         if experiment.predictions is not None:
             model = experiment.architecture.load(run.weights()).to(experiment.device)
             test = data.open("test").to(experiment.device)
@@ -108,14 +108,14 @@ def complete_stages(
     Returns:
         The results, and the names of the stages that were made.
     """
-    with run.lock(), shown(experiment, run, again):
+    with run.lock(), recording_outcome(experiment, run, again):
         if again:
             evaluate_run(experiment, run, data, experiment.evaluation.modes)
-        made = [*(["evaluation"] if again else []), *finish(experiment, run, data)]
+        made = [*(["evaluation"] if again else []), *make_missing_stages(experiment, run, data)]
     return results_of(experiment, run), made
 
 
-def finish(experiment: Experiment, run: Run, data: Prepared) -> list[str]:
+def make_missing_stages(experiment: Experiment, run: Run, data: Prepared) -> list[str]:
     """Make what is missing of a trained run's evaluations and deployment.
 
     Returns:
@@ -182,7 +182,7 @@ def made_upstream(
     with run.lock():
         if run.done:
             return run
-        with shown(experiment, run):
+        with recording_outcome(experiment, run):
             train_upstream(experiment, training, identity, data, run, above)
     return run
 
@@ -200,7 +200,7 @@ def train_upstream(
     run.write_manifest({"partial": partial_words(experiment, data)})
     tell(f"{training.told} (run {run.id})")
     weights = above.weights() if above else None
-    parallel.of_first(training.kind)
+    distributed.of_first(training.kind)
     with timed(run, "train"):
         errors = training.train(experiment.architecture, data, weights, run, experiment.device)
     write_json(run.results_path, {"val": errors})
@@ -208,8 +208,8 @@ def train_upstream(
 
 
 @contextlib.contextmanager
-def shown(experiment: Experiment, run: Run, again: bool = False) -> Iterator[None]:
-    """Show work on a run elsewhere while it goes on, if there is any; its failure is kept with the run.
+def recording_outcome(experiment: Experiment, run: Run, again: bool = False) -> Iterator[None]:
+    """Follow work on a run in the trackers, and record its failure in the run's folder.
 
     Only failures of the work itself count: bad input, interruptions, a full disk and the loss of the run to
     another process leave it as it is.
@@ -239,7 +239,7 @@ def train_run(
     run.write_manifest({"body": data.manifest.body, "partial": partial_words(experiment, data)})
     run.clear_stages()
     weights = above.weights() if above else None
-    parallel.of_first(NETWORK)
+    distributed.of_first(NETWORK)
     with timed(run, "train"):
         experiment.training.train(experiment.architecture, data, weights, run, experiment.device, watch)
     run.finish(("model.safetensors",))
@@ -276,10 +276,10 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared, name: str) -> N
         deployed.latency.unlink(missing_ok=True)  # it lacks a file and is made again, from the start
         deployment = experiment.deployments[name]
         record = deployment.deploy(model, deployed, run.id, *clips)
-        record |= pose_latency(deployed.onnx, deployment.latency_steps)
+        record |= measure_pose(deployed.onnx, deployment.latency_steps)
         for precision, path in (("int8", deployed.int8), ("fp16", deployed.half)):
             if precision in record:
-                record[precision] |= pose_latency(path, deployment.latency_steps)
+                record[precision] |= measure_pose(path, deployment.latency_steps)
         deployed.finish(
             {"run": run.manifest["id"], "settings": deployment_settings(experiment.config), **record}
         )
@@ -289,7 +289,7 @@ def begin(experiment: Experiment, run: Run, identity: Identity, config: dict[str
     """Begin a training: write its config, and into its manifest its identity and what it runs on."""
     above = identity.upstream.id if identity.upstream else None
     facts = {"recipes": identity.recipes, "what": identity.what, **machine(experiment)}
-    facts |= {"processes": parallel.size(), **own_code(experiment)}
+    facts |= {"processes": distributed.size(), **own_code(experiment)}
     counting = {**(identity.upstream.config if identity.upstream else {}), **identity.config}
     facts |= {"name": experiment.called(identity.kind, counting), "user": user()}
     run.begin(identity.kind, config, data=identity.data, upstream=above, **facts)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from io import BytesIO
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -32,11 +33,11 @@ class Sheet:
         empty = np.full((height, width, 3), 255, np.uint8)
         return self.figure.figimage(empty, x, self.height - y - height)
 
-    def text(self, x: float, y: float, text: str, size: float, **style: object) -> Text:
+    def text(self, x: float, y: float, text: str, size: float, **style: Any) -> Text:
         """Add words, anchored at a position; `size` is in pixels."""
         width = self.figure.get_figwidth() * DPI
         style = {"color": INK, "va": "center", "ha": "center"} | style
-        return self.figure.text(x / width, 1 - y / self.height, text, fontsize=0.72 * size, **style)  # type: ignore[arg-type]
+        return self.figure.text(x / width, 1 - y / self.height, text, fontsize=0.72 * size, **style)
 
     def colour_bar(self, x: int, y: int, width: int, height: int, top: float) -> None:
         """Add the scale of errors from 0 to `top` cm."""

@@ -76,7 +76,7 @@ def page(chapters: Sequence[Chapter], published: Sequence[Point], generated: str
 
 
 def fragment(chapters: Sequence[Chapter], published: Sequence[Point], generated: str, commit: str) -> str:
-    """Return the same as part of a page that has a head and a style of its own."""
+    """Return the report as part of a page that has a head and a style of its own."""
     about = f"{generated}, code {commit}, {_counted(_entries(chapters))}"
     body = "\n".join(_section(*section) for section in _sections(chapters, published))
     return f'<h1>Measured and published</h1>\n<p class="about">{_text(about)}</p>\n{body}'

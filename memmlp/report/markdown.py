@@ -8,8 +8,8 @@ from typing import NamedTuple
 from jinja2 import Environment, StrictUndefined, TemplateError
 
 from memmlp.common.errors import InputError
-from memmlp.report.claims import claims
 from memmlp.report.kept_results import Kept
+from memmlp.report.unbacked_claims import claims
 from memmlp.statistics import Verdict
 from memmlp.tables.formats import escaped, markdown
 from memmlp.tables.measured_run import UNKNOWN, Measured
@@ -59,7 +59,7 @@ def pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -> dic
 
 
 def check_claims(name: str, text: str) -> None:
-    """Refuse prose that claims effects by hand (see `memmlp.report.claims`). Raises InputError."""
+    """Refuse prose that claims effects by hand (see `memmlp.report.unbacked_claims`). Raises InputError."""
     for claim in claims(text):
         raise InputError(
             f"{name}, line {claim.line}: {claim.reason} in '{claim.sentence[:80]}'; allowed for effects are "

@@ -33,10 +33,13 @@ LARGEST = 4 * 10**9  # bytes of all files together, unless more is allowed
 PIECE = 2**20
 PART = r"[\w.-]*[\w-]"  # a name of a folder or file: no "..", nothing that leads elsewhere
 ALLOWED = re.compile(
-    rf"(evaluations/{PART}\.json|deployments/{PART}/(latency\.json|step(\.int8)?\.onnx)"
-    r"|(checkpoint|model)\.safetensors|results\.json|metrics\.jsonl|system\.jsonl|poses\.png|code\.patch"
-    r"|config\.yaml|manifest\.json|notes\.json|DONE)"
+    "|".join(
+        re.escape(pattern).replace(r"\*", PART)
+        for pattern in (*Run.FILES, "notes.json", "DONE")
+        if pattern != "FAILED"
+    )
 )
+"""The files that an archive may hold: a run's own without a failure, its notes and its marker."""
 
 
 def export_run(run: Run, out: Path) -> str:

@@ -11,6 +11,13 @@ from memmlp.common.files import file_digest, now, read_json, write_json
 from memmlp.runs.environment import environment
 from memmlp.runs.identity import belongs, deployment_name
 
+ONNX_FILES = {"fp32": "step.onnx", "int8": "step.int8.onnx", "fp16": "step.fp16.onnx"}
+"""The name of the ONNX file of each precision (`export.precision`)."""
+
+LATENCY = "latency.json"
+FILES = (LATENCY, *ONNX_FILES.values())
+"""A deployment's files, in the order in which they are removed: what was measured before what it is of."""
+
 
 class DeploymentFolder:
     """A deployment of a run: the folder runs/<id>/deployments/<identity>/.
@@ -25,10 +32,14 @@ class DeploymentFolder:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        self.onnx = folder / "step.onnx"
-        self.int8 = folder / "step.int8.onnx"
-        self.half = folder / "step.fp16.onnx"
-        self.latency = folder / "latency.json"
+        self.onnx = self.file("fp32")
+        self.int8 = self.file("int8")
+        self.half = self.file("fp16")
+        self.latency = folder / LATENCY
+
+    def file(self, precision: str) -> Path:
+        """Return the ONNX file of a precision, one of ONNX_FILES, whether it was made or not."""
+        return self.folder / ONNX_FILES[precision]
 
     @property
     def done(self) -> bool:
@@ -44,7 +55,7 @@ class DeploymentFolder:
 
     def finish(self, record: Mapping[str, Any]) -> None:
         """Write what was measured, with the files' digests; this marks the deployment as complete."""
-        files = (self.onnx, self.int8, self.half)
+        files = map(self.file, ONNX_FILES)
         artifacts = {path.name: file_digest(path) for path in files if path.exists()}
         made = {"made": now(), "made_by": environment(), "artifacts": artifacts}
         write_json(self.latency, {**record, **made})

@@ -12,7 +12,7 @@ from memmlp.runs.identity import NETWORK
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.name import kind_words
 from memmlp.runs.notes import read_notes
-from memmlp.runs.recipes import outdated
+from memmlp.runs.recipe_numbers import outdated
 from memmlp.runs.run import Run
 
 REASONS = ("failed", "old", "orphaned")

@@ -20,7 +20,7 @@ from typing import Any
 
 from memmlp.common.files import plain
 from memmlp.common.plugin import METRICS
-from memmlp.runs.recipes import recipes
+from memmlp.runs.recipe_numbers import recipes
 
 NEUTRAL = (
     "data",  # its digest stands for it: frames, clips, split and rest pose; but see `_draws`

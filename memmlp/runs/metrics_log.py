@@ -52,13 +52,15 @@ class MetricsLog:
             LeaseLost: if the run has another owner by now.
             OSError: if the disk is full; the log is as it was.
         """
-        fences.check(self.path)
+        fences.check_owner(self.path)
         if not self._whole:
             self.repair()
         entry = {"step": step, "phase": phase, "time": round(time.time(), 3), "values": dict(values)}
         line = json.dumps(plain(entry), allow_nan=False).encode() + b"\n"
         with open(self.path, "ab", buffering=0) as file:
-            fences.check(self.path)  # who is frozen from here on writes to a file that `repair` replaced
+            fences.check_owner(
+                self.path
+            )  # who is frozen from here on writes to a file that `repair` replaced
             self._whole = False
             if file.write(line) < len(line):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))

@@ -31,7 +31,7 @@ DEEPEST = 50  # parentheses and "not"s in one another
 
 
 def record(run: Run) -> dict[str, Any]:
-    """Return what may be asked of a run, by key.
+    """Return the values that conditions can use for a run, by key.
 
     These are its id, kind, status, name, started, tag, note and step; its data by name (`data`) and by digest
     (`data_digest`); the keys of its config, slots also by their name alone (`memory` for `memory.name`); and
@@ -109,10 +109,10 @@ def _later(config: Mapping[str, Any]) -> list[str]:
     return [key for key in flatten(config) if key.startswith(("evaluation.ik", "export.precision"))]
 
 
-def shown(value: Any) -> str:
+def as_typed(value: Any) -> str:
     """Return a value as it is typed in a condition, and shown in a column."""
     if isinstance(value, list | tuple):
-        return f"[{','.join(map(shown, value))}]"
+        return f"[{','.join(map(as_typed, value))}]"
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):
@@ -257,7 +257,7 @@ def _equal(own: Any, value: str) -> bool:
         return value in own
     if isinstance(own, int | float) and not isinstance(own, bool):
         return own == _number(value)
-    return shown(own) == value.replace(", ", ",")
+    return as_typed(own) == value.replace(", ", ",")
 
 
 def _number(text: str) -> float | None:

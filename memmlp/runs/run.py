@@ -19,6 +19,7 @@ from memmlp.common import fences
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, file_digest, now, read_json, sync_folder, write_json
 from memmlp.common.lease import Lease, Lock
+from memmlp.runs import deployment_folder
 from memmlp.runs.deployment_folder import DeploymentFolder
 from memmlp.runs.environment import changes, environment, host, sources
 from memmlp.runs.evaluation_file import current, intact, read_report
@@ -51,11 +52,10 @@ class Run:
         marker: the file that marks the run as done.
     """
 
+    STAGES = (*(f"deployments/*/{name}" for name in deployment_folder.FILES), "evaluations/*.json")
+    """The files of a run's evaluations and deployments."""
     FILES = (
-        "deployments/*/latency.json",
-        "deployments/*/step.onnx",
-        "deployments/*/step.int8.onnx",
-        "evaluations/*.json",
+        *STAGES,
         "checkpoint.safetensors",
         "model.safetensors",
         "results.json",
@@ -68,7 +68,6 @@ class Run:
         "manifest.json",
     )
     """A run's own files, in the order in which a reset removes them: results before what they are of."""
-    STAGES = FILES[:4]
 
     def __init__(self, folder: Path | str):
         self.folder = Path(folder)
@@ -112,7 +111,7 @@ class Run:
         return self.deployment_used(self.config)
 
     def deployment_used(self, config: Mapping[str, Any]) -> DeploymentFolder:
-        """Return the same for a config that was read already."""
+        """Return the preferred deployment, given the run's config as it was read already."""
         made = [DeploymentFolder(path.parent) for path in self.deployments.glob("*/latency.json")]
         own = [one for one in made if one.done and used_as_configured(one.settings, config)]
         best = max(own, key=lambda one: (one.current, one.prefers_int8, one.made), default=None)
@@ -198,7 +197,7 @@ class Run:
         attempts = self.manifest.get("attempts", [])
         if self.failure and attempts:
             self.write_manifest({"forgiven": len(attempts)})
-        fences.check(self.folder)
+        fences.check_owner(self.folder)
         (self.folder / "FAILED").unlink(missing_ok=True)
 
     def begin(
@@ -352,7 +351,7 @@ class Run:
         """Remove the run's own files, the marker first, and nothing else."""
         if not self.folder.exists():
             return
-        fences.check(self.folder)
+        fences.check_owner(self.folder)
         self.marker.unlink(missing_ok=True)
         sync_folder(self.folder)
         self._remove((*self.FILES, self.marker.name))
@@ -362,7 +361,7 @@ class Run:
         self._remove(self.STAGES)
 
     def _remove(self, names: Iterable[str]) -> None:
-        fences.check(self.folder)
+        fences.check_owner(self.folder)
         for name in names:
             temporary = str(Path(name).with_name(f".{Path(name).name}.*.tmp"))
             for path in (*self.folder.glob(name), *self.folder.glob(temporary)):

@@ -217,7 +217,7 @@ def direct(director: Director, fleet: Fleet, board: SearchBoard, path: Path) -> 
     try:
         with board:
             while plan is None or director.going:
-                fences.check(path)
+                fences.check_owner(path)
                 before, plan = plan, director.look(fleet.size)
                 if plan != before:
                     plan.save(path)

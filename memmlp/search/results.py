@@ -131,11 +131,11 @@ def importances(study: Study) -> list[tuple[str, float]]:
 
     Empty with fewer than four complete trials or a single key.
     """
-    return shares(study.study)
+    return study_importances(study.study)
 
 
-def shares(study: optuna.Study) -> list[tuple[str, float]]:
-    """Return the same of a study alone."""
+def study_importances(study: optuna.Study) -> list[tuple[str, float]]:
+    """Return each key's share in the variation of the first objective of an Optuna study, largest first."""
     complete = [t for t in study.get_trials(deepcopy=False) if t.state == TrialState.COMPLETE]
     if len(complete) < 4 or len(complete[0].params) < 2:
         return []

@@ -156,7 +156,7 @@ class FencedJournal(JournalFileBackend):
         """Append lines to the journal. Raises LeaseLost if its folder has another owner by now."""
         lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
         with open(self.path, "ab") as file:
-            fences.check(self.path)  # after opening: `mend` gave a later owner another file
+            fences.check_owner(self.path)  # after opening: `mend` gave a later owner another file
             file.write(lines.encode())
             file.flush()
             os.fsync(file.fileno())
@@ -168,10 +168,10 @@ def storage(search: Search, folder: Path) -> BaseStorage:
     Raises:
         InputError: for a bad URL or a damaged journal.
     """
-    return opened(search.storage, folder)
+    return open_storage(search.storage, folder)
 
 
-def opened(url: str | None, folder: Path) -> BaseStorage:
+def open_storage(url: str | None, folder: Path) -> BaseStorage:
     """Return the storage of a URL, or where that is None the journal in a folder. Raises InputError."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     if url:

@@ -1,45 +1,17 @@
-"""Sweep files: arms (each a label and its overrides of the base), seeds, and the paper's values.
-
-title: Placement of memory blocks in the backbone
-table: 14                          # the number in the paper; left out in sweeps of your own
-base: [experiment=paper]           # overrides that all arms share
-seeds: [0, 1, 2]
-control: 2, 4, 6, 8                # the arm that the others are compared with; the first one by default
-metrics: [MPJRE, MPJPE, MPJVE, Jitter]
-branch: combined                   # whose errors the rows show: rotation (the default), position or combined
-branch_source: its last row is Table 6's after inverse kinematics    # how we know the paper's branch
-smallest: {MPJPE: 0.1}             # the smallest effect of interest by metric; SMALLEST has the defaults
-arms:
-  2, 4, 6, 8: {overrides: [], paper: {MPJRE: 2.57}}
-  "2": {overrides: ['memory.layers=[2]'], paper: {MPJRE: 2.63}, note: as printed}
-  "4": {overrides: ['memory.layers=[4]'], branch: rotation, against: "2"}     # its own branch and control
-axes: {model.frames: [11, 21], seed: [0, 1, 2]}      # a grid, instead of arms or over each of them
-"""
+"""Sweeps: arms, seeds, and the overrides that each is trained with (memmlp.sweep.parsing reads files)."""
 
 from __future__ import annotations
 
-import difflib
-import itertools
-import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
-import yaml
-
-from memmlp.common.errors import InputError, why_unreadable
-from memmlp.evaluation.units import SMALLEST, UNITS
+from memmlp.common.errors import InputError
+from memmlp.evaluation.units import SMALLEST
 
 MODES = ("stream", "window")
 BRANCHES = ("rotation", "position", "combined")
-KEYS = (
-    "title", "table", "notes", "base", "seeds", "control", "metrics", "branch", "branch_source", "smallest",
-    "arms", "axes",
-)  # fmt: skip
-ARM_KEYS = ("overrides", "branch", "against", "paper", "note")
-BASE = "base"  # the arm of a sweep that has only seeds
 COSTS = ("FLOPs", "MACs", "parameters", "size", "ms", "pose ms", "ratio", "FPS")
 """Metrics that are costs and no errors.
 
@@ -124,7 +96,7 @@ class Sweep:
         Raises:
             InputError: for an unknown branch.
         """
-        name = _branch(branch, "branch")
+        name = parse_branch(branch, "branch")
         arms = tuple(
             arm if arm.fixed or arm.branch == name else replace(arm, branch=name, paper={})
             for arm in self.arms
@@ -156,7 +128,7 @@ class Sweep:
         seeds = [word.partition("=")[2] for word in overrides if word.startswith("seed=")]
         others = tuple(word for word in overrides if not word.startswith("seed="))
         self._check_keys_of_arms(others)
-        chosen = _seeds(seeds[-1].split(","), "seed") if seeds else self.seeds
+        chosen = parse_seeds(seeds[-1].split(","), "seed") if seeds else self.seeds
         return replace(self, extra=(*self.extra, *others), seeds=chosen)
 
     def _check_keys_of_arms(self, overrides: Iterable[str]) -> None:
@@ -192,234 +164,17 @@ def _key(override: str) -> str:
     return override.partition("=")[0].lstrip("+~")
 
 
-class UniqueKeys(yaml.SafeLoader):
-    """Safe YAML that refuses a mapping with a key twice, where plain YAML silently takes the last one."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Return the mapping. Raises ConstructorError for a key that occurs twice."""
-        seen = set()
-        for key, _ in node.value:
-            if key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' twice", key.start_mark)
-            seen.add(key.value)
-        return super().construct_mapping(node, deep)
-
-
-def load_sweep(path: Path, prepare: Callable[[list[str]], None] = lambda base: None) -> Sweep:
-    """Read a sweep file.
-
-    Args:
-        path: the file.
-        prepare: told the base before the rest is checked, which may name metrics of one's own.
-
-    Raises:
-        InputError: naming file and key, where it is wrong.
-    """
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8"), UniqueKeys)
-    except OSError as error:
-        raise InputError(f"{path}: {why_unreadable(error)}; allowed: a readable sweep file") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not YAML: {why_unreadable(error)}") from None
-    try:
-        base = content.get("base") if isinstance(content, Mapping) else None
-        prepare([word for word in base if isinstance(word, str)] if isinstance(base, list) else [])
-        return parse_sweep(path.stem, content)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-
-
-def parse_sweep(name: str, content: Any) -> Sweep:
-    """Return the sweep that a file's content describes. Raises InputError, naming the key."""
-    content = _mapping(content, "the file", KEYS)
-    branch = _branch(content.get("branch", BRANCHES[0]), "branch")
-    arms = [_arm(label, value, branch) for label, value in _labelled(content.get("arms", {})).items()]
-    axes = dict(_mapping(content.get("axes", {}), "axes"))
-    seeds = _seeds(axes.pop("seed", content.get("seeds", [0])), "seeds")
-    if "axes" in content and not arms:
-        arms = [Arm("" if axes else BASE, branch=branch)]  # axes of seeds alone
-    arms = list(_grid(arms, axes)) if axes else arms
-    runnable = [arm.label for arm in arms if arm.overrides is not None]
-    if not runnable:
-        raise InputError("arms: none to run; allowed is at least one arm with overrides, or axes")
-    control = str(content.get("control", runnable[0]))
-    if control not in runnable:
-        raise InputError(f"control: '{control}' is no arm; allowed are {', '.join(runnable)}")
-    _check_controls(arms, runnable)
-    source = content.get("branch_source")
-    return Sweep(
-        name=name,
-        title=_text(content.get("title", name), "title"),
-        table=_table(content.get("table")),
-        notes=tuple(_texts(content.get("notes", []), "notes")),
-        base=tuple(_overrides(content.get("base", []), "base")),
-        seeds=seeds,
-        arms=tuple(arms),
-        control=control,
-        metrics=_metrics(content.get("metrics", ["MPJRE", "MPJPE", "MPJVE", "Jitter"])),
-        branch_source=None if source is None else _text(source, "branch_source"),
-        smallest=SMALLEST | _smallest(content.get("smallest", {})),
-    )
-
-
-def _arm(label: str, value: Any, branch: str) -> Arm:
-    """Return an arm from its mapping, or from a bare list of its overrides; `branch` is the sweep's."""
-    name = f"arms.{label}"
-    if isinstance(value, list):
-        return Arm(label, tuple(_overrides(value, name)), branch)
-    value = _mapping(value or {}, name, ARM_KEYS)
-    overrides = value.get("overrides", [])
-    return Arm(
-        label,
-        None if overrides is None else tuple(_overrides(overrides, f"{name}.overrides")),
-        _branch(value.get("branch", branch), f"{name}.branch"),
-        _paper(value.get("paper", {}), f"{name}.paper"),
-        value.get("note"),
-        str(value["against"]) if value.get("against") is not None else None,
-        "branch" in value,
-    )
-
-
-def _branch(value: Any, name: str) -> str:
+def parse_branch(value: Any, name: str) -> str:
     """Return the name of a branch. Raises InputError, naming the key, for an unknown one."""
     if value not in BRANCHES:
         raise InputError(f"{name}: '{value}'; allowed are {', '.join(BRANCHES)}")
     return value
 
 
-def _check_controls(arms: Sequence[Arm], runnable: Sequence[str]) -> None:
-    """Refuse an arm that is compared with itself, or with an arm that is not run."""
-    for arm in arms:
-        others = [label for label in runnable if label != arm.label]
-        if arm.against is not None and arm.against not in others:
-            raise InputError(
-                f"arms.{arm.label}.against: '{arm.against}' is no other arm; allowed are {', '.join(others)}"
-            )
-
-
-def _grid(arms: Sequence[Arm], axes: Mapping[str, Any]) -> Iterable[Arm]:
-    """Yield every arm with every combination of the axes' values.
-
-    The paper's own arms stay as they are. An arm without a label gets that of its combination. An arm with a
-    control of its own is compared with that control at the same combination.
-    """
-    for key, values in axes.items():
-        if not isinstance(values, list) or not values:
-            raise InputError(f"axes.{key}: allowed is a list of values, not empty")
-    for arm in arms:
-        if arm.overrides is None:
-            yield arm
-            continue
-        for values in itertools.product(*axes.values()):
-            words = [f"{key}={_word(value)}" for key, value in zip(axes, values, strict=True)]
-            label = ", ".join([arm.label, *words] if arm.label else words)
-            control = f"{arm.against}, {', '.join(words)}" if arm.against else None
-            yield replace(arm, label=label, overrides=(*arm.overrides, *words), against=control)
-
-
-def _word(value: Any) -> str:
-    """Return a value as text in an override."""
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list):
-        return f"[{','.join(map(_word, value))}]"
-    return str(value)
-
-
-def _mapping(value: Any, name: str, keys: Sequence[str] = ()) -> Mapping[str, Any]:
-    """Return the value, checked to be a mapping with known keys only."""
-    if not isinstance(value, Mapping):
-        raise InputError(f"{name}: {_kind(value)}; allowed is a mapping")
-    for key in value:
-        if keys and key not in keys:
-            near = difflib.get_close_matches(str(key), keys, n=1)
-            hint = f"did you mean {near[0]}? " if near else ""
-            where = "" if name == "the file" else f"{name}."
-            raise InputError(f"{where}{key}: no such key; {hint}allowed are {', '.join(keys)}")
-    return value
-
-
-def _labelled(value: Any) -> dict[str, Any]:
-    """Return the arms by label; a label that YAML takes for a number becomes text."""
-    arms = {str(label): arm for label, arm in _mapping(value, "arms").items()}
-    if len(arms) < len(value):
-        raise InputError("arms: two have the same label")
-    for label in arms:
-        if not label.isprintable():
-            raise InputError(f"arms: {label!r}; allowed is a label of one line")
-    return arms
-
-
-def _overrides(value: Any, name: str) -> list[str]:
-    """Return a list of Hydra overrides, checked for their form only; composing them shows what they mean."""
-    words = _texts(value, name)
-    for word in words:
-        if not re.match(r"[+~]*[\w./@]+(=|$)", word):
-            raise InputError(f"{name}: '{word}'; allowed is KEY=VALUE or GROUP=OPTION")
-        if re.match(r"[+~]*seed(=|$)", word):
-            raise InputError(f"{name}: '{word}'; the seeds are set by the key seeds")
-    return words
-
-
-def _texts(value: Any, name: str) -> list[str]:
-    if not isinstance(value, list):
-        raise InputError(f"{name}: {_kind(value)}; allowed is a list of words")
-    return [_text(item, name) for item in value]
-
-
-def _text(value: Any, name: str) -> str:
-    if not isinstance(value, str) or not value.strip():
-        raise InputError(f"{name}: {_kind(value)}; allowed is text that is not empty")
-    return value
-
-
-def _table(value: Any) -> int | None:
-    if value is None or (isinstance(value, int) and not isinstance(value, bool) and value > 0):
-        return value
-    raise InputError(f"table: {value!r}; allowed is the number of a table of the paper")
-
-
-def _seeds(value: Any, name: str) -> tuple[int, ...]:
+def parse_seeds(value: Any, name: str) -> tuple[int, ...]:
     """Return the seeds, checked to be whole numbers, each once."""
     items = value if isinstance(value, list) else [value]
     words = [str(item).strip() for item in items]
     if not words or not all(re.fullmatch(r"\d+", word) for word in words) or len(set(words)) < len(words):
         raise InputError(f"{name}: {value}; allowed is a list of whole numbers, each once")
     return tuple(map(int, words))
-
-
-def _metrics(value: Any) -> tuple[str, ...]:
-    """Return the names of the columns, checked to be metrics or costs."""
-    names = _texts(value, "metrics")
-    if not names:
-        raise InputError("metrics: empty; allowed is at least one")
-    for name in names:
-        if name not in UNITS and name not in COSTS:
-            raise InputError(f"metrics: '{name}'; allowed are {', '.join([*UNITS, *COSTS])}")
-    return tuple(names)
-
-
-def _paper(value: Any, name: str) -> dict[str, float]:
-    """Return the paper's values by metric."""
-    values = dict(_mapping(value or {}, name, [*UNITS, *COSTS]))
-    for metric, number in values.items():
-        if not isinstance(number, int | float) or isinstance(number, bool):
-            raise InputError(f"{name}.{metric}: {number!r}; allowed is a number")
-    return values
-
-
-def _smallest(value: Any) -> dict[str, float]:
-    """Return the smallest effects of interest by metric."""
-    values = dict(_mapping(value or {}, "smallest", [*UNITS]))
-    for metric, number in values.items():
-        real = isinstance(number, int | float) and not isinstance(number, bool)
-        if not real or not 0 < number < math.inf:
-            raise InputError(f"smallest.{metric}: {number!r}; allowed is a number above 0")
-    return values
-
-
-def _kind(value: Any) -> str:
-    """Describe a value of the wrong kind for an error message."""
-    return "nothing" if value is None else f"{value!r}"[:60]

@@ -32,7 +32,7 @@ class Cancelled(Exception):
     """Raised when the plan no longer wants the run. Its folder stays as it is, and can be resumed."""
 
 
-def work(path: Path, perform: Perform, wanted: Callable[[], bool] = lambda: True) -> None:
+def work_off(path: Path, perform: Perform, wanted: Callable[[], bool] = lambda: True) -> None:
     """Work on the plan of that file while `wanted` returns true and tasks are left.
 
     The file is read again before each task, for the plan may have changed. An open plan (a search's) may get
@@ -76,13 +76,13 @@ def attempt(plan: Plan, task: RunTask, perform: Perform) -> bool:
         if not mine:
             return False
         try:
-            _bring_to_end(plan, task, run, perform)
+            _attempt_locked(plan, task, run, perform)
         except LeaseLost as lost:
             print(f"memmlp: {lost}", file=sys.stderr, flush=True)
     return True
 
 
-def _bring_to_end(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
+def _attempt_locked(plan: Plan, task: RunTask, run: Run, perform: Perform) -> None:
     """Perform the task, unless somebody else ended it since the plan was looked at."""
     if plan.complete(task) or run.failure:
         return

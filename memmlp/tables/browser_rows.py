@@ -50,7 +50,7 @@ ROW = {
 
 
 @dataclass(frozen=True)
-class Measured:
+class BrowserBench:
     """A file of the bench: the device, the browser, and the rows, each as the page wrote them."""
 
     about: Mapping[str, Any]
@@ -62,7 +62,7 @@ class Measured:
         return f"{self.about['device']}, {self.about['browser']}"
 
 
-def read(path: Path) -> Measured:
+def read(path: Path) -> BrowserBench:
     """Read a file of the bench.
 
     Raises:
@@ -84,7 +84,7 @@ def read(path: Path) -> Measured:
     _check(path, "", found, FILE)
     for index, row in enumerate(rows):
         _check(path, f"rows[{index}].", row, ROW)
-    return Measured(
+    return BrowserBench(
         {key: _shown(found[key]) for key in FILE}, tuple({k: _shown(r[k]) for k in ROW} for r in rows)
     )
 
@@ -105,7 +105,7 @@ def _shown(value: Any) -> Any:
     return one_line(value) if isinstance(value, str) else value
 
 
-def with_rows(table: Table, measured: Measured) -> Table:
+def with_rows(table: Table, measured: BrowserBench) -> Table:
     """Return Table 17 with a browser's rows below its own.
 
     Their differences and ratios are to AvatarPoser as published, in the same browser on the same backend.
@@ -125,12 +125,12 @@ def _kind(row: Mapping[str, Any]) -> tuple[str, str, str]:
     return row["network"], row["graph"], row["precision"]
 
 
-def _label(measured: Measured, row: Mapping[str, Any]) -> str:
+def _label(measured: BrowserBench, row: Mapping[str, Any]) -> str:
     graph = GRAPHS.get(row["graph"], row["graph"])
     return f"{row['network']}, {graph}, {row['precision']}, {row['backend']}: {measured.name}"
 
 
-def _row(table: Table, measured: Measured, row: Mapping[str, Any], base: Mapping[str, Any] | None) -> Row:
+def _row(table: Table, measured: BrowserBench, row: Mapping[str, Any], base: Mapping[str, Any] | None) -> Row:
     costs, others = _costs(row), _costs(base) if base and base is not row else {}
 
     def cell(metric: str) -> Cell:
@@ -159,7 +159,7 @@ def _costs(row: Mapping[str, Any]) -> dict[str, float | None]:
     }
 
 
-def _told(measured: Measured) -> list[str]:
+def _told(measured: BrowserBench) -> list[str]:
     """Say how the rows were measured."""
     about, first = measured.about, measured.rows[0]
     clock = f"a clock of {about['clock_ms']:.2g} ms"

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Find = Callable[[Arm, int], Measured | None]
 
 
-def finished(sweep: Sweep, find: Find) -> dict[str, Runs]:
+def finished_runs(sweep: Sweep, find: Find) -> dict[str, Runs]:
     """Return the finished runs of each runnable arm, by seed."""
     return {
         arm.label: {seed: run for seed in sweep.seeds_of(arm) if (run := find(arm, seed)) is not None}
@@ -40,7 +40,7 @@ def collect(
 
     Args:
         sweep: the sweep; where seeds were spent in rounds, `rounds.spent(sweep)`.
-        runs: the finished runs of every runnable arm, by seed (`finished`).
+        runs: the finished runs of every runnable arm, by seed (`finished_runs`).
         modes: the modes of evaluation to show ("stream", "window").
         command: the command that makes missing runs; `memmlp sweep` with the sweep's name by default.
         state: says in a word how far the unfinished run of an arm and seed is; None for nothing to say.

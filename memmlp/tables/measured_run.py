@@ -105,7 +105,7 @@ class Measured:
         return self.groups.get(clip, clip)
 
     def by_source(self) -> dict[str, Measured]:
-        """Return the same of each source's clips alone, by the source's name; empty where there is one."""
+        """Return the results on each source's clips alone, by its name; empty where there is one source."""
         names = sorted(set(self.sources.values()))
         return {name: self._of([clip for clip in self.clips if self.sources[clip] == name]) for name in names}
 

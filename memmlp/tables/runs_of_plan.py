@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from memmlp.runs.lookup import list_runs
-from memmlp.runs.recipes import outdated
+from memmlp.runs.recipe_numbers import outdated
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan
 from memmlp.sweep.spec import Arm

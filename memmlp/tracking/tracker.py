@@ -40,10 +40,10 @@ class Tracker(Protocol):
 
     @property
     def place(self) -> str:
-        """Where it shows runs: an address or a folder."""
+        """Where the tracker shows runs: an address or a folder."""
 
     def has(self, run_id: str) -> bool:
-        """Return whether it shows a run of that id."""
+        """Return whether the tracker shows a run of that id."""
 
     def begin(self, facts: Facts, points: Sequence[Point]) -> Shown:
         """Show a run: afterwards there is exactly this of it, whatever was there of it before."""

@@ -31,7 +31,7 @@ class Average(ABC):
         """Take in the weights after `steps` steps."""
 
     @abstractmethod
-    def show(self) -> None:
+    def put_in_place(self) -> None:
         """Put the weights that count into the module, for good."""
 
     @abstractmethod
@@ -43,10 +43,10 @@ class Average(ABC):
         """Load what `tensors` returned, from among a checkpoint's tensors."""
 
     @contextlib.contextmanager
-    def shown(self) -> Iterator[None]:
-        """Have the weights that count in the module herein, and then the last step's again, to the bit."""
+    def in_place(self) -> Iterator[None]:
+        """Give the module the weights that count within the context; then the last step's, to the bit."""
         before = {name: one.detach().clone() for name, one in self.parameters.items()}
-        self.show()
+        self.put_in_place()
         try:
             yield
         finally:
@@ -65,7 +65,7 @@ class LastWeights(Average):
     def update(self, steps: int) -> None:
         """Do nothing."""
 
-    def show(self) -> None:
+    def put_in_place(self) -> None:
         """Do nothing: they are in the module."""
 
     def tensors(self) -> dict[str, Tensor]:
@@ -98,7 +98,7 @@ class EMA(Average):
         weights = [one.detach() for one in self.parameters.values()]
         get_ema_multi_avg_fn(decay)(list(self.averages.values()), weights, steps)
 
-    def show(self) -> None:
+    def put_in_place(self) -> None:
         """Put the average into the module."""
         self._put(self.averages)
 
@@ -130,17 +130,17 @@ class ScheduleFreeAverage(Average):
     def update(self, steps: int) -> None:
         """Do nothing: the optimiser's step has."""
 
-    def show(self) -> None:
+    def put_in_place(self) -> None:
         """Put the average into the module."""
         self.optimiser.eval()  # type: ignore[attr-defined]
 
     @contextlib.contextmanager
-    def shown(self) -> Iterator[None]:
-        """Have the average in the module herein, and then the last step's weights again, to the bit.
+    def in_place(self) -> Iterator[None]:
+        """Give the module the average within the context; then the last step's weights, to the bit.
 
         The optimiser can go back to them by itself, but not to the bit.
         """
-        with super().shown():
+        with super().in_place():
             yield
             self.optimiser.train()  # type: ignore[attr-defined]
 

@@ -2,7 +2,7 @@
 
 A step's randomness comes from (seed, step) alone, so a run that was killed and resumed ends in the same
 weights, bit for bit on a CPU, as one that was not. Several processes may train one run together
-(memmlp.common.parallel); the first of them writes.
+(memmlp.common.distributed); the first of them writes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.common.errors import InputError, TrainingDiverged
 from memmlp.common.progress import Count, counting, stage
 from memmlp.motion.dataset import MotionDataset
@@ -97,28 +97,28 @@ def train(
         TrainingDiverged: if the loss is NaN or infinite.
         InputError: if several processes can't train the task as one would.
     """
-    check_shares(task, optim, description)
+    check_divisible(task, optim, description)
     optimiser = optim.build(task.parameter_groups())
     average = optim.average(task.module, optimiser)
     start = resume(task, optimiser, average, run)
-    parallel.align(task.module)
-    with counting(description, optim.steps, start, shown=parallel.first(), unit="steps") as count:
+    distributed.align(task.module)
+    with counting(description, optim.steps, start, shown=distributed.first(), unit="steps") as count:
         for step in range(start, optim.steps):
             seed_step(seed, step)
             result = train_step(task, optim, optimiser, step)
             average.update(step + 1)
-            first = parallel.first()
+            first = distributed.first()
             validation = record(task, optim, average, run, step + 1, result, count) if first else {}
             if (step + 1) % optim.checkpoint_every == 0 or step + 1 == optim.steps:
                 save(task, optimiser, average, run, step + 1)
             if validation:
                 watch(step + 1, validation)
-    average.show()
+    average.put_in_place()
 
 
-def check_shares(task: TrainingTask, optim: Optim, description: str) -> None:
+def check_divisible(task: TrainingTask, optim: Optim, description: str) -> None:
     """Raise InputError if shares of a batch, one for each process, don't add up to what one process does."""
-    count = parallel.size()
+    count = distributed.size()
     if optim.batch % count:
         raise InputError(
             f"{description}: a batch of {optim.batch} (optim.batch, vqvae.batch) on {count} processes: "
@@ -139,13 +139,13 @@ def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimize
         group["lr"] = group["initial_lr"] * optim.factor(step)
     device = task.dataset.frames.device
     mixed = torch.autocast(device.type, torch.bfloat16) if optim.precision == "bf16" else nullcontext()
-    with mixed, parallel.sharing():
+    with mixed, distributed.sharing():
         result = task.step(step)
         seen = of_whole_batch(result)
     check_finite(task, seen, step)
     optimiser.zero_grad(set_to_none=True)
     result.loss.backward()
-    parallel.average_gradients(task.module.parameters())
+    distributed.average_gradients(task.module.parameters())
     if optim.clip_norm:
         torch.nn.utils.clip_grad_norm_(task.module.parameters(), optim.clip_norm)
     optimiser.step()
@@ -154,11 +154,11 @@ def train_step(task: TrainingTask, optim: Optim, optimiser: torch.optim.Optimize
 
 def of_whole_batch(result: StepResult) -> StepResult:
     """Return the loss, terms and clips of the whole batch, of which this process may have a share."""
-    if not parallel.shared():
+    if not distributed.shared():
         return result
     terms = torch.stack([result.loss, *result.terms.values()])
-    loss, *means = parallel.mean(terms.detach())
-    return StepResult(loss, dict(zip(result.terms, means, strict=True)), parallel.whole(result.clips))
+    loss, *means = distributed.mean(terms.detach())
+    return StepResult(loss, dict(zip(result.terms, means, strict=True)), distributed.whole(result.clips))
 
 
 def check_finite(task: TrainingTask, result: StepResult, step: int) -> None:
@@ -199,16 +199,16 @@ def record(
         count.note(f"loss {loss:.3g}")
     count.advance()
     if step % optim.validate_every == 0 or last:
-        values = validated(task, average)
+        values = validate(task, average)
         run.log(step, values, phase="val")
         return values
     return {}
 
 
-def validated(task: TrainingTask, average: Average) -> dict[str, float]:
+def validate(task: TrainingTask, average: Average) -> dict[str, float]:
     """Return the task's validation of the weights that count."""
     task.module.eval()
-    with average.shown(), stage("validation"):
+    with average.in_place(), stage("validation"):
         return task.validate()
 
 
@@ -217,8 +217,8 @@ def save(task: TrainingTask, optimiser: torch.optim.Optimizer, average: Average,
 
     Of several processes the first one writes, and the others go on with its weights.
     """
-    parallel.align(task.module)
-    if not parallel.first():
+    distributed.align(task.module)
+    if not distributed.first():
         return
     rates = [group["initial_lr"] for group in optimiser.param_groups]
     tensors = checkpoint.module_tensors("module", task.module) | checkpoint.optimiser_tensors(optimiser)
@@ -229,8 +229,8 @@ def save(task: TrainingTask, optimiser: torch.optim.Optimizer, average: Average,
 
 def resume(task: TrainingTask, optimiser: torch.optim.Optimizer, average: Average, run: Run) -> int:
     """Load the run's checkpoint, if there is one, and return the number of finished steps."""
-    found = checkpoint.read(run.checkpoint) if parallel.first() and run.checkpoint.exists() else None
-    found = parallel.of_first(found)
+    found = checkpoint.read(run.checkpoint) if distributed.first() and run.checkpoint.exists() else None
+    found = distributed.of_first(found)
     if found is None:
         return 0
     tensors, values = found

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 from torch.profiler import record_function
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.evaluation import modes
 from memmlp.evaluation.metrics import OwnMetrics
 from memmlp.motion.body import SPARSE_DIM
@@ -78,7 +78,7 @@ class NetworkTraining:
         """
         task = self.task(architecture, data, above, device)
         train(task, self.optim, run, self.seed, "network", watch)
-        if parallel.first():
+        if distributed.first():
             checkpoint.write(run.model, checkpoint.module_tensors("model", task.model), {})
         return task.model.eval()
 

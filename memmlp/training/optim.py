@@ -15,7 +15,7 @@ from torch import nn
 
 from memmlp.common.errors import InputError
 from memmlp.training.averaging import EMA, Average, LastWeights, ScheduleFreeAverage
-from memmlp.training.composed import ComposedOptimiser
+from memmlp.training.composed_optimiser import ComposedOptimiser
 
 SCHEDULES: dict[str, Callable[[float, float, float], float]] = {
     # Each maps the progress in [0, 1), final rate / first rate and `drop_at` to the factor on the first rate.

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.networks.memory import State
@@ -37,7 +37,7 @@ class Call(NamedTuple):
 class Rollout(nn.Module):
     """The rollout slot's interface.
 
-    Where several processes share a batch, each draws the call of its own rows (memmlp.common.parallel).
+    Where several processes share a batch, each draws the call of its own rows (memmlp.common.distributed).
     """
 
     def begin(self, model: WindowModel) -> None:
@@ -56,7 +56,7 @@ class TeacherForcing(Rollout):
 
     def draw(self, model: WindowModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """Draw the call of a training step."""
-        clips, end = map(parallel.own, sampler.draw(step))
+        clips, end = map(distributed.own, sampler.draw(step))
         past, stride = model.length, model.stride
         segment = dataset.segments(clips, end, past + stride)
         state = model.true_state(segment[:, :past])
@@ -75,7 +75,7 @@ class OwnPredictions(Rollout):
 
     def draw(self, model: WindowModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """Draw the call of a training step, after the calls that make its history."""
-        clips, end = map(parallel.own, sampler.draw(step))
+        clips, end = map(distributed.own, sampler.draw(step))
         past, stride = model.length, model.stride
         passes = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
         segment = dataset.segments(clips, end, past + stride * (passes + 1))
@@ -130,7 +130,7 @@ class PersistentStreams(Rollout):
         self.clip[who] = torch.where(going, self.clip[who], clips)
         self.end[who] = torch.where(going, self.end[who] + model.stride, end)
         self.lives[who] = True
-        self.who, mine, going = who, parallel.own(who), parallel.own(going)
+        self.who, mine, going = who, distributed.own(who), distributed.own(going)
         past, stride = model.length, model.stride
         segment = dataset.segments(self.clip[mine], self.end[mine], past + stride)
         fresh = model.running_state(segment[:, :past, :SPARSE_DIM])
@@ -143,4 +143,4 @@ class PersistentStreams(Rollout):
     def keep(self, state: State) -> None:
         """Keep the streams' states after the trained call."""
         for name, tensor in state.items():
-            self.get_buffer(f"state_{name}")[self.who] = parallel.whole(tensor.detach())
+            self.get_buffer(f"state_{name}")[self.who] = distributed.whole(tensor.detach())

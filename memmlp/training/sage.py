@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.preparing.source import Prepared
@@ -158,7 +158,7 @@ class PartTraining:
         windows = Windows(self.network, dataset, data.open("val").to(device), net.frames)
         task = PartTask(part.requires_grad_(True), objective(self.kind, halves), windows)
         train(task, self.network.optim, run, self.network.seed, self.kind.replace("_", " "))
-        if parallel.first():
+        if distributed.first():
             checkpoint.write(run.model, before | checkpoint.module_tensors(name, part), {})
         return last_errors(run)
 
@@ -202,7 +202,7 @@ class Windows:
 
     def draw(self, step: int) -> tuple[Tensor, Tensor]:
         """Return the world frames (B, T, 252) of a step's windows, and their clips (B,)."""
-        clips, end = map(parallel.own, self.sampler.draw(step))
+        clips, end = map(distributed.own, self.sampler.draw(step))
         return self.dataset.segments(clips, end, self.frames), clips
 
 

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.networks.baselines.sage import HIDDEN, HalfVQVAE
 from memmlp.networks.baselines.sage_net import SAGENet
@@ -53,7 +53,7 @@ def code_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) 
     """
     rotation, encoded = seen(net, frames)
     sixd = rotation.unflatten(-1, (N_JOINTS, 6))
-    hidden = parallel.drawn(torch.rand_like, sixd[:, 0, :, 0]) < HIDDEN_SHARE
+    hidden = distributed.drawn(torch.rand_like, sixd[:, 0, :, 0]) < HIDDEN_SHARE
     hidden[:, codes.joints[0]] = False
     shown = sixd.masked_fill(hidden[:, None, :, None], HIDDEN) if training else sixd
     latent, codebook = codes.encode(shown.flatten(-2), encoded)
@@ -135,7 +135,7 @@ def latents(codes: HalfVQVAE, rotation: Tensor, encoded: Tensor) -> Tensor:
 
 def noised(net: SAGENet, clean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return noisy latents (B, T // 2, 384) of times (B,) drawn for each, and hidden joints (B, 22)."""
-    time = parallel.drawn(net.diffusion.random_times, clean)
-    noisy = net.diffusion.noised(clean, time, parallel.drawn(torch.randn_like, clean))
-    drawn = parallel.drawn(lambda like: torch.rand_like(like[:, 0, :HIDDEN_COUNT]), clean) * N_JOINTS
+    time = distributed.drawn(net.diffusion.random_times, clean)
+    noisy = net.diffusion.noised(clean, time, distributed.drawn(torch.randn_like, clean))
+    drawn = distributed.drawn(lambda like: torch.rand_like(like[:, 0, :HIDDEN_COUNT]), clean) * N_JOINTS
     return noisy, time, F.one_hot(drawn.long(), N_JOINTS).sum(1) > 0

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from memmlp.training.loop import TrainingTask, seed_step, train_step, validated
+from memmlp.training.loop import TrainingTask, seed_step, train_step, validate
 from memmlp.training.optim import Optim
 
 
@@ -59,7 +59,7 @@ class Learner:
     def advance(self, steps: int) -> None:
         """Take so many steps, no more than are left, and validate."""
         self.take(steps)
-        error = validated(self.task, self.average)[self.error]
+        error = validate(self.task, self.average)[self.error]
         self.validations.append(Validation(self.steps, self.seconds, error))
 
 

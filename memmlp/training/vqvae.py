@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.preparing.source import Prepared
@@ -60,7 +60,7 @@ class VQVAETraining:
         optim = self.optim(len(dataset.frames))
         task = VQVAETask(model, normalizer, dataset, validation, optim, self.seed)
         train(task, optim, run, self.seed, "VQ-VAE")
-        if parallel.first():
+        if distributed.first():
             checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
         return task.validate()
 
@@ -90,10 +90,10 @@ class VQVAETask:
 
     def step(self, step: int) -> StepResult:
         """Compute the loss on a batch of single frames."""
-        clips, end = map(parallel.own, self.sampler.draw(step))
+        clips, end = map(distributed.own, self.sampler.draw(step))
         frames = self.normalizer.encode(self.dataset.segments(clips, end, 1))[:, 0]
         terms, indices = self.model.loss_terms(frames, self.normalizer)
-        self.used = torch.bincount(parallel.whole(indices), minlength=len(self.used)).float()
+        self.used = torch.bincount(distributed.whole(indices), minlength=len(self.used)).float()
         return StepResult(torch.stack(list(terms.values())).sum(), terms, clips)
 
     def report(self) -> dict[str, float]:

@@ -11,8 +11,8 @@ from memmlp.runs.identity import ID
 from memmlp.ui import runs
 from memmlp.ui.curves import Curves
 from memmlp.ui.index import Index
-from memmlp.ui.places import places
 from memmlp.ui.replay import Predict, Replays, body
+from memmlp.ui.run_places import places
 from memmlp.ui.runs import Rows
 from memmlp.ui.searches import Searches
 from memmlp.ui.sweeps import Sweeps

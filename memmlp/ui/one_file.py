@@ -22,14 +22,14 @@ CURVES = ("train loss", "val rotation ", "val position MPJPE", "val loss")
 """The beginnings of the names of the curves that are kept."""
 
 
-class Shown(NamedTuple):
+class ReportedSweep(NamedTuple):
     """A sweep in the file: the name of its folder below outputs/sweeps, and its table."""
 
     name: str
     table: Table
 
 
-def written(answers: Answers, sweeps: Iterable[Shown], extra: str, replays: bool = True) -> str:
+def page_text(answers: Answers, sweeps: Iterable[ReportedSweep], extra: str, replays: bool = True) -> str:
     """Return the page as one file.
 
     Args:

@@ -75,8 +75,14 @@ def one_file(answers: Mapping[str, Any], extra: str = "") -> str:
         ),
     }  # fmt: skip
     for old, new in parts.items():
-        page, count = re.subn(old, lambda _, new=new: new, page, flags=re.DOTALL)  # type: ignore[misc]
-        assert count == 1, old
+        page = _put(page, old, new)
+    return page
+
+
+def _put(page: str, old: str, new: str) -> str:
+    """Return a page with a text in place of the one thing that the pattern fits."""
+    page, count = re.subn(old, lambda _: new, page, flags=re.DOTALL)
+    assert count == 1, old
     return page
 
 

@@ -96,7 +96,7 @@ class Replays:
         }
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_suffix(".tmp.npz")
-        np.savez(temporary, allow_pickle=False, **made)  # type: ignore[arg-type]
+        np.savez(temporary, allow_pickle=False, truth=made["truth"], joints=made["joints"])
         temporary.replace(path)
         return made
 

@@ -121,7 +121,7 @@ def differing(runs: Any) -> list[str]:
 
 
 def minor(keys: Sequence[str]) -> list[str]:
-    """Return those keys that change no result, and the profile's, which others take over."""
+    """Return the keys that change no result, and `profile`, whose choices other keys repeat."""
     groups = [name for name in NEUTRAL if name != "data"]
     return [key for key in keys if any(key == name or key.startswith(f"{name}.") for name in groups)]
 
@@ -141,7 +141,7 @@ def sets(runs: Iterable[Mapping[str, Any]]) -> dict[str, str]:
 
 
 def shared(runs: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return the names that runs of different data share, so that the name alone tells them not apart."""
+    """Return names that several data sets share, so that a digest must be added."""
     found: dict[str, set[str]] = {}
     for run in runs:
         found.setdefault(run["name"], set()).add(run["data"])

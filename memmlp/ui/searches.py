@@ -96,15 +96,15 @@ def _page(folder: Path) -> dict[str, Any]:
 def _study(folder: Path, url: str | None) -> optuna.Study:
     import optuna
 
-    from memmlp.search.study import opened
+    from memmlp.search.study import open_storage
 
-    return optuna.load_study(storage=opened(url, folder), study_name=folder.name)
+    return optuna.load_study(storage=open_storage(url, folder), study_name=folder.name)
 
 
 def _of_study(study: optuna.Study) -> dict[str, Any]:
     from optuna.trial import TrialState
 
-    from memmlp.search.results import shares
+    from memmlp.search.results import study_importances
 
     trials = [trial for trial in study.get_trials(deepcopy=False) if trial.state != TrialState.WAITING]
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
@@ -125,7 +125,7 @@ def _of_study(study: optuna.Study) -> dict[str, Any]:
         "front": front,
         "best": [_trial(trial) for trial in complete if trial.number in front][:1],
         "trials": [_trial(trial) for trial in trials],
-        "importance": [[key, round(share, 4)] for key, share in shares(study)],
+        "importance": [[key, round(share, 4)] for key, share in study_importances(study)],
     }
 
 

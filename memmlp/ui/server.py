@@ -15,9 +15,9 @@ from collections.abc import Callable, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from memmlp.common.access import LOCAL, Access
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain
+from memmlp.common.page_access import LOCAL, Access
 from memmlp.runs.identity import ID
 from memmlp.ui import pages
 from memmlp.ui.answers import Answers

@@ -19,10 +19,11 @@ from memmlp.runs.identity import NETWORK, training_settings
 from memmlp.runs.run import STAGE_WORDS
 from memmlp.statistics import Verdict
 from memmlp.sweep.board import name as task_name
-from memmlp.sweep.kept import kept
+from memmlp.sweep.kept_sweep import kept
+from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
-from memmlp.sweep.spec import Arm, Sweep, parse_sweep
-from memmlp.tables.build_table import collect, finished
+from memmlp.sweep.spec import Arm, Sweep
+from memmlp.tables.build_table import collect, finished_runs
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import Measured, load
 from memmlp.tables.rounds import Rounds, standings, subject
@@ -101,7 +102,7 @@ class Sweeps:
         if plan is None:
             raise KeyError(name)
         states = self.states(plan)
-        sweep = self._kept(name) or of_plan(plan)
+        sweep = self._kept(name) or sweep_of_plan(plan)
         metric = next((metric for metric in sweep.metrics if metric in UNITS), "MPJPE")
         shown = {arm.label: f"stream.{arm.branch}.{metric}" for arm in sweep.arms}
         cells = [self._cell(plan, entry, states, shown.get(entry.label, "")) for entry in plan.entries]
@@ -194,7 +195,7 @@ class Sweeps:
         flags: list[str] = []
         sweep = self._kept(plan.name)
         if sweep is None:
-            sweep, flags = of_plan(plan), [NOT_KEPT]
+            sweep, flags = sweep_of_plan(plan), [NOT_KEPT]
         rounds, doubts = rounds_of(sweep, plan, self._rounds_path(plan)) if not flags else (None, [])
         sweep = rounds.spent(sweep) if rounds else sweep
         flags += doubts
@@ -210,7 +211,7 @@ class Sweeps:
                 flags.append(str(error))
                 return None
 
-        made = collect(sweep, finished(sweep, find), rounds=rounds)
+        made = collect(sweep, finished_runs(sweep, find), rounds=rounds)
         table = table_words(replace(made, flags=(*made.flags, *flags)))
         return Made(table, rounds_words(rounds, sweep) if rounds else None)
 
@@ -277,7 +278,7 @@ def caption_of(sweep: Sweep) -> str:
     return f"Table {sweep.table}: {sweep.title}" if sweep.table else sweep.title
 
 
-def of_plan(plan: Plan) -> Sweep:
+def sweep_of_plan(plan: Plan) -> Sweep:
     """Return a sweep with a plan's arms and seeds; its first arm is the control."""
     seeds = list(dict.fromkeys(entry.seed for entry in plan.entries)) or [0]
     arms: dict[str, list[str]] = {

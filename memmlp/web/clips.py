@@ -55,7 +55,7 @@ def packed(name: str, frames: np.ndarray, seconds: float) -> SiteClip:
     return SiteClip(hashlib.sha256(content).hexdigest()[:12], name, content)
 
 
-def written(clips: Iterable[SiteClip], folder: Path) -> list[dict[str, Any]]:
+def write_clips(clips: Iterable[SiteClip], folder: Path) -> list[dict[str, Any]]:
     """Write clips into a site's folder, and return what the page has to know of them."""
     entries = []
     for clip in clips:

@@ -24,7 +24,7 @@ from memmlp.live.player.play import TOP
 from memmlp.motion.body import JOINTS
 from memmlp.motion.limbs import LIMBS
 from memmlp.render.error_colours import HEAT
-from memmlp.web.clips import SiteClip, written
+from memmlp.web.clips import SiteClip, write_clips
 from memmlp.web.networks import SiteNetwork, Writer
 from memmlp.web.packages import write_packages
 
@@ -80,7 +80,7 @@ class Site:
             "packages": versions,
             "backends": ["wasm", "webgpu"] if self.webgpu else ["wasm"],
             "networks": [writer.write(network) for network in self.networks],
-            "clips": written(self.clips, folder),
+            "clips": write_clips(self.clips, folder),
             "limbs": [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS],
             "joints": JOINTS,
             "heat": HEAT,

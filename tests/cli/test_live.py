@@ -16,7 +16,7 @@ from conftest import Memmlp, one_line
 from glb import Glb
 from processes import PATIENCE, hearing_interrupts, started
 
-from memmlp.cli.live import Room, known_of
+from memmlp.cli.live import ShowOptions, known_of
 from memmlp.live.calibration import Calibration, save_calibration
 from memmlp.live.stream import Offsets, Stream
 from memmlp.motion.formats.npz import read_clip, write_clip
@@ -106,7 +106,7 @@ def test_a_calibration_of_another_height_is_told(
     stream = Stream(step)
     worn = Offsets(np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)))
     save_calibration(tmp_path / "me.json", Calibration("amass", 1.72, worn, 1.80, 0.02))
-    room = Room(None, None, tmp_path / "me.json", (), (), (), None, 0, "127.0.0.1", None, True)
+    room = ShowOptions(None, None, tmp_path / "me.json", (), (), (), None, 0, "127.0.0.1", None, True)
     known = known_of(room, "amass", stream)
     assert (known.height, known.floor, capsys.readouterr().err) == (1.80, 0.02, "")
     known = known_of(room._replace(height=186.0, floor=5.0), "amass", stream)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from command_line import run, run_apart
+from command_line import run
 
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.npz import write_clip
@@ -31,8 +31,9 @@ def home(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:unclosed file .*DEBUG:ResourceWarning")  # submitit leaves its logs open
 def test_every_command_knows_where_a_clip_is_from(home):
-    assert "none" in run_apart(home, "sweep", "both.yaml", *TINY, "--workers", "1")
+    assert "none" in run(home, "sweep", "both.yaml", *TINY, "executor=debug")
     (made,) = list_runs(home / "outputs")
     (cache,) = (home / "outputs" / "cache").glob("*/manifest.json")
     said = run(home, "data", "inspect", str(cache.parent))

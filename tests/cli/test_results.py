@@ -23,7 +23,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, () if sweep.name == "table10" else tuple(found), ())
 
-    monkeypatch.setattr("memmlp.config.plan_sweep.planned", plan)
+    monkeypatch.setattr("memmlp.config.plan_sweep.make_plan", plan)
 
 
 def test_kept_results_become_pages(memmlp: Memmlp, planned: None):

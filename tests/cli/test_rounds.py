@@ -64,8 +64,8 @@ def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Runs:
     monkeypatch.chdir(tmp_path)
     write(ARMS)
     found = Runs(tmp_path / "outputs")
-    monkeypatch.setattr("memmlp.config.plan_sweep.planned", found.planned)
-    monkeypatch.setattr("memmlp.cli.sweep.bring_to_end", found.work)
+    monkeypatch.setattr("memmlp.config.plan_sweep.make_plan", found.planned)
+    monkeypatch.setattr("memmlp.cli.sweep.run_workers", found.work)
     monkeypatch.setattr("memmlp.cli.track.show_in_trackers", lambda *_: None)
     return found
 

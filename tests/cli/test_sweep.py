@@ -21,9 +21,9 @@ from processes import PATIENCE, ignoring_interrupts, started, until
 from memmlp.cli.workers import split_executor
 from memmlp.common.errors import InputError
 from memmlp.config.perform_task import perform
-from memmlp.config.plan_sweep import find_sweep, orphans, planned
+from memmlp.config.plan_sweep import find_sweep, make_plan, orphans
 from memmlp.runs.lookup import list_runs
-from memmlp.runs.recipes import RECIPES
+from memmlp.runs.recipe_numbers import RECIPES
 from memmlp.runs.run import Run
 from memmlp.sweep.board import name
 
@@ -106,7 +106,7 @@ def test_an_edited_file_adds_arms_and_lists_orphans(home: Path):
 
 def test_seeds_come_one_after_another_each_with_all_arms(home: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(home)
-    plan = planned(
+    plan = make_plan(
         find_sweep("trial.yaml").with_overrides([*TINY, "seed=1,0"]), (home / "outputs").absolute()
     )
     cells = [(entry.seed, entry.label) for entry in plan.entries]
@@ -142,10 +142,11 @@ def test_the_first_failure_ends_the_sweep_where_that_is_wanted(tmp_path: Path):
     assert len(list_runs(tmp_path / "outputs")) == len(runs)
 
 
+@pytest.mark.filterwarnings("ignore:unclosed file .*DEBUG:ResourceWarning")  # submitit leaves its logs open
 def test_retry_takes_failed_runs_up_again(home: Path):
     failed = next(run for run in list_runs(home / "outputs") if run.failure)
     attempts = len(failed.manifest["attempts"])
-    assert "3 of 4 runs done" in run_apart(home, "sweep", "trial.yaml", *TINY, "--retry", code=1)
+    assert "3 of 4 runs done" in command(home, "--retry", "executor=debug", code=1)
     assert len(Run(failed.folder).manifest["attempts"]) == attempts + 1
     assert failed.failure is not None
 
@@ -157,7 +158,7 @@ def test_again_does_networks_again_and_force_is_refused(
     copy = Path(shutil.copytree(home, tmp_path / "copy"))
     left = []
     monkeypatch.setattr(
-        "memmlp.cli.sweep.bring_to_end", lambda chosen, plan, **options: left.extend(plan.left())
+        "memmlp.cli.sweep.run_workers", lambda chosen, plan, **options: left.extend(plan.left())
     )
     command(copy, "--again")
     assert sorted(task.kind for task in left) == ["memmlp", "memmlp", "memmlp"]
@@ -177,12 +178,12 @@ def test_a_plan_is_kept_until_the_data_changes(home: Path, monkeypatch: pytest.M
     outputs = (home / "outputs").absolute()
     kept = json.loads(next(outputs.glob("sweeps/trial-*/planned.json")).read_text())
     assert kept["stamp"]
-    first = planned(chosen, outputs)
+    first = make_plan(chosen, outputs)
     clip = next((home / "outputs" / "data").rglob("*.npz"))
     os.utime(clip)
-    assert planned(chosen, outputs).entries == ()
-    assert [task.id for task in planned(chosen, outputs, prepare=True).tasks] == [t.id for t in first.tasks]
-    assert orphans(chosen, planned(chosen, outputs)) == []
+    assert make_plan(chosen, outputs).entries == ()
+    assert [task.id for task in make_plan(chosen, outputs, prepare=True).tasks] == [t.id for t in first.tasks]
+    assert orphans(chosen, make_plan(chosen, outputs)) == []
 
 
 def test_a_look_at_a_sweep_that_was_never_started_leaves_nothing(home: Path):
@@ -264,7 +265,7 @@ def test_shipped_sweeps_are_found_by_name_and_number(name: str):
 
 def test_a_worker_of_other_code_or_data_leaves_the_run_alone(home: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(home)
-    plan = planned(find_sweep("trial.yaml").with_overrides(TINY), (home / "outputs").absolute())
+    plan = make_plan(find_sweep("trial.yaml").with_overrides(TINY), (home / "outputs").absolute())
     other = replace(next(task for task in plan.tasks if task.kind == "memmlp"), id="0" * 16)
     with pytest.raises(InputError, match="the data or the code changed since the sweep began"):
         perform(home / "plan.json", 1, plan, other)

@@ -14,7 +14,7 @@ from command_line import run_apart
 from filelock import FileLock
 
 from memmlp.cli.bench.chaos import examine
-from memmlp.cli.tune import prepared
+from memmlp.cli.tune import prepare_search
 from memmlp.runs.run import Run
 from memmlp.search.spec import Range
 
@@ -130,7 +130,7 @@ def test_a_search_is_named_after_what_its_trials_follow_from(tmp_path: Path, mon
     monkeypatch.setattr(Range, "corners", lambda self: ())  # which are checked above, and name nothing
 
     def folder(*words: str) -> str:
-        return prepared([*TINY, *words], None, tmp_path).folder.name
+        return prepare_search([*TINY, *words], None, tmp_path).folder.name
 
     base = folder()
     assert folder("search.n_trials=99", "optim.checkpoint_every=7", "search.seeds=1") == base
@@ -148,7 +148,7 @@ def test_a_folder_of_ones_own_searches(tmp_path: Path):
     space = "space: {loss: null, optim: {lr: {low: 1.0e-4, high: 0.1}}}"
     text = f"defaults: [loss_weights, _self_]\nname: rates\nbase: []\n{space}\n"
     (tmp_path / "own/search/rates.yaml").write_text(text)
-    setup = prepared([*TINY, "search=rates"], tmp_path / "own", tmp_path)
+    setup = prepare_search([*TINY, "search=rates"], tmp_path / "own", tmp_path)
     assert [one.key for one in setup.search.space] == ["optim.lr"]
     assert setup.folder.name.startswith("rates-")
 

@@ -99,6 +99,6 @@ def test_workers_know_whether_they_are_to_have_a_gpu(
     path, fleet = hire(tmp_path, Plan("s", tmp_path, (), ()), Workers(engine, count=1), wanted)
     assert fleet.work.args[-1] is gpu
     monkeypatch.setattr(devices, "missing_gpu", lambda: "none is there")
-    monkeypatch.setattr(perform_task, "work_on", lambda *_: None)
+    monkeypatch.setattr(perform_task, "work_off", lambda *_: None)
     assert fleet.work() == ("none is there" if gpu else None)
     assert path.exists()

@@ -11,7 +11,7 @@ import pytest
 from begun_runs import complete
 
 from memmlp.common.errors import LeaseLost
-from memmlp.common.fences import fenced, publish, sweep, temporary
+from memmlp.common.fences import fenced, publish, remove_unfinished, temporary
 from memmlp.common.files import atomic_write, write_json
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.run import Run
@@ -79,9 +79,9 @@ def test_only_what_earlier_owners_left_unfinished_is_removed(tmp_path: Path):
     others = [temporary(folder / "notes"), folder / ".mine.tmp", folder / ".lease-3"]
     for path in (*of_three, *others):
         path.touch()
-    sweep(folder, 3)
+    remove_unfinished(folder, 3)
     assert all(path.exists() for path in (*of_three, *others))
-    sweep(folder, 4)
+    remove_unfinished(folder, 4)
     assert not any(path.exists() for path in of_three)
     assert all(path.exists() for path in others)
 

@@ -146,7 +146,7 @@ def test_the_naive_graph_by_switch(tmp_path):
 
 
 def test_a_deployment_in_fp16_and_an_older_opset(tmp_path):
-    place, model = DeploymentFolder(tmp_path), exported.NETWORKS["mem_mlp"]()
+    place, model = DeploymentFolder(tmp_path), exported.NETWORKS["no_memory"]()
     deployment = build_experiment(composed(["export.precision=fp16", "export.opset=15"])).deployment
     assert (deployment.precision, deployment.opset) == ("fp16", 15)
     record = deployment.deploy(model, place, "0" * 16, CLIPS, CLIPS)

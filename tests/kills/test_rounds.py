@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from pathlib import Path
 
 import pytest
 import yaml
-from command_line import MAIN, TINY, run
-from processes import started, until
+from command_line import TINY, in_folder, run
+from processes import forked, until
 
 from memmlp.runs.lookup import list_runs
 
@@ -30,8 +29,7 @@ def test_rounds_go_on_after_a_kill(tmp_path: Path, no_picture: None):
     hardly = ["memory=none", "optim.weight_decay=1.001e-4"]
     content = {"metrics": ["MPJPE"], "arms": {"one": ["memory=none"], "other": hardly}}
     (tmp_path / "trial.yaml").write_text(yaml.safe_dump(content))
-    line = [*MAIN, *WORDS, "--until-decided"]
-    with started(line, cwd=tmp_path, stderr=subprocess.DEVNULL) as killed:
+    with forked(in_folder, tmp_path, *WORDS, "--until-decided") as killed:
         until(
             lambda: any(one.done for one in list_runs(tmp_path / "outputs")), "the first run is done", killed
         )

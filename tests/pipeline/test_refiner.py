@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment, config_of
 from memmlp.config.compose import composed
 from memmlp.config.perform_task import check_identity
 from memmlp.config.plan_sweep import tasks_of
 from memmlp.networks.refiner import Refined
-from memmlp.pipeline.together import run_together
+from memmlp.pipeline.distributed import run_distributed
 from memmlp.runs.lookup import list_runs
 
 SHORT = [
@@ -78,6 +78,6 @@ def test_a_sweep_trains_what_is_upstream_first():
 
 
 def test_several_processes_are_refused(monkeypatch):
-    monkeypatch.setattr(parallel, "size", lambda: 2)
+    monkeypatch.setattr(distributed, "size", lambda: 2)
     with pytest.raises(InputError, match="refiner: several processes"):
-        run_together(experiment("refiner=sage"))
+        run_distributed(experiment("refiner=sage"))

@@ -24,9 +24,9 @@ from memmlp.config.packaged import packaged
 from memmlp.live.stream import Stream
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline import run_stages
-from memmlp.pipeline.run_stages import shown, upstream_run
+from memmlp.pipeline.run_stages import recording_outcome, upstream_run
 from memmlp.runs.lookup import list_runs
-from memmlp.runs.recipes import RECIPES
+from memmlp.runs.recipe_numbers import RECIPES
 from memmlp.runs.run import Run
 from memmlp.sweep.worker import Cancelled
 from memmlp.tables.measured_run import load
@@ -247,7 +247,7 @@ def test_a_failure_of_the_work_is_kept_with_the_run_and_an_interruption_is_not(
     run = Run.of(tmp_path, "0" * 16)
     run.begin("memmlp", {}, data="d", upstream=None)
     experiment: Any = SimpleNamespace(tracking=Tracking((), tmp_path), stages=(), outputs=tmp_path)
-    with pytest.raises(type(error)), shown(experiment, run):
+    with pytest.raises(type(error)), recording_outcome(experiment, run):
         raise error
     assert (run.failure is None) == (failure is None)
     assert (failure or "") in (run.failure or "")

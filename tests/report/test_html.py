@@ -17,8 +17,9 @@ from processes import finished
 from memmlp.common.errors import InputError
 from memmlp.report import figures
 from memmlp.report.html import Chapter, page, published
+from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.plan import Entry, Plan
-from memmlp.sweep.spec import Sweep, load_sweep
+from memmlp.sweep.spec import Sweep
 from memmlp.tables.build_table import without_runs
 from memmlp.tables.distributions import distributions
 from memmlp.tables.table_text import caption
@@ -234,7 +235,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         found = [Entry(arm.label, seed, find(arm, seed).id) for arm, seed in entries]  # type: ignore[union-attr]
         return Plan(sweep.name, tmp_path / sweep.name, tuple(found), ())
 
-    monkeypatch.setattr("memmlp.config.plan_sweep.planned", plan)
+    monkeypatch.setattr("memmlp.config.plan_sweep.make_plan", plan)
 
 
 @pytest.mark.slow

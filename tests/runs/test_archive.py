@@ -12,6 +12,7 @@ import pytest
 from memmlp.common.errors import InputError
 from memmlp.common.files import file_digest
 from memmlp.runs.archive import INDEX, export_run, import_run
+from memmlp.runs.deployment_folder import ONNX_FILES
 from memmlp.runs.notes import add_tags, read_notes
 from memmlp.runs.run import Run
 
@@ -83,6 +84,17 @@ def test_it_arrives_as_it_was_without_checkpoint_and_strange_files(run: Run, arc
         or not import_run(archive, tmp_path / "there")[1]
     )
     assert [path.name for path in there.folder.parent.iterdir()] == [NAME]
+
+
+def test_deployments_of_every_precision_arrive(run: Run, tmp_path: Path):
+    for precision in ONNX_FILES:
+        made = run.deployment(f"{precision}-0")
+        made.folder.mkdir(exist_ok=True)
+        made.file(precision).write_bytes(precision.encode())
+        made.finish({"settings": {}})
+    export_run(run, tmp_path / "run.zip")
+    there, _ = import_run(tmp_path / "run.zip", tmp_path / "there")
+    assert all(there.deployment(f"{precision}-0").done for precision in ONNX_FILES)
 
 
 def test_only_a_finished_and_unchanged_run_leaves(run: Run, tmp_path: Path):

@@ -11,9 +11,10 @@ import pytest
 from begun_runs import CONFIG, begun, complete
 from processes import finished
 
-import memmlp.runs.recipes
+import memmlp.runs.recipe_numbers
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
+from memmlp.runs.deployment_folder import ONNX_FILES
 from memmlp.runs.evaluation_file import intact, write_report
 from memmlp.runs.identity import (
     deployment_id,
@@ -93,13 +94,13 @@ def test_todays_recipes_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         place.finish({"settings": deployment_settings(config), "int8": {"default": True}})
 
     with monkeypatch.context() as today:
-        today.setitem(memmlp.runs.recipes.RECIPES, "metrics", 2)
-        today.setitem(memmlp.runs.recipes.RECIPES, "graph.naive", 2)
+        today.setitem(memmlp.runs.recipe_numbers.RECIPES, "metrics", 2)
+        today.setitem(memmlp.runs.recipe_numbers.RECIPES, "graph.naive", 2)
         make(fp32, 2.0, b"new")
     make(config, 1.0, b"old")
     assert run.results["stream"]["rotation"]["MPJPE"] == 1.0
-    monkeypatch.setitem(memmlp.runs.recipes.RECIPES, "metrics", 2)
-    monkeypatch.setitem(memmlp.runs.recipes.RECIPES, "graph.naive", 2)
+    monkeypatch.setitem(memmlp.runs.recipe_numbers.RECIPES, "metrics", 2)
+    monkeypatch.setitem(memmlp.runs.recipe_numbers.RECIPES, "graph.naive", 2)
     assert run.results["stream"]["rotation"]["MPJPE"] == 2.0
     assert load(run.folder).means["stream"]["rotation"]["MPJPE"] == 2.0
     assert run.preferred_onnx.read_bytes() == b"new"
@@ -145,6 +146,16 @@ def test_reset_removes_the_runs_files_and_no_others(tmp_path: Path):
     run.reset()
     assert [path.name for path in run.folder.iterdir()] == ["notes.txt"]
     assert not run.done
+
+
+def test_cleared_stages_leave_no_file_of_any_precision(tmp_path: Path):
+    """A file that stays would keep its folder, and seem to be of the next weights."""
+    run = complete(tmp_path)
+    for precision in ONNX_FILES:
+        run.deployment("int8-0").file(precision).touch()
+    run.clear_stages()
+    assert not run.deployments.exists()
+    assert not run.evaluations.exists()
 
 
 def test_a_reset_that_is_cut_short_leaves_no_results_of_what_is_gone(tmp_path: Path, monkeypatch):

@@ -25,7 +25,7 @@ from memmlp.config.perform_task import check_wanted
 from memmlp.runs.run import Run
 from memmlp.sweep import worker
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
-from memmlp.sweep.worker import Cancelled, Presence, attempt, directed, work
+from memmlp.sweep.worker import Cancelled, Presence, attempt, directed, work_off
 
 CODES = RunTask("c" * 16, "vqvae", {})
 ONE, TWO, ALONE = (
@@ -61,10 +61,10 @@ def test_upstream_runs_come_first_and_each_task_once(tmp_path: Path):
         seen.append(task.id)
         finish(plan, task)
 
-    work(saved(tmp_path, ONE, TWO, CODES, ALONE, ONE), perform)
+    work_off(saved(tmp_path, ONE, TWO, CODES, ALONE, ONE), perform)
     assert sorted(seen) == sorted([ONE.id, TWO.id, CODES.id, ALONE.id])
     assert seen[0] == CODES.id
-    work(saved(tmp_path, ONE, TWO, CODES, ALONE), perform)
+    work_off(saved(tmp_path, ONE, TWO, CODES, ALONE), perform)
     assert len(seen) == 4
 
 
@@ -86,7 +86,7 @@ def test_a_plan_that_ends_with_its_first_failure(tmp_path: Path):
 
     path = saved(tmp_path, CODES, ONE, TWO, ALONE, fail_fast=True)
     assert len(Plan.load(path).left()) == 4
-    work(path, perform)
+    work_off(path, perform)
     assert begun == [CODES.id, ONE.id]
     assert Plan.load(path).stopped
     assert Plan.load(path).left() == []
@@ -110,7 +110,7 @@ def test_a_failure_is_left_with_its_run_and_the_others_go_on(tmp_path: Path):
         finish(plan, task)
 
     path = saved(tmp_path, CODES, ONE, TWO, ALONE)
-    work(path, perform)
+    work_off(path, perform)
     now = Plan.load(path)
     assert now.states() == {CODES.id: "done", ONE.id: "failed", TWO.id: "failed", ALONE.id: "failed"}
     assert now.run_of(ONE).failure == "a bad key"
@@ -118,7 +118,7 @@ def test_a_failure_is_left_with_its_run_and_the_others_go_on(tmp_path: Path):
     assert now.left() == []
     del errors[ONE.id]
     now.run_of(ONE).retry()
-    work(path, perform)
+    work_off(path, perform)
     assert now.states()[ONE.id] == "done"
 
 
@@ -127,7 +127,7 @@ def test_what_needs_a_failed_run_is_blocked(tmp_path: Path):
         raise InputError("no")
 
     path = saved(tmp_path, CODES, ONE, ALONE)
-    work(path, perform)
+    work_off(path, perform)
     assert Plan.load(path).states() == {CODES.id: "failed", ONE.id: "blocked", ALONE.id: "failed"}
     further = RunTask("f" * 16, "memmlp", {}, ONE.id)
     deeper = Plan.load(saved(tmp_path, CODES, ONE, further))
@@ -142,7 +142,7 @@ def test_a_cancelled_run_is_left_as_it_is(tmp_path: Path):
         raise Cancelled
 
     path = saved(tmp_path, ALONE)
-    work(path, perform)
+    work_off(path, perform)
     assert Plan.load(path).run_of(ALONE).status == "stopped"
     assert Plan.load(path).left() == []
 
@@ -158,7 +158,7 @@ def test_a_worker_stays_while_its_plan_is_open_and_wanted(tmp_path: Path, monkey
 
     looks: list[Path] = []
     monkeypatch.setattr(Plan, "load", lambda path, load=Plan.load: (looks.append(path), load(path))[1])
-    thread = threading.Thread(target=work, args=(path, perform), daemon=True)
+    thread = threading.Thread(target=work_off, args=(path, perform), daemon=True)
     thread.start()
     until(lambda: len(looks) > 2, "it looks again")
     assert thread.is_alive()
@@ -168,18 +168,18 @@ def test_a_worker_stays_while_its_plan_is_open_and_wanted(tmp_path: Path, monkey
     thread.join(PATIENCE)
     assert not thread.is_alive()
     assert done == [ALONE.id]
-    work(saved(tmp_path, ONE, open=True), perform, wanted=lambda: False)
+    work_off(saved(tmp_path, ONE, open=True), perform, wanted=lambda: False)
     assert done == [ALONE.id]
 
 
 def test_a_run_whose_process_died_is_lost_then_taken_over(tmp_path: Path):
     path = saved(tmp_path, ALONE)
     code = (
-        "import sys, time; from pathlib import Path; from memmlp.sweep.worker import work\n"
+        "import sys, time; from pathlib import Path; from memmlp.sweep.worker import work_off\n"
         "def perform(plan, task):\n"
         "    plan.run_of(task).begin('memmlp', {}, data='d', upstream=None)\n"
         "    print('at it', flush=True); time.sleep(600)\n"
-        "work(Path(sys.argv[1]), perform)"
+        "work_off(Path(sys.argv[1]), perform)"
     )
     with started([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE) as victim:
         assert victim.stdout is not None
@@ -189,7 +189,7 @@ def test_a_run_whose_process_died_is_lost_then_taken_over(tmp_path: Path):
         victim.kill()
         victim.wait()
     assert Plan.load(path).states()[ALONE.id] == "lost"
-    work(path, finish)
+    work_off(path, finish)
     run = Plan.load(path).run_of(ALONE)
     assert run.status == "done"
     assert len(run.manifest["attempts"]) == 2
@@ -205,12 +205,12 @@ def test_a_run_that_kills_its_workers_fails_at_last(tmp_path: Path):
     assert worker.deaths(run) == 0
     for _ in range(worker.DEATHS):
         run.begin("memmlp", {}, data="d", upstream=None)
-    work(path, finish)
+    work_off(path, finish)
     assert run.status == "failed"
     assert "processes died at step 5" in str(run.failure)
     run.retry()
     assert worker.deaths(run) == 0
-    work(path, finish)
+    work_off(path, finish)
     assert run.status == "done"
 
 
@@ -220,14 +220,14 @@ def test_many_workers_perform_each_task_exactly_once(tmp_path: Path):
     tasks = [RunTask(f"{n:016x}", "memmlp", {}, CODES.id if n % 2 else None) for n in range(12)]
     path = saved(tmp_path, CODES, *tasks)
     code = (
-        "import os, sys, time; from pathlib import Path; from memmlp.sweep.worker import work\n"
+        "import os, sys, time; from pathlib import Path; from memmlp.sweep.worker import work_off\n"
         "import memmlp.sweep.worker as w; w.PAUSE = 0.01\n"
         "def perform(plan, task):\n"
         "    with open(sys.argv[2], 'ab', buffering=0) as log: log.write((task.id + '\\n').encode())\n"
         "    run = plan.run_of(task)\n"
         "    run.begin(task.kind, {}, data='d', upstream=None); time.sleep(0.02)\n"
         "    run.results_path.write_text('{}'); run.finish(['results.json'])\n"
-        "work(Path(sys.argv[1]), perform)"
+        "work_off(Path(sys.argv[1]), perform)"
     )
     log = tmp_path / "log"
     with contextlib.ExitStack() as stack:
@@ -243,7 +243,7 @@ FREEZING = """
 import sys, time
 from pathlib import Path
 from memmlp.common import lease
-from memmlp.sweep.worker import work
+from memmlp.sweep.worker import work_off
 
 lease.BEAT, stop = 0.01, sys.argv[2]
 
@@ -257,7 +257,7 @@ def perform(plan, task):
     run.results_path.write_text("{}")
     run.finish(["results.json"])
 
-work(Path(sys.argv[1]), perform)
+work_off(Path(sys.argv[1]), perform)
 """
 
 
@@ -297,7 +297,7 @@ def test_workers_do_each_task_once_where_locks_do_nothing(tmp_path: Path, monkey
         seen.append(task.id)
         finish(plan, task)
 
-    threads = [threading.Thread(target=work, args=(path, perform)) for _ in range(3)]
+    threads = [threading.Thread(target=work_off, args=(path, perform)) for _ in range(3)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -312,9 +312,9 @@ def test_a_full_disk_is_no_runs_failure(tmp_path: Path, code: int):
 
     path = saved(tmp_path, ALONE)
     with pytest.raises(OSError, match=os.strerror(code)):
-        work(path, perform)
+        work_off(path, perform)
     assert Plan.load(path).states() == {ALONE.id: "new"}
-    work(path, finish)
+    work_off(path, finish)
     assert Plan.load(path).states() == {ALONE.id: "done"}
 
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from memmlp.statistics import Verdict
-from memmlp.sweep.spec import Sweep, parse_sweep
+from memmlp.sweep.parsing import parse_sweep
+from memmlp.sweep.spec import Sweep
 from memmlp.tables.build_table import collect
 from memmlp.tables.effects import Runs
 from memmlp.tables.formats import markdown

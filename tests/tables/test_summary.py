@@ -7,8 +7,8 @@ from pathlib import Path
 from fake_runs import fake_run, fake_sweep, table_of
 
 from memmlp.common.files import read_json
+from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
-from memmlp.sweep.spec import load_sweep
 from memmlp.tables.summary import write_summary
 from memmlp.tracking.view import SweepFacts
 

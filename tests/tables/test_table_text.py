@@ -7,7 +7,7 @@ from pathlib import Path
 from fake_runs import fake_sweep, table_of
 from fake_table import SHIPPED, printed
 
-from memmlp.sweep.spec import load_sweep
+from memmlp.sweep.parsing import load_sweep
 from memmlp.tables.table_text import heading
 
 

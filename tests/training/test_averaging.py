@@ -19,7 +19,7 @@ def test_an_exponential_moving_average_by_hand():
         average.update(step)
         decay = min(0.3, (1 + step) / (10 + step))
         expected = decay * expected + (1 - decay) * value
-    with average.shown():
+    with average.in_place():
         assert model.weight.item() == pytest.approx(expected)
     assert model.weight.item() == 8
 
@@ -30,7 +30,7 @@ def test_weights_come_back_after_an_error():
     model.weight.data += 1
 
     def fail() -> None:
-        with average.shown():
+        with average.in_place():
             assert torch.equal(model.weight, before)
             raise RuntimeError("in it")
 

@@ -198,5 +198,5 @@ def test_what_is_counted_in_a_validation_says_so(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(progress, "EVERY", 0.0)
     task = mock.MagicMock(validate=lambda: list(progress.progress_bar(iter("a"), "stream", unit="frames")))
     with progress.telling(told.append):
-        loop.validated(task, mock.MagicMock())
+        loop.validate(task, mock.MagicMock())
     assert told == ["validation, stream: 1 frames"]

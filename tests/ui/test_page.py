@@ -16,14 +16,14 @@ from ui.test_replay import motion
 from memmlp.cli.rounds import look
 from memmlp.evaluation.units import UNITS
 from memmlp.runs.run import Run
-from memmlp.sweep.kept import kept
+from memmlp.sweep.kept_sweep import kept
 from memmlp.sweep.plan import Plan
-from memmlp.tables.build_table import collect, finished
+from memmlp.tables.build_table import collect, finished_runs
 from memmlp.tables.measured_run import load
 from memmlp.tables.rounds import begin
 from memmlp.tables.runs_of_plan import finder
 from memmlp.ui.answers import Answers
-from memmlp.ui.one_file import Shown, query, rounded, written
+from memmlp.ui.one_file import ReportedSweep, page_text, query, rounded
 from memmlp.ui.server import Server
 
 EVIL = "<img src=x onerror=owned=1>"
@@ -260,8 +260,8 @@ def test_a_file_without_a_server(browser: Browser, home: Path, tmp_path: Path):
     folder = home / "sweeps" / "mine"
     sweep, plan = kept(folder), Plan.load(folder / "plan.json")
     assert sweep is not None
-    table = collect(sweep, finished(sweep, finder(plan, load)))
-    text = written(Answers(home, predict, kept=False), [Shown("mine", table)], "<h1>Extra</h1>")
+    table = collect(sweep, finished_runs(sweep, finder(plan, load)))
+    text = page_text(Answers(home, predict, kept=False), [ReportedSweep("mine", table)], "<h1>Extra</h1>")
     assert EVIL not in text
     file = tmp_path / "report.html"
     file.write_text(text)

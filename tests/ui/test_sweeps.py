@@ -12,9 +12,9 @@ from ui.conftest import begun, run_of
 
 from memmlp.cli.rounds import look
 from memmlp.runs.run import Run
-from memmlp.sweep.kept import keep, kept
+from memmlp.sweep.kept_sweep import keep, kept
 from memmlp.sweep.plan import Plan, RunTask
-from memmlp.tables.build_table import collect, finished
+from memmlp.tables.build_table import collect, finished_runs
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import load
 from memmlp.tables.rounds import Rounds, begin
@@ -33,7 +33,7 @@ def test_the_table_is_that_of_the_command(outputs: Path):
     folder = outputs / "sweeps" / "mine"
     sweep, plan = kept(folder), Plan.load(folder / "plan.json")
     assert sweep is not None
-    table = json.loads(as_json(collect(sweep, finished(sweep, finder(plan, load)))))
+    table = json.loads(as_json(collect(sweep, finished_runs(sweep, finder(plan, load)))))
     shown = sweeps_of(outputs).page("mine")["table"]
     assert shown["rows"] == table["rows"]
     (row,) = [row for row in shown["rows"] if row["label"] == "gru"]

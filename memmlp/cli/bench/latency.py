@@ -148,12 +148,12 @@ def timed(paths: dict[tuple[str, str], Path], rounds: int, steps: int) -> list[d
     import numpy as np
 
     from memmlp.deploy.latency import interleaved
-    from memmlp.live.latency import measure
+    from memmlp.live.latency import measure_pose
 
     seconds = interleaved(paths, rounds, steps)
     base = np.median(seconds[BASE], 1)
     return [
-        row(model, variant, times, np.median(times, 1) / base) | measure(paths[model, variant], steps)
+        row(model, variant, times, np.median(times, 1) / base) | measure_pose(paths[model, variant], steps)
         for (model, variant), times in seconds.items()
     ]
 
@@ -186,11 +186,10 @@ def show(rows: list[dict[str, Any]], rounds: int) -> None:
     from rich.table import Table
 
     table = Table(title=f"one step on one thread, {rounds} rounds in turn", title_justify="left")
-    for name, side in (("network", "left"), ("graph", "left"), ("median ms", "right"), ("p95 ms", "right")):
-        table.add_column(name, justify=side)  # type: ignore[arg-type]
-    table.add_column("to AvatarPoser", justify="right")
-    table.add_column("over rounds", justify="right")
-    table.add_column("whole pose ms", justify="right")
+    for name in ("network", "graph"):
+        table.add_column(name)
+    for name in ("median ms", "p95 ms", "to AvatarPoser", "over rounds", "whole pose ms"):
+        table.add_column(name, justify="right")
     for r in rows:
         table.add_row(
             r["model"],

@@ -1,4 +1,4 @@
-"""`memmlp bench train`: how soon a recipe reaches the validation error that today's ends with."""
+"""`memmlp bench train`: how fast a changed recipe reaches the final validation error of today's."""
 
 from __future__ import annotations
 
@@ -89,10 +89,13 @@ def train(
     rows = known_rows(file, subject)
     for seed in range(seeds):
         words = (*BASE, *overrides)
-        arms = (built((*words, f"seed={seed}")), built((*words, *own, f"seed={seed}")))
+        arms = (
+            compose_experiment((*words, f"seed={seed}")),
+            compose_experiment((*words, *own, f"seed={seed}")),
+        )
         experiments = dict(zip(ARMS, arms, strict=True))
-        rows[seed] = measured(experiments, seed, error, every, rows.get(seed))
-        click.echo(told(rows[seed], error))
+        rows[seed] = measure_seed(experiments, seed, error, every, rows.get(seed))
+        click.echo(seed_line(rows[seed], error))
         if file:
             write(file, subject, rows, times)
     click.echo(conclusion(summary([rows[seed] for seed in range(seeds)], times)))
@@ -121,7 +124,7 @@ def known_rows(file: Path | None, subject: dict[str, Any]) -> dict[int, dict[str
     return {row["seed"]: row for row in content["seeds"]}
 
 
-def built(words: Sequence[str]) -> Experiment:
+def compose_experiment(words: Sequence[str]) -> Experiment:
     """Build the experiment of overrides, and let torch have its number of threads.
 
     Raises:
@@ -144,7 +147,7 @@ def built(words: Sequence[str]) -> Experiment:
     return experiment
 
 
-def measured(
+def measure_seed(
     experiments: dict[str, Experiment], seed: int, error: str, every: int, known: dict[str, Any] | None
 ) -> dict[str, Any]:
     """Return the row of a seed: the error, when each arm had it, and the runs that they are.
@@ -175,7 +178,7 @@ def measured(
             "--recipe: changes the data or the VQ-VAE; allowed is the network and how it is trained"
         )
     learners = {arm: learner(experiments[arm], data[arm], error) for arm in ARMS}
-    reached, target = raced(learners, every, f"seed {seed}")
+    reached, target = race(learners, every, f"seed {seed}")
     marks = {arm: one._asdict() if one else None for arm, one in reached.items()}
     return {"seed": seed, "runs": ids, "target": target, **marks}
 
@@ -194,7 +197,7 @@ def learner(experiment: Experiment, data: Any, error: str = "MPJPE") -> Learner:
     return Learner(task, training.optim, training.seed, f"rotation {error}")
 
 
-def raced(
+def race(
     learners: dict[str, Learner], every: int, description: str
 ) -> tuple[dict[str, Validation | None], float]:
     """Train both in turn; return when each first had the error that today's ends with, and that error."""
@@ -235,11 +238,11 @@ def write(file: Path, subject: dict[str, Any], rows: dict[int, dict[str, Any]], 
     from memmlp.common.files import write_json
 
     every = list(rows.values())
-    told = {"threads": torch.get_num_threads(), "torch": torch.__version__}
-    write_json(file, {"subject": subject, **told, "seeds": every, "summary": summary(every, times)})
+    setting = {"threads": torch.get_num_threads(), "torch": torch.__version__}
+    write_json(file, {"subject": subject, **setting, "seeds": every, "summary": summary(every, times)})
 
 
-def told(row: dict[str, Any], error: str) -> str:
+def seed_line(row: dict[str, Any], error: str) -> str:
     """Return a seed's line."""
     parts = [f"seed {row['seed']}: {error} {row['target']:.3f} {UNITS[error]}"]
     for arm in ARMS:
@@ -262,7 +265,7 @@ def show_profile(arm: str, words: Sequence[str], steps: int) -> None:
     """Print how long a step takes, and each part of it."""
     from memmlp.training.step_profile import PARTS, step_parts
 
-    experiment = built((*words, f"optim.steps={WARM_UP + 2 * steps}"))
+    experiment = compose_experiment((*words, f"optim.steps={WARM_UP + 2 * steps}"))
     one = learner(experiment, experiment.data.prepare())
     one.take(WARM_UP)
     before = one.seconds

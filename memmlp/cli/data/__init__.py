@@ -8,7 +8,7 @@ from memmlp.cli.data.export import export
 from memmlp.cli.data.import_ import import_
 from memmlp.cli.data.inspect import inspect
 from memmlp.cli.data.prepare import prepare
-from memmlp.cli.data.sheet import show
+from memmlp.cli.data.show import show
 from memmlp.cli.data.skeleton import skeleton
 from memmlp.cli.data.synth import synth
 from memmlp.cli.data.verify import verify

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from memmlp.cli.data.show import show_skipped, show_some
+from memmlp.cli.data.texts import show_skipped, show_some
 from memmlp.cli.options import PATH
 from memmlp.common.errors import InputError
 
@@ -48,9 +48,9 @@ def import_(
     SOURCE is a folder or one file. The clips are brought to the 22-joint tree, and each is compared with its
     file; what looks wrong is said.
     """
-    from memmlp.motion.importing.folder import How, import_folder
+    from memmlp.motion.importing.folder import ImportSettings, import_folder
 
-    how = How(skeleton, dict(map(_rate, fps)), body, _floor(floor), take, strict, sound)
+    how = ImportSettings(skeleton, dict(map(_rate, fps)), body, _floor(floor), take, strict, sound)
     report = import_folder(source, out, how)
     for note in report.notes:
         click.echo(f"note: {note}")

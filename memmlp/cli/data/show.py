@@ -1,100 +1,32 @@
-"""Clips, frame rates and skipped files as people read them."""
+"""`memmlp data show`: clips as a sheet of pictures."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import click
-from rich.console import Console
-from rich.table import Table
 
-from memmlp.common.errors import one_line
-from memmlp.motion.body import FPS
-from memmlp.motion.preparing.folders import source_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from memmlp.motion.exporting.folder import ExportReport
-    from memmlp.motion.preparing.manifest import ClipRecord, Manifest
-
-SHOWN = 8  # skipped files that are named on the screen; the manifest lists all
+from memmlp.cli.data.texts import show_skipped
+from memmlp.cli.options import PATH
 
 
-def show_manifest(manifest: Manifest) -> None:
-    """Print the parts, frame rates and skipped files of a cache."""
-    table = Table("part")
-    for name in ("clips", "frames", "hours"):
-        table.add_column(name, justify="right")
-    for part, total in manifest.totals.items():
-        table.add_row(part, f"{total['clips']:.0f}", f"{total['frames']:.0f}", f"{total['hours']:.3f}")
-    Console(highlight=False).print(table)
-    for source in manifest.sources:
-        show_source(manifest, source)
-    show_rates(manifest.clips)
-    show_skipped([f"{file.file}: {file.reason}" for file in manifest.skipped])
-    show_files(manifest.ignored, manifest.passed_over, manifest.links, manifest.unusual)
-    show_pairs("left out, since another part has the same frames", manifest.duplicates)
-    left_out = sum(manifest.left_out.values())
-    click.echo(
-        f"{len(manifest.clips)} clips; skipped {len(manifest.skipped)}, left out by the split {left_out}, "
-        f"listed but missing {len(manifest.missing)}; body {manifest.body}"
-    )
-    if not manifest.coverage.whole:
-        click.echo(f"{manifest.coverage}: {manifest.coverage.gaps}")
+@click.command("show")
+@click.argument("source", type=PATH)
+@click.option("--out", required=True, type=PATH, help="The sheet, a .png.")
+@click.option("--clips", default=12, show_default=True, type=click.IntRange(1, 200), help="Clips at most.")
+@click.option("--body", default="builtin", show_default=True, help="builtin, or an SMPL-H model.npz.")
+def show(source: Path, out: Path, clips: int, body: str) -> None:
+    """Draw clips of a folder of npz files, or one clip, each at three moments.
 
+    The clips are spread evenly over the folder's files in the order of their names.
+    """
+    from memmlp.common.files import atomic_write
+    from memmlp.render.clips import clip_sheet, some_clips
+    from memmlp.render.picture import check_picture
+    from memmlp.render.sheet import png
 
-def show_source(manifest: Manifest, source: str) -> None:
-    """Print how many clips and hours of one source are in each part."""
-    clips = [clip for clip in manifest.clips if source_of(clip.name) == source]
-    parts = [(part, [clip.length for clip in clips if clip.split == part]) for part in manifest.totals]
-    words = [f"{part} {len(lengths)} clips, {sum(lengths) / FPS / 3600:.3f} h" for part, lengths in parts]
-    click.echo(f"{source}: {'; '.join(words)}")
-
-
-def show_rates(clips: tuple[ClipRecord, ...]) -> None:
-    """Print the frame rates that were found, and how each was brought to 60 Hz."""
-    for (fps, how), count in sorted(Counter((clip.fps, clip.resampling) for clip in clips).items()):
-        click.echo(f"{count} clips at {fps:g} Hz: {how}")
-
-
-def show_files(
-    ignored: int, passed_over: Mapping[str, int], links: Mapping[str, str], unusual: Mapping[str, str]
-) -> None:
-    """Print what else there was in a folder: files that are no clips, links, and clips to look at."""
-    others = {"npz without poses": ignored, **dict(sorted(passed_over.items()))}
-    counts = [f"{count} {kind}" for kind, count in others.items() if count]
-    if counts:
-        click.echo(f"passed over: {', '.join(counts)}")
-    show_pairs("taken once, since the other path is a link", links)
-    show_pairs("unusual", unusual, ": ")
-
-
-def show_pairs(what: str, pairs: Mapping[str, str], sign: str = " = ") -> None:
-    """Print the first few pairs of names, and the number of the others."""
-    for first, second in list(pairs.items())[:SHOWN]:
-        click.echo(f"{what}: {one_line(first)}{sign}{one_line(second)}")
-    if len(pairs) > SHOWN:
-        click.echo(f"{what}: {len(pairs) - SHOWN} more")
-
-
-def show_skipped(lines: list[str]) -> None:
-    """Print the first few skipped files and the number of the others."""
-    show_some([f"skipped {line}" for line in lines], "skipped")
-
-
-def show_some(lines: list[str], what: str) -> None:
-    """Print the first few lines, and how many more of them there are."""
-    for line in lines[:SHOWN]:
-        click.echo(line)
-    if len(lines) > SHOWN:
-        click.echo(f"{len(lines) - SHOWN} more {what}")
-
-
-def show_exported(report: ExportReport, out: Path) -> None:
-    """Print what an export skipped and how much it wrote."""
-    show_skipped([f"{file.file}: {file.reason}" for file in report.skipped])
-    clips = "1 clip" if len(report.written) == 1 else f"{len(report.written)} clips"
-    click.echo(f"{clips}, {report.seconds / 60:.1f} minutes, in {out}")
+    check_picture(out, "--out", (".png",))
+    shown, skipped, total = some_clips(source, clips, body)
+    show_skipped([f"{file.file}: {file.reason}" for file in skipped])
+    atomic_write(out, png(clip_sheet(shown)))
+    click.echo(f"{len(shown)} of {total} clips: {out}")

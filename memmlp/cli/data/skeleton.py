@@ -58,7 +58,7 @@ def show(file: Path, which: str | None, out: Path) -> None:
     from memmlp.motion.importing.skeleton import find_skeleton, load_skeleton
     from memmlp.motion.importing.stance import find_stance
     from memmlp.render.picture import check_picture
-    from memmlp.render.skeleton import skeleton_png
+    from memmlp.render.skeleton_map import skeleton_png
 
     check_picture(out, "--out", (".png",))
     recording = read_recording(file)

@@ -33,9 +33,9 @@ def recorded(run: Run) -> Record:
 
 def value_text(record: Record, key: str, whole: bool) -> str:
     """Return a record's value as text, of a long one its beginning unless the whole is wanted."""
-    from memmlp.runs.query import shown
+    from memmlp.runs.query import as_typed
 
-    text = shown(record[key]) if key in record else "-"
+    text = as_typed(record[key]) if key in record else "-"
     return text if whole or len(text) <= LONGEST else f"{text[:LONGEST]}…"
 
 

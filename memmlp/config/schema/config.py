@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Optional
+from typing import Optional
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import MISSING
 
 from memmlp.common.plugin import METRICS
 from memmlp.config.schema.data import (
@@ -92,7 +91,7 @@ from memmlp.config.schema.training import (
     TermsLossConfig,
     UncertaintyConfig,
 )
-from memmlp.runs.identity import chosen
+from memmlp.runs.deployment_folder import ONNX_FILES
 
 # OmegaConf reads the annotations at run time and knows Optional and Union, not `|`.
 # The fields' helpers make dataclass fields, not shared defaults.
@@ -200,7 +199,7 @@ class ExportConfig:
 
     latency_steps: int = at_least(1)
     graph: str = one_of("auto", "streaming", "naive", "off")
-    precision: str = one_of("fp32", "int8", "fp16")
+    precision: str = one_of(*ONNX_FILES)
     opset: int = standing(18, Within(15, 26))  # memmlp.deploy.opsets.OPSETS, without importing onnx
 
 
@@ -340,63 +339,6 @@ GROUPS = {
     "export": ExportConfig,
 }
 DATA = {"seeded": SeededDataConfig, "lists": ListDataConfig, "subsets": SubsetDataConfig}
-
-
-RENAMED = {"tracker": "tracking"}
-"""The names of today for groups that runs of version 0.1 recorded under other names."""
-
-
-def restored(config: Mapping[str, Any]) -> DictConfig:
-    """Turn the config that a run recorded back into a typed one, with the classes of this version.
-
-    Raises:
-        OmegaConfBaseException, KeyError: where the record does not fit this version's schema. (A value of the
-            wrong kind may also raise TypeError or ValueError.)
-    """
-    cfg = OmegaConf.structured(Config)
-    for group, content in ((RENAMED.get(name, name), content) for name, content in config.items()):
-        cfg[group] = _restored(group, content) if isinstance(content, Mapping) else content
-    return cfg
-
-
-def _restored(group: str, content: Mapping[str, Any]) -> Any:
-    """Return one group as a typed config.
-
-    A component that is not part of this package keeps the path of its class.
-    """
-    if group == "tracking":
-        return _trackers(content)
-    option = SCHEMAS.get(f"{group}_{chosen({group: content}, group)}")
-    ours = option is None or option.__module__.startswith("memmlp.")
-    if group == "data" and ours:
-        schema = SynthDataConfig if content["synth"] else DATA[content["split"]["name"]]
-        return OmegaConf.merge(OmegaConf.structured(schema), _bare(content))
-    return OmegaConf.merge(OmegaConf.structured(option or GROUPS[group]), _content(option, content))
-
-
-def _trackers(content: Mapping[str, Any]) -> Any:
-    """Return the trackers as typed configs. Up to version 0.2 there was a single one, itself the group."""
-    every = {str(content["name"]): content} if "name" in content else content
-    return {name: _restored_tracker(name, node) for name, node in every.items() if name != "none"}
-
-
-def _restored_tracker(name: str, content: Mapping[str, Any]) -> Any:
-    option = SCHEMAS.get(f"tracking_{name}")
-    return OmegaConf.merge(OmegaConf.structured(option or TrackerConfig), _content(option, content))
-
-
-def _content(option: type | None, content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a typed config is filled with.
-
-    The classes of memmlp's options may lie elsewhere by now; others are checked to be those of the option.
-    """
-    return _bare(content) if option and option.__module__.startswith("memmlp.") else dict(content)
-
-
-def _bare(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a group without the paths of its classes, which the schema provides."""
-    bare = {key: _bare(value) if isinstance(value, Mapping) else value for key, value in content.items()}
-    return {key: value for key, value in bare.items() if key != "_target_"}
 
 
 @functools.cache

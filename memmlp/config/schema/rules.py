@@ -172,17 +172,17 @@ DEVICE = Matching(re.compile(r"auto|cpu|mps|cuda(:\d+)?"), "auto or cpu or cuda 
 
 
 def optional(rule: object = None) -> Any:
-    """Declare a key that may be null, as it is in runs from before there was the key."""
+    """Declare a key that may be null, as it counts for runs that were recorded before the key existed."""
     return field(default=None, metadata={"rule": rule})
 
 
 def standing(value: object, rule: object = None) -> Any:
-    """Declare a key with a default, which stands for it in runs from before there was the key."""
+    """Declare a key with a default, which counts for runs that were recorded before the key existed."""
     return field(default=value, metadata={"rule": rule})
 
 
 def own(rule: object) -> Any:
-    """Declare a list that is empty unless one asks for it, as it is in runs from before there was the key."""
+    """Declare a list that is empty by default, as it counts for runs recorded before the key existed."""
     return field(default_factory=list, metadata={"rule": rule})
 
 

@@ -113,7 +113,7 @@ class OwnLossConfig(BaselineLossConfig):
 
 @dataclass
 class TermsLossConfig(BaselineLossConfig):
-    """A loss made of terms of the library; null leaves a term out, as do runs from before there was it."""
+    """A loss made of terms of the library; null leaves a term out. Older runs lack some terms."""
 
     name: str = called("terms")
     _target_: str = target("memmlp.training.losses.TermsLoss")

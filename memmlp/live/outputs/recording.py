@@ -28,7 +28,7 @@ ROW = 3 * N_JOINTS + 3  # numbers of a kept frame: rotation vectors, and the roo
 LONGEST = 1.0  # seconds without a frame that are filled
 
 
-class Kept(NamedTuple):
+class KeptFrame(NamedTuple):
     """A frame as it is kept: of the network's body.
 
     Attributes:
@@ -42,7 +42,7 @@ class Kept(NamedTuple):
     root: np.ndarray
 
 
-class Recording:
+class Recorder:
     """Records to files.
 
     Args:
@@ -66,18 +66,18 @@ class Recording:
         self.paths, self.rest, self.fps, self.tell = paths, rest, fps, tell
         self.frames = _spool(paths[0])
         self.count, self.filled, self.breaks, self.scale = 0, 0, 0, 1.0
-        self.last: Kept | None = None
+        self.last: KeptFrame | None = None
 
     def take(self, frame: BodyFrame) -> None:
         """Keep a frame, after those that are missing before it."""
-        kept = Kept(frame.time, frame.local, frame.scale * frame.positions[ROOT])
+        kept = KeptFrame(frame.time, frame.local, frame.scale * frame.positions[ROOT])
         for between in self._missing(kept, frame.restarted):
             self._keep(between)
             self.filled += 1
         self._keep(kept)
         self.last, self.scale = kept, frame.scale
 
-    def _missing(self, kept: Kept, restarted: bool) -> list[Kept]:
+    def _missing(self, kept: KeptFrame, restarted: bool) -> list[KeptFrame]:
         """Return the frames between the last one and this one, which no pose was made for."""
         last = self.last
         if last is None:
@@ -88,7 +88,7 @@ class Recording:
             return []
         weights = [step / steps for step in range(1, steps)]
         return [
-            Kept(
+            KeptFrame(
                 last.time + weight * (kept.time - last.time),
                 slerp(last.local, kept.local, weight),
                 last.root + weight * (kept.root - last.root),
@@ -96,7 +96,7 @@ class Recording:
             for weight in weights
         ]
 
-    def _keep(self, kept: Kept) -> None:
+    def _keep(self, kept: KeptFrame) -> None:
         turns = Rotation.from_matrix(kept.local).as_rotvec()
         row = np.concatenate([turns.ravel(), kept.root]).astype("<f4")
         place = self.count * row.nbytes  # where a row that was cut off by a full disk is written over

@@ -12,7 +12,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.live.outputs.output import Outputs
 from memmlp.live.player.fitting import Fitting, hips_height
-from memmlp.live.player.sources import PoseSample, PoseSource
+from memmlp.live.player.sources import SourceSample, TrackerSource
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES, Space
 from memmlp.live.stream import Pose, Stream
@@ -21,14 +21,14 @@ from memmlp.motion.formats.humanoid import VRM
 from memmlp.motion.limbs import LIMBS
 from memmlp.render.error_colours import HEAT
 
-SHOWN = SPACES["openxr"]  # the page's axes: those of three.js
+PAGE_SPACE = SPACES["openxr"]  # the page's axes: those of three.js
 TOP = 20  # cm at the top of the page's colour scale
 UNIT = 10_000  # whole numbers that a quaternion's 1 is sent as
 
 Publish = Callable[[dict[str, Any]], None]
 
 
-def greeting(source: PoseSource, network: str, outputs: Outputs | None = None) -> dict[str, Any]:
+def greeting(source: TrackerSource, network: str, outputs: Outputs | None = None) -> dict[str, Any]:
     """Return what the page must know before the first frame."""
     limbs = [{"start": a, "end": b, "radii": radii, "tip": tip} for a, b, radii, tip in LIMBS]
     words = {"network": network, "source": source.name, "fps": FPS, "joints": JOINTS}
@@ -49,7 +49,7 @@ def with_avatar(words: Mapping[str, Any], rest: np.ndarray) -> dict[str, Any]:
 
 def play(
     stream: Stream,
-    source: PoseSource,
+    source: TrackerSource,
     publish: Publish,
     stopped: threading.Event,
     outputs: Outputs | None = None,
@@ -80,7 +80,7 @@ def play(
             fitting.step(sample and sample.trackers)
         if (source.malformed + refused, source.foreign) != told:
             told = source.malformed + refused, source.foreign
-            publish(counts(dropped, *told))
+            publish(refusals_message(dropped, *told))
         if sample is None:
             continue
         dropped += sample.dropped
@@ -97,12 +97,17 @@ def play(
         times = {"ms": round(1000 * stream.network_seconds, 3), "whole": round(whole, 3)}
         told = source.malformed + refused, source.foreign
         head = {"number": number, "time": round(pose.time, 4), "held": pose.held}
-        message = head | times | counts(dropped, *told) | shown(stream.space, pose, source.truth(pose.time))
-        publish(message | (turns(stream.space, pose) if avatar else {}))
+        message = (
+            head
+            | times
+            | refusals_message(dropped, *told)
+            | joints_message(stream.space, pose, source.truth(pose.time))
+        )
+        publish(message | (rotations_message(stream.space, pose) if avatar else {}))
         number += 1
 
 
-def stepped(stream: Stream, sample: PoseSample) -> Pose | None:
+def stepped(stream: Stream, sample: SourceSample) -> Pose | None:
     """Return the pose of a sample; None where the stream refuses it."""
     try:
         return stream.step(*sample.trackers, time=sample.time)
@@ -110,12 +115,12 @@ def stepped(stream: Stream, sample: PoseSample) -> Pose | None:
         return None
 
 
-def counts(dropped: int, malformed: int, foreign: int) -> dict[str, Any]:
+def refusals_message(dropped: int, malformed: int, foreign: int) -> dict[str, Any]:
     """Return the part of a message about samples that were not taken."""
     return {"dropped": dropped, "malformed": malformed, "foreign": foreign}
 
 
-def shown(space: Space, pose: Pose, truth: np.ndarray | None) -> dict[str, Any]:
+def joints_message(space: Space, pose: Pose, truth: np.ndarray | None) -> dict[str, Any]:
     """Return the part of a message with the joints."""
     return {"joints": millimetres(space, pose.positions), "truth": millimetres(space, truth)}
 
@@ -124,15 +129,15 @@ def millimetres(space: Space, joints: np.ndarray | None) -> list[int] | None:
     """Return joints (22, 3) of a space, in metres, as a flat list of whole millimetres in the page's axes."""
     if joints is None:
         return None
-    shown = SHOWN.positions_out(space.positions_in(np.asarray(joints, np.float64)))
-    return (1000 * shown).round().astype(int).ravel().tolist()
+    positions = PAGE_SPACE.positions_out(space.positions_in(np.asarray(joints, np.float64)))
+    return (1000 * positions).round().astype(int).ravel().tolist()
 
 
-def turns(space: Space, pose: Pose) -> dict[str, Any]:
+def rotations_message(space: Space, pose: Pose) -> dict[str, Any]:
     """Return the part of a message with the joints' rotations: 22 quaternions xyzw as 88 whole numbers.
 
     They are those of VRM's T-pose, which is SMPL's: Y up, facing +Z; the root's is in the page's axes.
     """
     local = space.pose_in(pose.rotations)
-    local[0] = SHOWN.world.T @ local[0]
+    local[0] = PAGE_SPACE.world.T @ local[0]
     return {"turns": (UNIT * matrix_to_quaternion(local)).round().astype(int).ravel().tolist()}

@@ -19,8 +19,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from typing import Any, NamedTuple
 
-from memmlp.common.access import Access
 from memmlp.common.errors import InputError
+from memmlp.common.page_access import Access
 from memmlp.live.player.sources import EVERYWHERE, HOST
 
 QUEUED = 240  # the most frames that wait for a watcher; beyond, its oldest are dropped

@@ -37,7 +37,7 @@ LARGEST = 65_536  # the largest datagram, bytes
 FORGOTTEN = 10_000  # so many missing numbers are not lost packets but another sender
 
 
-class PoseSample(NamedTuple):
+class SourceSample(NamedTuple):
     """What a source gives.
 
     Attributes:
@@ -53,7 +53,7 @@ class PoseSample(NamedTuple):
     arrived: float | None = None
 
 
-class PoseSource(Protocol):
+class TrackerSource(Protocol):
     """Gives tracker poses, one sample after the other.
 
     Attributes:
@@ -70,7 +70,7 @@ class PoseSource(Protocol):
     foreign: int
     worn: bool
 
-    def read(self) -> PoseSample | None:
+    def read(self) -> SourceSample | None:
         """Return the next sample; None where none came within `WAIT` seconds."""
 
     def truth(self, time: float) -> np.ndarray | None:
@@ -182,7 +182,7 @@ class ClipSource:
         """Whether all rounds are played."""
         return self.next >= self.rounds * self.count
 
-    def read(self) -> PoseSample | None:
+    def read(self) -> SourceSample | None:
         """Wait for the sample that is due next, and return it."""
         now = self.clock()
         self.began = now if self.began is None else self.began
@@ -192,7 +192,7 @@ class ClipSource:
         self.sleep(max(self.began + index / self.hz - now, 0))
         self.next = index + 1
         turn, step = divmod(index, self.count)
-        return PoseSample(turn * self.round + step / self.hz, self.clip.trackers(step / self.hz), dropped)
+        return SourceSample(turn * self.round + step / self.hz, self.clip.trackers(step / self.hz), dropped)
 
     @property
     def round(self) -> float:
@@ -238,12 +238,12 @@ class PacketSource:
         self.strangers: set[str] = set()
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.settimeout(WAIT)
-        bound(self.socket, port, EVERYWHERE if senders else HOST)
+        bind(self.socket, port, EVERYWHERE if senders else HOST)
         self.port = self.socket.getsockname()[1]
         self.name = f"{name} packets on port {self.port}"
         self.last: int | None = None
 
-    def read(self) -> PoseSample | None:
+    def read(self) -> SourceSample | None:
         """Return the next packet's sample; None where none came in time, or what came is not taken."""
         try:
             datagram, (sender, _) = self.socket.recvfrom(LARGEST)
@@ -259,7 +259,7 @@ class PacketSource:
             self.malformed += 1
             return None
         now = time.monotonic() if packet.time is None else packet.time
-        return PoseSample(now, packet.trackers, self._dropped(packet), arrived)
+        return SourceSample(now, packet.trackers, self._dropped(packet), arrived)
 
     def _known(self, sender: str) -> bool:
         address = ip_address(sender)
@@ -287,7 +287,7 @@ class PacketSource:
         self.socket.close()
 
 
-def bound(listener: socket.socket, port: int, host: str = HOST) -> None:
+def bind(listener: socket.socket, port: int, host: str = HOST) -> None:
     """Bind a socket to a port, by default of this machine alone. Raises InputError where it is taken."""
     try:
         listener.bind((host, port))

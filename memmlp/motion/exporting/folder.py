@@ -41,7 +41,7 @@ class Target:
 
 
 @dataclass(frozen=True)
-class Plan:
+class ExportPlan:
     """What is to be written, and how.
 
     Attributes:
@@ -70,7 +70,7 @@ class ExportReport:
     skipped: tuple[Skipped, ...]
 
 
-def plan_export(source: Path, out: Path, name: str | None = None) -> Plan:
+def plan_export(source: Path, out: Path, name: str | None = None) -> ExportPlan:
     """Plan the export of an npz file to the file `out`, or of a folder's npz files to the folder `out`.
 
     Args:
@@ -89,10 +89,10 @@ def plan_export(source: Path, out: Path, name: str | None = None) -> Plan:
         return _plan_folder(source, out, chosen)
     if out.resolve() == source.resolve():
         raise InputError(f"--out {out}: would be written over its source; allowed: another file")
-    return Plan((Target(source.stem, source, out),), chosen)
+    return ExportPlan((Target(source.stem, source, out),), chosen)
 
 
-def _plan_folder(source: Path, out: Path, chosen: Format) -> Plan:
+def _plan_folder(source: Path, out: Path, chosen: Format) -> ExportPlan:
     """Plan the export of a folder."""
     _check_folder(source, out)
     found = find_clips(source)
@@ -100,7 +100,7 @@ def _plan_folder(source: Path, out: Path, chosen: Format) -> Plan:
     path, count = Counter(target.path for target in targets).most_common(1)[0]
     if count > 1:
         raise InputError(f"{path}: {count} npz files of this name in {source}; allowed: one")
-    return Plan(
+    return ExportPlan(
         targets, chosen, tuple(Skipped(folder, reason) for folder, reason in found.unreadable.items())
     )
 
@@ -140,7 +140,7 @@ def _check_folder(source: Path, out: Path) -> None:
 
 
 def read_targets(
-    plan: Plan, read: Callable[[Target], T], skipped: list[Skipped], strict: bool = False
+    plan: ExportPlan, read: Callable[[Target], T], skipped: list[Skipped], strict: bool = False
 ) -> Iterator[tuple[Target, T]]:
     """Yield each target of a plan with what is read of its source, while a progress bar counts them.
 
@@ -178,7 +178,7 @@ def read_motion(target: Target) -> Clip:
 
 
 def export(
-    plan: Plan, *, body: str = "builtin", fps: float | None = None, strict: bool = False
+    plan: ExportPlan, *, body: str = "builtin", fps: float | None = None, strict: bool = False
 ) -> ExportReport:
     """Write a plan's clips.
 

@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -123,11 +124,11 @@ class Npz:
         return rows, width
 
     @contextmanager
-    def _entry(self, name: str, header: Header) -> Iterator[zipfile.ZipExtFile]:
+    def _entry(self, name: str, header: Header) -> Iterator[IO[bytes]]:
         """Open an array's bytes where its data begin."""
         with self._zip.open(f"{name}.npy") as entry:
             entry.seek(header.offset)
-            yield entry  # type: ignore[misc]
+            yield entry
 
 
 @contextmanager
@@ -183,9 +184,7 @@ def _parse_header(start: bytes) -> Header:
     return Header(shape, fortran, dtype, stream.tell())
 
 
-def _lines(
-    entry: io.BufferedIOBase, dtype: np.dtype, count: int, length: int
-) -> Iterator[tuple[int, np.ndarray]]:
+def _lines(entry: IO[bytes], dtype: np.dtype, count: int, length: int) -> Iterator[tuple[int, np.ndarray]]:
     """Yield `count` lines of `length` numbers in blocks (n, length), each with its first line's index."""
     step = max(1, BLOCK // (length * dtype.itemsize))
     for start in range(0, count, step):

@@ -10,7 +10,7 @@ from memmlp.motion.clip import Clip
 from memmlp.motion.importing.axes import settle
 from memmlp.motion.importing.fidelity import Fidelity, compare, pose
 from memmlp.motion.importing.floor import find_floor
-from memmlp.motion.importing.recording import Performance, Recording, perform
+from memmlp.motion.importing.recording import MappedMotion, Recording, pick_joints
 from memmlp.motion.importing.retarget import fit, to_body
 from memmlp.motion.importing.skeleton import SkeletonMap
 
@@ -33,7 +33,7 @@ class Converted:
     """
 
     clip: Clip
-    performance: Performance
+    performance: MappedMotion
     fidelity: Fidelity
     floor: float | None
     rest_pose: str
@@ -64,7 +64,7 @@ def convert(
         InputError: as `retarget.fit` and `recording.perform` do.
     """
     settled = settle(recording, skeleton)
-    performance = perform(recording, settled)
+    performance = pick_joints(recording, settled)
     fitted = fit(recording, settled, performance, rest)
     clip = to_body(performance, fitted, rest, name, fps or recording.fps)
     if floor == AUTO:

@@ -29,7 +29,7 @@ from memmlp.motion.importing.anatomy import (
     unit,
 )
 from memmlp.motion.importing.axes import LEG
-from memmlp.motion.importing.recording import Performance
+from memmlp.motion.importing.recording import MappedMotion
 from memmlp.motion.importing.skeleton import Z_UP
 from memmlp.motion.plausible import implausible
 
@@ -86,7 +86,7 @@ class Fidelity:
     faults: tuple[str, ...]
 
 
-def compare(clip: Clip, performance: Performance, rest: np.ndarray, skeleton: str) -> Fidelity:
+def compare(clip: Clip, performance: MappedMotion, rest: np.ndarray, skeleton: str) -> Fidelity:
     """Compare a clip on a body, rest joints (22, 3) in metres, with the performance that it came from."""
     rotations, positions = pose(clip, rest)
     expected = performance.positions @ Z_UP.T

@@ -82,7 +82,7 @@ class ImportReport:
 
 
 @dataclass(frozen=True)
-class How:
+class ImportSettings:
     """How files are imported.
 
     Attributes:
@@ -107,7 +107,7 @@ class How:
     sound: bool = False
 
 
-def import_folder(source: Path, out: Path, how: How | None = None) -> ImportReport:
+def import_folder(source: Path, out: Path, how: ImportSettings | None = None) -> ImportReport:
     """Write each file of a folder, or a single one, as out/<its path>.npz, and out/import.json about it.
 
     Args:
@@ -120,7 +120,7 @@ def import_folder(source: Path, out: Path, how: How | None = None) -> ImportRepo
             folder, clips of another import in `out`, or no file that could be imported; also if `out` cannot
             be written.
     """
-    how, files = how or How(), find_recordings(source)
+    how, files = how or ImportSettings(), find_recordings(source)
     _check_import(files, out, how)
     rest, clips, skipped = load_rest_joints(how.body), [], []
     chosen = None if how.skeleton is None else load_skeleton(how.skeleton)
@@ -167,7 +167,7 @@ def _npz(relative: Path) -> Path:
     return relative.with_suffix(".npz")
 
 
-def _check_import(files: Mapping[Path, Path], out: Path, how: How) -> None:
+def _check_import(files: Mapping[Path, Path], out: Path, how: ImportSettings) -> None:
     """Raise InputError for two sources of one clip, foreign clips in `out`, wrong takes or rates."""
     npz, count = Counter(_npz(relative) for relative in files).most_common(1)[0]
     if count > 1:
@@ -202,7 +202,7 @@ def _import_file(
     relative: Path,
     folder: Path,
     skeleton: SkeletonMap,
-    how: How,
+    how: ImportSettings,
     rest: np.ndarray,
     source: Path,
 ) -> Imported:
@@ -237,7 +237,7 @@ def _import_file(
     )
 
 
-def _notes(clips: Sequence[Imported], maps: Mapping[str, SkeletonMap], how: How) -> Iterator[str]:
+def _notes(clips: Sequence[Imported], maps: Mapping[str, SkeletonMap], how: ImportSettings) -> Iterator[str]:
     """Yield what a person has to know of an import, a line each."""
     yield from dict.fromkeys(_rate_note(clip) for clip in clips if clip.fps != clip.header_fps)
     yield from (f"{skeleton.name}: {skeleton.note}" for skeleton in maps.values() if skeleton.note)

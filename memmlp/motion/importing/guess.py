@@ -7,7 +7,7 @@ be; else from the lengths of the bones. The map says of each joint what it is fr
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -241,9 +241,9 @@ def _left_by_motion(tree: Tree, shape: Found) -> tuple[int | None, str]:
     return None, f"feet and knees {wrong} which way the person faces"
 
 
-def _bones(at: object, side: int) -> tuple[np.ndarray, np.ndarray]:
+def _bones(at: Callable[[str], np.ndarray], side: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the directions (F, 3) of thigh and shin."""
-    hip, knee, ankle = (at(f"{side}.{part}") for part in ("hip", "knee", "ankle"))  # type: ignore[operator]
+    hip, knee, ankle = (at(f"{side}.{part}") for part in ("hip", "knee", "ankle"))
     return unit(knee - hip + 1e-12), unit(ankle - knee + 1e-12)
 
 

@@ -56,7 +56,7 @@ class Recording(Protocol):
 
 
 @dataclass(frozen=True)
-class Performance:
+class MappedMotion:
     """A recording's motion of the mapped joints, in Y-up axes and metres.
 
     Attributes:
@@ -79,7 +79,7 @@ class Performance:
         return len(self.rotations)
 
 
-def perform(recording: Recording, skeleton: SkeletonMap) -> Performance:
+def pick_joints(recording: Recording, skeleton: SkeletonMap) -> MappedMotion:
     """Pick the mapped joints' motion from a recording, without its calibration frame.
 
     Raises:
@@ -93,7 +93,7 @@ def perform(recording: Recording, skeleton: SkeletonMap) -> Performance:
     )
     if len(rotations) == 0:
         raise InputError(f"{recording.path}: only the calibration frame; allowed: two frames or more")
-    return Performance(
+    return MappedMotion(
         path=recording.path,
         mapped=np.array([joint in skeleton.joints for joint in JOINTS]),
         nodes=nodes,

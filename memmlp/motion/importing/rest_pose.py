@@ -12,7 +12,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.motion.importing import anatomy
-from memmlp.motion.importing.recording import Performance, Recording
+from memmlp.motion.importing.recording import MappedMotion, Recording
 from memmlp.motion.importing.skeleton import SkeletonMap
 
 STRAIGHTEST = "the straightest"  # how a frame was chosen, beside a given one
@@ -36,7 +36,7 @@ class RestPose:
     straight: bool
 
 
-def find_rest_pose(recording: Recording, skeleton: SkeletonMap, performance: Performance) -> RestPose:
+def find_rest_pose(recording: Recording, skeleton: SkeletonMap, performance: MappedMotion) -> RestPose:
     """Find the pose in which the person stands: the map's, else the zero pose, else the straightest frame.
 
     Raises:
@@ -57,7 +57,7 @@ def find_rest_pose(recording: Recording, skeleton: SkeletonMap, performance: Per
     return _straightest(performance, why)
 
 
-def _given(recording: Recording, skeleton: SkeletonMap, performance: Performance) -> RestPose:
+def _given(recording: Recording, skeleton: SkeletonMap, performance: MappedMotion) -> RestPose:
     """Return the pose whose joints have the map's rotations."""
     assert isinstance(skeleton.rest, dict)
     rotations, positions = (array[performance.nodes] for array in recording.posed(skeleton.rest))
@@ -72,7 +72,7 @@ def _given(recording: Recording, skeleton: SkeletonMap, performance: Performance
     return rest
 
 
-def _straightest(performance: Performance, why: str) -> RestPose:
+def _straightest(performance: MappedMotion, why: str) -> RestPose:
     """Return the frame in which the person stands straightest; `why` is what is wrong with the zero pose."""
     frames = np.unique(np.linspace(0, len(performance) - 1, TRIED).astype(int))
     order = frames[np.argsort(anatomy.unevenness(performance.positions[frames]), kind="stable")]
@@ -89,14 +89,14 @@ def _straightest(performance: Performance, why: str) -> RestPose:
     )
 
 
-def _frame(performance: Performance, frame: int, how: str) -> RestPose:
+def _frame(performance: MappedMotion, frame: int, how: str) -> RestPose:
     pose, rotations = performance.positions[frame], performance.rotations[frame]
     rest = _turned(rotations, pose, f"frame {frame}, {how}", straight=False)
     _check_sides(performance, rest)
     return rest
 
 
-def _checked_frame(performance: Performance, frame: int) -> int:
+def _checked_frame(performance: MappedMotion, frame: int) -> int:
     """Return the frame's number if the person stands in it; raise InputError otherwise."""
     if not 0 <= frame < len(performance):
         raise InputError(
@@ -116,7 +116,7 @@ def _turned(rotations: np.ndarray, positions: np.ndarray, source: str, straight:
     return RestPose(turn @ rotations, positions @ turn.T, source, straight)
 
 
-def _check_sides(performance: Performance, rest: RestPose) -> None:
+def _check_sides(performance: MappedMotion, rest: RestPose) -> None:
     why = anatomy.wrong_sides(rest.positions, performance.mapped)
     if why is not None:
         allowed = "a map with left on the left, and the file's true up axis"

@@ -19,7 +19,7 @@ from memmlp.motion.body import JOINTS, PARENTS
 from memmlp.motion.clip import Clip
 from memmlp.motion.importing import anatomy
 from memmlp.motion.importing.anatomy import HINGES, HIPS, LEGS, LIMBS, Segment, least_rotation, segments
-from memmlp.motion.importing.recording import Performance, Recording
+from memmlp.motion.importing.recording import MappedMotion, Recording
 from memmlp.motion.importing.rest_pose import RestPose, find_rest_pose
 from memmlp.motion.importing.skeleton import Z_UP, SkeletonMap
 
@@ -43,7 +43,7 @@ class Retargeting:
 
 
 def fit(
-    recording: Recording, skeleton: SkeletonMap, performance: Performance, rest: np.ndarray
+    recording: Recording, skeleton: SkeletonMap, performance: MappedMotion, rest: np.ndarray
 ) -> Retargeting:
     """Fit a recording's skeleton to a body's rest joints (22, 3), metres.
 
@@ -59,7 +59,7 @@ def fit(
     return Retargeting(corrections, scale, stance.source)
 
 
-def to_body(performance: Performance, fitted: Retargeting, rest: np.ndarray, name: str, fps: float) -> Clip:
+def to_body(performance: MappedMotion, fitted: Retargeting, rest: np.ndarray, name: str, fps: float) -> Clip:
     """Return a performance as a clip on the body that it was fitted to, in the world (Z up).
 
     The middle of the hips goes where the recording has it, scaled by the length of the legs.
@@ -86,7 +86,7 @@ def to_body(performance: Performance, fitted: Retargeting, rest: np.ndarray, nam
     return Clip(name, poses, trans, fps)
 
 
-def _aimed(performance: Performance, turned: np.ndarray, rest: np.ndarray) -> np.ndarray:
+def _aimed(performance: MappedMotion, turned: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """Return rotations (N, 22, 3, 3) whose segments point as in the recording; unmapped joints don't turn."""
     for start, end in (HIP_LINE, *segments(performance.mapped)):
         joint = 0 if (start, end) == HIP_LINE else start
@@ -101,7 +101,7 @@ def _aimed(performance: Performance, turned: np.ndarray, rest: np.ndarray) -> np
 
 
 def _turned_to_hinges(
-    turned: np.ndarray, stance: RestPose, performance: Performance, rest: np.ndarray
+    turned: np.ndarray, stance: RestPose, performance: MappedMotion, rest: np.ndarray
 ) -> np.ndarray:
     """Turn thighs and upper arms about themselves, so that knees and elbows bend about their axes.
 

@@ -9,7 +9,7 @@ import numpy as np
 from memmlp.motion.body import JOINTS, PARENTS
 from memmlp.motion.importing import anatomy
 from memmlp.motion.importing.axes import settle
-from memmlp.motion.importing.recording import Performance, Recording, perform
+from memmlp.motion.importing.recording import MappedMotion, Recording, pick_joints
 from memmlp.motion.importing.rest_pose import RestPose, find_rest_pose
 from memmlp.motion.importing.retarget import fit
 from memmlp.motion.importing.skeleton import SkeletonMap
@@ -47,7 +47,7 @@ def find_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -
         InputError: as importing does: where no person stands in the file, or the map does not fit it.
     """
     settled = settle(recording, skeleton)
-    performance = perform(recording, settled)
+    performance = pick_joints(recording, settled)
     pose = find_rest_pose(recording, settled, performance)
     turned = pose.rotations @ fit(recording, settled, performance, rest).corrections
     mapped = {joint: int(performance.nodes[JOINTS.index(joint)]) for joint in skeleton.joints}
@@ -58,7 +58,7 @@ def find_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -
 
 
 def _all_nodes(
-    recording: Recording, skeleton: SkeletonMap, performance: Performance, pose: RestPose
+    recording: Recording, skeleton: SkeletonMap, performance: MappedMotion, pose: RestPose
 ) -> np.ndarray:
     """Return the positions (nodes, 3) of all nodes in the pose of which the mapped ones are known.
 

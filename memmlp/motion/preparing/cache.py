@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.common.fences import check, publish, temporary
+from memmlp.common.fences import check_owner, publish, temporary
 from memmlp.common.lease import Lock
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
@@ -34,9 +34,11 @@ from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manif
 from memmlp.motion.preparing.splits import PARTS, Split
 from memmlp.motion.preparing.survey import Survey, survey
 from memmlp.motion.threads import one_thread
-from memmlp.runs.recipes import RECIPES
+from memmlp.runs.recipe_numbers import RECIPES
 
-FRAMES = 1  # number of a frame's content; a new one changes every digest, and so makes every run again
+FRAMES_VERSION = (
+    1  # number of a frame's content; a new one changes every digest, and so makes every run again
+)
 CHUNK = 4096  # frames turned into features at a time
 ITEM_BYTES = FRAME_DIM * 4
 
@@ -85,7 +87,7 @@ def prepare(source: ClipFolder, out: Path) -> Manifest:
         raise InputError(f"{out}: cannot write the cache there ({error.strerror or error})") from error
 
 
-def finished(source: ClipFolder, out: Path) -> Manifest | None:
+def finished_cache(source: ClipFolder, out: Path) -> Manifest | None:
     """Return the manifest of a finished, up-to-date cache of the source in `out`, or None."""
     try:
         return _finished(out, _request(source, load_rest_joints(str(source.body))))
@@ -133,7 +135,7 @@ def _make(source: ClipFolder, rest: np.ndarray, request: str, out: Path) -> Mani
 
 def _write(source: ClipFolder, rest: np.ndarray, manifest: Manifest, out: Path) -> None:
     """Write the arrays under temporary names, then rename them, then write the manifest."""
-    check(out)
+    check_owner(out)
     (out / MANIFEST).unlink(missing_ok=True)
     frames = {part: int(manifest.totals[part]["frames"]) for part in PARTS}
     _check_space(out, sum(frames.values()) * ITEM_BYTES)
@@ -222,13 +224,13 @@ def _total(clips: Sequence[ClipRecord], part: str) -> dict[str, float]:
 
 def _digest(clips: Sequence[ClipRecord], rest: np.ndarray, min_frames: int) -> str:
     sources = [(clip.name, clip.split, clip.sha256) for clip in clips]
-    return _hash([FRAMES, min_frames, rest.tolist(), sources])
+    return _hash([FRAMES_VERSION, min_frames, rest.tolist(), sources])
 
 
 def _request(source: ClipFolder, rest: np.ndarray) -> str:
     """Return a digest of the settings and of each source's path, size and time, without opening any."""
     files = [(file, *_stamp(source.root / file)) for file in find_all(source.root).files]
-    code = [FORMAT, FRAMES, RECIPES["features"]]
+    code = [FORMAT, FRAMES_VERSION, RECIPES["features"]]
     return _hash([*code, source.min_frames, rest.tolist(), source.split.describe(), files])
 
 

@@ -19,7 +19,7 @@ from memmlp.motion.preparing.splits import PARTS, Split
 def assign(
     split: Split, clips: Sequence[ClipRecord]
 ) -> tuple[dict[str, str | None], dict[str, str], dict[str, str]]:
-    """Return each clip's part and group, and the clips that gave way -> one that stayed.
+    """Return each clip's part and group, and for each dropped copy the clip that stayed.
 
     Raises:
         InputError: if the split is impossible.

@@ -13,7 +13,7 @@ SUFFIX = ".npz"  # in any case
 
 
 @dataclass
-class Found:
+class FoundFiles:
     """What lies below a folder; paths are relative to it.
 
     Attributes:
@@ -29,7 +29,7 @@ class Found:
     passed_over: Counter[str] = field(default_factory=Counter)
 
 
-def find_clips(root: Path) -> Found:
+def find_clips(root: Path) -> FoundFiles:
     """Find the npz files below a folder, also behind links, each file and each folder once.
 
     Raises:
@@ -37,7 +37,7 @@ def find_clips(root: Path) -> Found:
     """
     if not root.is_dir():
         raise InputError(f"data.root: {root} is no folder; give it the folder with your npz clips")
-    found, files = Found(), dict[object, str]()
+    found, files = FoundFiles(), dict[object, str]()
     folders: dict[object, str] = {_identity(root): "."}
     level = [""]
     while level:  # one depth after the other, so that of two paths the shorter one counts
@@ -63,7 +63,7 @@ def clip_name(file: str) -> str:
     return file[: -len(SUFFIX)] if file.lower().endswith(SUFFIX) else file
 
 
-def _entries(root: Path, folder: str, found: Found) -> list[tuple[str, bool]]:
+def _entries(root: Path, folder: str, found: FoundFiles) -> list[tuple[str, bool]]:
     """Return the paths in a folder with whether each is a folder itself: sorted, real ones before links."""
     try:
         with os.scandir(root / folder) as listing:

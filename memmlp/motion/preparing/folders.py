@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.find import Found, find_clips
+from memmlp.motion.preparing.find import FoundFiles, find_clips
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ Root = Path | Folders
 """Where clips are."""
 
 
-def find_all(root: Root) -> Found:
+def find_all(root: Root) -> FoundFiles:
     """Find the npz files below one folder or several (see `find_clips`).
 
     Raises:
@@ -60,7 +60,7 @@ def find_all(root: Root) -> Found:
     """
     if isinstance(root, Path):
         return find_clips(root)
-    every = Found()
+    every = FoundFiles()
     for source, folder in root.sources.items():
         found = find_clips(folder)
         every.files += [f"{source}/{file}" for file in found.files]

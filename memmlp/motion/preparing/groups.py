@@ -52,7 +52,7 @@ class Grouping:
         return hashlib.sha256(json.dumps(sorted(self.rows.items())).encode()).hexdigest()
 
     def check(self, names: Collection[str], files: Iterable[str]) -> None:
-        """Check that the column file has all clips to be split, and no others than those with a file.
+        """Check that the column file lists every clip to be split, and only clips that have a file.
 
         Args:
             names: clips to be split.

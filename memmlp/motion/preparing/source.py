@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from memmlp.common.fences import publish, temporary
 from memmlp.common.lease import Lock
-from memmlp.motion.preparing.cache import ClipFolder, finished, prepare
+from memmlp.motion.preparing.cache import ClipFolder, finished_cache, prepare
 from memmlp.motion.preparing.coverage import Coverage
-from memmlp.motion.preparing.find import Found, clip_name
+from memmlp.motion.preparing.find import FoundFiles, clip_name
 from memmlp.motion.preparing.folders import find_all
 from memmlp.motion.preparing.manifest import Manifest
 
@@ -90,13 +90,13 @@ class MotionSource:
     def _listed(self) -> Coverage:
         """Return how many entries of the split have a file, whatever is in it."""
         split = self.source.split
-        found = find_all(self.source.root) if split.listed else Found()
+        found = find_all(self.source.root) if split.listed else FoundFiles()
         names = [clip_name(file) for file in (*found.files, *found.links)]
         return Coverage.of(split.listed, split.missing(names))
 
     def digest(self) -> str | None:
         """Return the digest of the prepared data; None if the cache is missing or out of date."""
-        manifest = finished(self.source, self.cache)
+        manifest = finished_cache(self.source, self.cache)
         return manifest.digest if manifest else None
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.amass import clip_key, subset, unpacked
+from memmlp.motion.preparing.amass import subset, unpacked
 from memmlp.motion.preparing.groups import Grouping
+from memmlp.motion.preparing.published_lists import PHASES, check_once, entries_of_clips, read_lists
 
 PARTS = ("train", "val", "test")
-PHASES = ("train", "test")  # the parts for which there are published lists
 
 S2_TRAIN = (
     "CMU", "MPI_Limits", "TotalCapture", "Eyes_Japan_Dataset", "KIT", "BioMotionLab_NTroje", "BMLmovi",
@@ -213,17 +213,17 @@ class ListSplit(_Grouped):
 
     def __post_init__(self) -> None:
         _check_fractions(val=self.val)
-        object.__setattr__(self, "entries", _read_lists(Path(self.folder)))
+        object.__setattr__(self, "entries", read_lists(Path(self.folder)))
 
     def assign(self, names: Sequence[str]) -> Assignment:
-        fits = _fits(self.entries, names)
+        fits = entries_of_clips(self.entries, names)
         seen = {name: fits.get(name, name) for name in names}
         parts = {name: self.entries.get(seen[name]) for name in names}
         missing = tuple(sorted(set(self.entries) - set(fits.values())))
         return _carved(parts, seen, self, missing)
 
     def missing(self, names: Collection[str]) -> tuple[str, ...]:
-        return tuple(sorted(set(self.entries) - set(_fits(self.entries, names).values())))
+        return tuple(sorted(set(self.entries) - set(entries_of_clips(self.entries, names).values())))
 
     @property
     def listed(self) -> Mapping[str, int]:
@@ -265,7 +265,7 @@ class SubsetSplit(_Grouped):
     def assign(self, names: Sequence[str]) -> Assignment:
         phase = {subset(name): part for part in PHASES for name in getattr(self, part)}
         parts = {name: phase.get(subset(name)) for name in names}
-        _check_once(name for name, part in parts.items() if part)
+        check_once(name for name, part in parts.items() if part)
         return _carved(parts, {name: unpacked(name) for name in names}, self, self.missing(names))
 
     def missing(self, names: Collection[str]) -> tuple[str, ...]:
@@ -343,63 +343,3 @@ def _counts(total: int, fractions: Mapping[str, float]) -> dict[str, int]:
 
 def _rank(name: str, seed: int) -> str:
     return hashlib.sha256(json.dumps([seed, name]).encode()).hexdigest()
-
-
-def _fits(entries: Collection[str], names: Collection[str]) -> dict[str, str]:
-    """Map clips to the entries that they fit: by name, else by the name in another release of AMASS.
-
-    Raises:
-        InputError: if several clips have an entry's name in another release, and none has it as it stands.
-    """
-    fits = {name: name for name in names if name in entries}
-    others = {clip_key(entry).lower(): entry for entry in sorted(set(entries) - set(fits), reverse=True)}
-    found = defaultdict(list)
-    for name in sorted(set(names) - set(fits)):
-        if (entry := others.get(clip_key(name).lower())) is not None:
-            found[entry].append(name)
-    _refuse_several(found.values())
-    return fits | {clips[0]: entry for entry, clips in found.items()}
-
-
-def _check_once(names: Iterable[str]) -> None:
-    """Refuse clips that are there more than once, from several releases of AMASS."""
-    found = defaultdict(list)
-    for name in sorted(names):
-        found[clip_key(name)].append(name)
-    _refuse_several(found.values())
-
-
-def _refuse_several(found: Iterable[Sequence[str]]) -> None:
-    several = [clips for clips in found if len(clips) > 1]
-    if several:
-        first, second = several[0][:2]
-        raise InputError(
-            f"data.root: {len(several)} clips of the split fit more than one file, the first {first}.npz and "
-            f"{second}.npz; keep one release of AMASS below it"
-        )
-
-
-def _read_lists(folder: Path) -> dict[str, str]:
-    """Map clip names to "train" or "test" by all lists below a folder."""
-    files = {phase: sorted(folder.rglob(f"{phase}_split.txt")) for phase in PHASES}
-    if not files["train"]:
-        raise InputError(f"data.split: no SUBSET/train_split.txt below {folder}")
-    entries: dict[str, str] = {}
-    for phase in PHASES:
-        for file in files[phase]:
-            for name in _read_list(file):
-                if entries.setdefault(name, phase) != phase:
-                    raise InputError(f"{file}: {name} is both in a train and in a test list")
-    return entries
-
-
-def _read_list(file: Path) -> Iterator[str]:
-    """Yield the clip names of one list; a path counts from the folder that is named like the list's own."""
-    try:
-        lines = file.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: not a readable list ({error})") from error
-    for line in filter(None, map(str.strip, lines)):
-        steps = [step for step in line.removesuffix(".npz").split("/") if step not in ("", ".")]
-        own = next((i for i, step in enumerate(steps[:-1]) if subset(step) == subset(file.parent.name)), 0)
-        yield "/".join(steps[own:])

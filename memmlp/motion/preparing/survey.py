@@ -15,7 +15,7 @@ from memmlp.motion.body import FPS
 from memmlp.motion.clip import Clip, Skipped, resample
 from memmlp.motion.formats.npz import NoMotion, read_clip
 from memmlp.motion.plausible import check_plausible, unusual
-from memmlp.motion.preparing.find import Found, clip_name
+from memmlp.motion.preparing.find import FoundFiles, clip_name
 from memmlp.motion.preparing.folders import Root, find_all
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
 
@@ -38,7 +38,7 @@ class Survey:
     ignored: int
     short: tuple[str, ...]
     unusual: dict[str, str]
-    found: Found
+    found: FoundFiles
 
     @property
     def damaged(self) -> tuple[str, ...]:

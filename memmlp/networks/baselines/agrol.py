@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.diffusion import Diffusion
@@ -187,6 +187,6 @@ class AGRoLDiffusion(WholeWindow):
         _, kept = self.taken_in(sparse, state)
         window, frames = truth[..., :SPARSE_DIM], self.normalizer.encode(truth)
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
-        time = parallel.drawn(self.diffusion.random_times, truth)
-        noisy = self.diffusion.noised(clean, time, parallel.drawn(torch.randn_like, clean))
+        time = distributed.drawn(self.diffusion.random_times, truth)
+        noisy = self.diffusion.noised(clean, time, distributed.drawn(torch.randn_like, clean))
         return self.normalizer.posed(self.denoise(noisy, time, encoded), window), kept

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM, TRACKED
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.agrol import TimeEmbedding, WholeWindow
@@ -206,8 +206,8 @@ class BoDiffusion(WholeWindow):
         _, kept = self.taken_in(sparse, state)
         window, frames = truth[..., :SPARSE_DIM], self.normalizer.encode(truth)
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
-        time = parallel.drawn(self.diffusion.random_times, truth)
-        noise = parallel.drawn(torch.randn_like, clean)
+        time = distributed.drawn(self.diffusion.random_times, truth)
+        noise = distributed.drawn(torch.randn_like, clean)
         noisy = self.diffusion.noised(clean, time, noise)
         made = self.denoise(noisy, time, encoded)
         self._call = clean, noise, time, made

@@ -16,7 +16,7 @@ Denoise = Callable[[Tensor, Tensor], Tensor]
 
 
 def cosine_schedule(steps: int) -> Tensor:
-    """Return the share (steps,) of signal in the noisy signal's variance, float64.
+    """Return the cosine schedule: the signal's share (steps,) of the noisy signal's variance, float64.
 
     This is Eq. 17 of Nichol & Dhariwal 2021, where the noise that one step adds has a share of at most 0.999.
     """
@@ -28,7 +28,7 @@ def cosine_schedule(steps: int) -> Tensor:
 
 
 def linear_schedule(steps: int) -> Tensor:
-    """Return the share (steps,) of signal in the noisy signal's variance, float64.
+    """Return the linear schedule: the signal's share (steps,) of the noisy signal's variance, float64.
 
     The noise that one step adds has a share that grows linearly from 1e-4 to 0.02 over 1000 steps (Ho et al.
     2020, Sec. 4); of fewer steps each adds in proportion more, at most 0.999.

@@ -33,7 +33,9 @@ SHAPE = 16  # components of a body's shape
 
 
 def by_tracker(sparse: Tensor) -> list[Tensor]:
-    """Return rotations (..., 3, 6), angular velocities, positions (..., 3, 3), velocities of (..., 54)."""
+    """Split inputs (..., 54) by tracker: rotations (..., 3, 6), angular velocities (..., 3, 6), positions
+    (..., 3, 3) and velocities (..., 3, 3).
+    """
     parts = SPARSE_ROTATION, SPARSE_ANGULAR_VELOCITY, SPARSE_POSITION, SPARSE_VELOCITY
     return [sparse[..., part].unflatten(-1, (len(TRACKED), -1)) for part in parts]
 

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from memmlp.motion.body import PARENTS
-from memmlp.motion.geometry import matrix_to_quaternion
+from memmlp.motion.geometry import matrix_to_wxyz
 
 BASES, MIDDLES, ENDS = (16, 17, 1, 2), (18, 19, 4, 5), (20, 21, 7, 8)
 ANKLES, TOES = ENDS[2:], (10, 11)
@@ -74,7 +74,7 @@ def frame(first: Tensor, second: Tensor) -> Tensor:
 
 
 def circle(axis: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the directions (..., 3) from which, and towards which, swivels are counted.
+    """Return the directions (..., 3) of a swivel of 0 and of 90 degrees.
 
     Args:
         axis: unit vectors (..., 3) from base to end.
@@ -115,7 +115,7 @@ def bones(rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def flexed(upper: Tensor, lower: Tensor, axis: Tensor, reach: Tensor) -> Tensor:
-    """Return the rotations (..., 4, 3, 3) of middles that bring the ends to a distance from their bases.
+    """Return the rotations (..., 4, 3, 3) of elbows and knees that bring hands and feet to a given reach.
 
     Of the two ways to bend, each limb takes the one about its own axis of flexion. A limb that is asked to
     reach further, or less far, than it can is as straight, or as bent, as can be.
@@ -154,7 +154,7 @@ def untwisting(local: Tensor, bone: Tensor, axis: Tensor) -> Tensor:
         bone: the upper bones' unit vectors (4, 3) in the rest pose.
         axis: the unit vectors (..., 4, 3) from base to end, as the bases' parents see them.
     """
-    real, vector = matrix_to_quaternion(local).split([1, 3], -1)
+    real, vector = matrix_to_wxyz(local).split([1, 3], -1)
     limit = (local.new_tensor(TWIST) * (math.pi / 360)).tan()[:, None]
     turned = dot(vector, bone)
     by_sine = real * dot(axis, bone) + dot(cross(axis, vector), bone)

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.motion.body import (
     HEAD,
     N_JOINTS,
@@ -200,7 +200,7 @@ class Manikin(WindowModel):
 
     def heading(self, truth: Tensor) -> Tensor:
         """Draw a turn about the world's vertical axis for each window, as an origin (B, 1, 5) of Heading."""
-        angle = self.turned * 2 * math.pi * parallel.drawn(torch.rand_like, truth[:, :1, :1])
+        angle = self.turned * 2 * math.pi * distributed.drawn(torch.rand_like, truth[:, :1, :1])
         return torch.cat([torch.zeros_like(truth[:, :1, :3]), angle.cos(), angle.sin()], -1)
 
     def auxiliary_losses(self, truth: Tensor) -> dict[str, Tensor]:

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.encoder import Attention, EncoderLayer
@@ -168,7 +168,7 @@ class RPM(StreamModel):
         return self.normalizer.posed(made, sparse[:, now:]), state
 
     def begun(self, fresh: State, encoded: Tensor, truth: Tensor) -> State:
-        """Return the state after true frames; for a share of the windows it stays a fresh start.
+        """Return the state after true frames; a drawn share of the windows gets a fresh start instead.
 
         Args:
             fresh: a fresh start.
@@ -176,7 +176,7 @@ class RPM(StreamModel):
             truth: the same frames (B, context, 252) in the world.
         """
         motion = self.normalizer.encode(truth)[..., SPARSE_DIM:][..., ROTATION]
-        known = (parallel.drawn(torch.rand_like, truth[:, :1, 0]) >= FRESH).to(truth.dtype)
+        known = (distributed.drawn(torch.rand_like, truth[:, :1, 0]) >= FRESH).to(truth.dtype)
         return fresh | {
             "sparse": known[..., None] * encoded,
             "motion": known[..., None] * motion,

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM, SPARSE_POSITION, SPARSE_ROTATION
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import Dropout
@@ -81,7 +81,7 @@ def divergence(latent: Tensor) -> Tensor:
 def drawn(latent: Tensor) -> Tensor:
     """Draw (..., z) from latents (..., 2 z), means and log variances."""
     mean, log_variance = latent.chunk(2, -1)
-    return mean + (0.5 * log_variance).exp() * parallel.drawn(torch.randn_like, mean)
+    return mean + (0.5 * log_variance).exp() * distributed.drawn(torch.randn_like, mean)
 
 
 class VAEHMD(StreamModel):
@@ -143,7 +143,7 @@ class VAEHMD(StreamModel):
             state: see `advance`.
             truth: world frames [X | Theta] (B, T, 252).
         """
-        posed = (parallel.drawn(torch.rand_like, sparse[:, :1, :1]) < 0.5).to(sparse.dtype)
+        posed = (distributed.drawn(torch.rand_like, sparse[:, :1, :1]) < 0.5).to(sparse.dtype)
         of_pose = self.pose_encoder(self.normalizer.encode(truth)[..., SPARSE_DIM:])
         self._latent = posed * of_pose + (1 - posed) * self.latent(sparse)
         sample = drawn(self._latent)

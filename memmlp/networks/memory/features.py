@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.motion.body import MOTION_DIM, SPARSE_DIM
 from memmlp.networks.layers import PlainFusion, ResidualFusion
 
@@ -81,7 +81,7 @@ class Blend(nn.Module):
     def forward(self, like: Tensor) -> Tensor | float:
         """Return m: a number, or draws of the shape (B, T, k) of `like`."""
         if self.training or isinstance(self.value, str):
-            return parallel.drawn(torch.rand_like, like)
+            return distributed.drawn(torch.rand_like, like)
         return self.value
 
 

@@ -16,7 +16,7 @@ from memmlp.networks.window_model import WindowModel
 
 
 def filled(earlier: Tensor, first: Tensor, fresh: Tensor) -> Tensor:
-    """Return a window's earlier frames, in which at a fresh start the first frame stands for all of them.
+    """Return a window's earlier frames; at a fresh start they are all copies of the first frame.
 
     They are zeros then, so that a sum does it: it needs no condition, which not every runtime has.
 

@@ -77,7 +77,7 @@ class Indices(nn.Module):
 
 
 class Recall(nn.Module):
-    """Computes at each step the share that the recalled feature has in each memory block.
+    """Computes, for each memory block, what the recalled feature adds to it at this step.
 
     Args:
         memory: the network's memory.

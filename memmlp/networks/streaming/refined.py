@@ -30,7 +30,7 @@ class RefinedStream(StreamingGraph):
         """Keep a copy of the refiner; of the network the graph has one."""
         assert isinstance(model, Refined)
         self.model, self.hidden = model, model.initial_state(1)[HIDDEN]
-        setattr(model, "layers", FrameGRU(model.layers))  # noqa: B010  # of another class than the network's
+        model.add_module("layers", FrameGRU(model.layers))  # of another class than the network's
 
     def windows(self) -> State:
         """Return what the network's graph carries, and the hidden states (1, depth, width): zeros."""

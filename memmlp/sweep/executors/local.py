@@ -12,7 +12,7 @@ from submitit.local import local
 
 from memmlp.sweep.executors.executor import Work
 from memmlp.sweep.executors.gpus import Share
-from memmlp.sweep.executors.submitted import UNLIMITED, Requeued, Submitted, explained
+from memmlp.sweep.executors.submitit_jobs import UNLIMITED, Requeued, Submitted, explained
 
 
 class LocalExecutor(submitit.LocalExecutor):

@@ -14,7 +14,7 @@ import submitit.helpers
 
 from memmlp.common.errors import InputError
 from memmlp.sweep.executors.executor import Work
-from memmlp.sweep.executors.submitted import UNLIMITED, Requeued, Submitted, explained
+from memmlp.sweep.executors.submitit_jobs import UNLIMITED, Requeued, Submitted, explained
 
 TIME = re.compile(r"(?:(?P<days>\d+)-)?(?P<first>\d+)(?::(?P<second>\d+))?(?::(?P<third>\d+))?")
 OURS = ("array", "output", "error", "open_mode", "signal", "wrap", "wait", "parsable", "test_only")

@@ -17,7 +17,7 @@ from vmc_receiver import Marionette, posed
 
 from memmlp.live.outputs.osc import Receiver
 from memmlp.live.outputs.output import Outputs
-from memmlp.live.outputs.recording import Recording
+from memmlp.live.outputs.recording import Recorder
 from memmlp.live.outputs.vmc import VMC
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
@@ -52,7 +52,7 @@ def minute(tmp_path_factory: pytest.TempPathFactory, step_files: Callable[[str],
     stream = Stream(step_files("no_memory"), space="openxr", height=HEIGHT, floor=FLOOR)
     marionette = Marionette()
     files = {kind: folder / f"minute.{kind}" for kind in ("npz", "bvh", "glb")}
-    recording = Recording(
+    recording = Recorder(
         list(files.values()), stream.network.skeleton.rest, stream.network.fps, lambda _: None
     )
     outputs = Outputs([VMC(Receiver("127.0.0.1", marionette.port, "--vmc")), recording], pytest.fail)

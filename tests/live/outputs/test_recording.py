@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
 from memmlp.live.outputs.output import BodyFrame
-from memmlp.live.outputs.recording import Recording
+from memmlp.live.outputs.recording import Recorder
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.formats.npz import read_clip
 
@@ -32,9 +32,9 @@ def told() -> list[str]:
 
 
 @pytest.fixture
-def recording(tmp_path: Path, told: list[str]) -> Callable[..., Recording]:
-    def made(*names: str) -> Recording:
-        return Recording([tmp_path / name for name in names], REST, 60.0, told.append)
+def recording(tmp_path: Path, told: list[str]) -> Callable[..., Recorder]:
+    def made(*names: str) -> Recorder:
+        return Recorder([tmp_path / name for name in names], REST, 60.0, told.append)
 
     return made
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
 from memmlp.live.player.avatar import avatar_files, mannequin_vrm, read_vrm
-from memmlp.live.player.play import UNIT, millimetres, shown, turns, with_avatar
+from memmlp.live.player.play import UNIT, joints_message, millimetres, rotations_message, with_avatar
 from memmlp.live.player.server import FILES, Hub, Server
 from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES
@@ -97,7 +97,7 @@ def test_an_avatar_s_bones_are_where_the_joints_are(browser: Browser, own: bytes
     person, space = pose(), SPACES["amass"]
     person = person._replace(positions=person.positions * size)
     words = with_avatar({}, REST * size)["avatar"]
-    given = shown(space, person, None) | turns(space, person)
+    given = joints_message(space, person, None) | rotations_message(space, person)
     joints = np.array(given["joints"]).reshape(22, 3) / 1000
     script = """
       import('./avatar.js').then(async ({ Avatar }) => {
@@ -135,7 +135,7 @@ def test_the_rotations_of_a_message_are_those_of_vrm_s_t_pose():
     still[0] = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     for space in SPACES.values():
         person = Pose(0.0, np.zeros((22, 3)), space.pose_out(still), np.zeros((22, 3)), (), True, False)
-        found = np.array(turns(space, person)["turns"]).reshape(22, 4)
+        found = np.array(rotations_message(space, person)["turns"]).reshape(22, 4)
         np.testing.assert_array_equal(np.abs(found), np.tile([0, 0, 0, UNIT], (22, 1)))
     assert millimetres(SPACES["amass"], np.array([[1.0, 2, 3]])) == [1000, 3000, -2000]
 

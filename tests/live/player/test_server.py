@@ -16,7 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.live.player import server as module
 from memmlp.live.player.play import greeting, play
 from memmlp.live.player.server import FILES, Hub, Server
-from memmlp.live.player.sources import ClipSource, PoseSample, TrackedClip
+from memmlp.live.player.sources import ClipSource, SourceSample, TrackedClip
 from memmlp.live.stream import Stream
 
 
@@ -30,7 +30,7 @@ class Instant(ClipSource):
     def pass_time(self, seconds: float) -> None:
         self.now += seconds
 
-    def read(self) -> PoseSample | None:
+    def read(self) -> SourceSample | None:
         sample = super().read()
         if self.over:
             self.stopped.set()
@@ -40,7 +40,7 @@ class Instant(ClipSource):
 class Losing(Instant):
     """A clip in which the left hand is lost for a while, and a rotation is malformed once."""
 
-    def read(self) -> PoseSample | None:
+    def read(self) -> SourceSample | None:
         sample = super().read()
         head, left, right = sample.trackers
         if 40 <= self.next < 50:

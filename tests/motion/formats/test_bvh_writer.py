@@ -17,7 +17,7 @@ from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.bvh_writer import TIPS, euler_zxy, write_bvh
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.importing.convert import NONE
-from memmlp.motion.importing.folder import How, import_folder
+from memmlp.motion.importing.folder import ImportSettings, import_folder
 from memmlp.motion.synthetic import synthesize_clip
 
 REST = builtin_rest_joints()
@@ -43,7 +43,7 @@ def there_and_back(folder: Path, clip: Clip, rest: np.ndarray, body: str = "buil
     """Return a clip that went from npz to BVH and was imported again."""
     write_clip(folder / "before.npz", clip)
     write_bvh(folder / "clip.bvh", read_clip(folder / "before.npz", "clip"), rest)
-    how = How(skeleton="memmlp", body=body, floor=NONE)  # nobody stands up in clips of any poses
+    how = ImportSettings(skeleton="memmlp", body=body, floor=NONE)  # nobody stands up in clips of any poses
     import_folder(folder / "clip.bvh", folder / "back", how)
     return read_clip(folder / "back" / "clip.npz", "clip")
 
@@ -148,6 +148,6 @@ def test_the_skeleton_is_recognised(tmp_path: Path):
     """As the joints of SMPL that others write too, so that unit and up axis are found in the file."""
     clip = synthesize_clip("walking", 1, seconds=1.0)
     write_bvh(tmp_path / "clip.bvh", clip, REST)
-    report = import_folder(tmp_path / "clip.bvh", tmp_path / "back", How(floor=NONE))
+    report = import_folder(tmp_path / "clip.bvh", tmp_path / "back", ImportSettings(floor=NONE))
     assert [(each.skeleton, each.faults) for each in report.clips] == [("smpl_words", ())]
     check_same(clip, read_clip(tmp_path / "back" / "clip.npz", "clip"))

@@ -12,7 +12,7 @@ from bvh_samples import person, refuse, write
 from memmlp.common.errors import InputError
 from memmlp.motion.formats.expmap import WIDTH
 from memmlp.motion.importing.files import find_recordings, read_recording, tells_rate
-from memmlp.motion.importing.folder import How, import_folder
+from memmlp.motion.importing.folder import ImportSettings, import_folder
 from memmlp.motion.importing.verify import verify
 
 
@@ -39,7 +39,7 @@ def test_exponential_maps_are_imported_at_the_rate_that_is_told(tmp_path: Path) 
     with refuse(path, "this format tells no frame rate", "--fps HZ, 120 for the published files"):
         import_folder(path, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-    report = import_folder(path, tmp_path / "out", How(fps={"": 60.0}))
+    report = import_folder(path, tmp_path / "out", ImportSettings(fps={"": 60.0}))
     assert (report.clips[0].fps, report.clips[0].frames, report.clips[0].faults) == (60.0, 39, ())
     assert json.loads((tmp_path / "out" / "import.json").read_text())["clips"][0]["source"] == "nod.txt"
     assert verify(path).faults == ()

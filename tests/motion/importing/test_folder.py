@@ -17,7 +17,7 @@ from memmlp.motion.body import JOINTS, builtin_rest_joints
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.importing.convert import NONE, convert
-from memmlp.motion.importing.folder import How, import_folder
+from memmlp.motion.importing.folder import ImportSettings, import_folder
 from memmlp.motion.importing.skeleton import SKELETONS, find_skeleton, load_skeleton
 from memmlp.motion.synthetic import synthesize_clip
 
@@ -67,7 +67,7 @@ def rates(out: Path) -> dict[str, float]:
 
 def test_import_writes_clips_and_record(source: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    report = import_folder(source, out, How(floor=NONE))
+    report = import_folder(source, out, ImportSettings(floor=NONE))
     assert rates(out) == {"indian/01.npz": 120, "salsa/01.npz": 60, "salsa/02.npz": 60, "top.npz": 120}
     assert [clip.source for clip in report.clips] == [
         "indian/01.bvh",
@@ -104,7 +104,7 @@ def test_import_twice_is_the_same(source: Path, tmp_path: Path) -> None:
     ],
 )
 def test_given_rates(source: Path, tmp_path: Path, fps: dict[str, float], expected: list[float]) -> None:
-    report = import_folder(source, tmp_path / "out", How(fps=fps, floor=NONE))
+    report = import_folder(source, tmp_path / "out", ImportSettings(fps=fps, floor=NONE))
     assert list(rates(tmp_path / "out").values()) == expected
     assert [clip.fps for clip in report.clips] == expected
     assert all("given" in clip.fps_reason for clip in report.clips if clip.fps not in (60, 120))
@@ -117,7 +117,7 @@ def test_given_rates(source: Path, tmp_path: Path, fps: dict[str, float], expect
 )
 def test_wrong_rates_are_refused(source: Path, tmp_path: Path, fps: dict[str, float]) -> None:
     with refuse("fps: ", "'indian', 'salsa'"):
-        import_folder(source, tmp_path / "out", How(fps=fps, floor=NONE))
+        import_folder(source, tmp_path / "out", ImportSettings(fps=fps, floor=NONE))
 
 
 def test_known_rate_holds_for_the_folder_or_file_itself(source: Path, tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_known_rate_holds_for_the_folder_or_file_itself(source: Path, tmp_path: 
 
 def test_a_header_that_is_right_is_not_corrected(source: Path, tmp_path: Path) -> None:
     write(source, person("cmu_daz", 3, 0).text(dt="0.0166667"), "indian/01.bvh")
-    report = import_folder(source / "indian/01.bvh", tmp_path / "out", How(floor=NONE))
+    report = import_folder(source / "indian/01.bvh", tmp_path / "out", ImportSettings(floor=NONE))
     assert (report.clips[0].fps, report.clips[0].fps_reason) == (60, "the header's")
     assert report.notes == ()
 
@@ -146,7 +146,7 @@ def test_bad_files_are_skipped(source: Path, tmp_path: Path) -> None:
 def test_strict_import_leaves_nothing(source: Path, tmp_path: Path) -> None:
     write(source, "HIERARCHY", "salsa/01.bvh")
     with refuse(source / "salsa/01.bvh", "no MOTION"):
-        import_folder(source, tmp_path / "out", How(strict=True))
+        import_folder(source, tmp_path / "out", ImportSettings(strict=True))
     assert [path.name for path in tmp_path.iterdir()] == ["source"]
 
 
@@ -156,7 +156,7 @@ def test_strict_import_leaves_an_earlier_one_alone(source: Path, tmp_path: Path)
     write(source, person("cmu_daz", 9, 9).text(), "indian/01.bvh")
     write(source, "HIERARCHY", "top.bvh")
     with pytest.raises(InputError):
-        import_folder(source, tmp_path / "out", How(strict=True))
+        import_folder(source, tmp_path / "out", ImportSettings(strict=True))
     assert {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.*")} == before
 
 
@@ -222,7 +222,7 @@ def test_each_clip_is_put_on_its_floor(takes: Path, tmp_path: Path) -> None:
 
 def test_clips_of_a_take_share_its_lowest_floor(takes: Path, tmp_path: Path) -> None:
     apart = import_folder(takes, tmp_path / "apart")
-    report = import_folder(takes, tmp_path / "out", How(takes=[r"^(\d)"]))
+    report = import_folder(takes, tmp_path / "out", ImportSettings(takes=[r"^(\d)"]))
     assert [clip.floor for clip in report.clips] == [apart.clips[index].floor for index in (0, 0, 2)]
     heights = toes(tmp_path / "out")
     assert heights["1b"] - heights["1a"] == pytest.approx(0.2, abs=0.01)
@@ -230,14 +230,14 @@ def test_clips_of_a_take_share_its_lowest_floor(takes: Path, tmp_path: Path) -> 
 
 
 def test_floors_as_told(takes: Path, tmp_path: Path) -> None:
-    left = import_folder(takes, tmp_path / "left", How(floor=NONE))
-    told = import_folder(takes, tmp_path / "told", How(floor=0.3))
+    left = import_folder(takes, tmp_path / "left", ImportSettings(floor=NONE))
+    told = import_folder(takes, tmp_path / "told", ImportSettings(floor=0.3))
     assert [clip.floor for clip in left.clips] == [None] * 3
     scale = {clip.floor for clip in told.clips}
     assert len(scale) == 1
     taken = np.subtract(list(toes(tmp_path / "left").values()), list(toes(tmp_path / "told").values()))
     np.testing.assert_allclose(taken, scale.pop(), atol=1e-5)
-    zero = import_folder(takes, tmp_path / "zero", How(floor=0))
+    zero = import_folder(takes, tmp_path / "zero", ImportSettings(floor=0))
     assert [clip.floor for clip in zero.clips] == [0.0] * 3
 
 
@@ -250,7 +250,7 @@ def test_a_clip_without_a_floor_says_so(takes: Path, tmp_path: Path) -> None:
 
 def test_patterns_of_takes_are_checked(takes: Path, tmp_path: Path) -> None:
     with refuse("take: '('"):
-        import_folder(takes, tmp_path / "out", How(takes=["("]))
+        import_folder(takes, tmp_path / "out", ImportSettings(takes=["("]))
 
 
 def test_clips_that_are_each_read_from_a_frame_are_noted(tmp_path: Path) -> None:
@@ -270,14 +270,14 @@ def test_several_up_axes_of_one_skeleton_are_noted(tmp_path: Path) -> None:
     for name, up in (("a", "y"), ("b", "z"), ("c", "y")):
         text = performed(replace(chosen, up=up), walk).text()
         write(tmp_path / "source", text, f"{name}.bvh")
-    notes = import_folder(tmp_path / "source", tmp_path / "out", How(skeleton=str(path))).notes
+    notes = import_folder(tmp_path / "source", tmp_path / "out", ImportSettings(skeleton=str(path))).notes
     assert "cmu_daz: up is found as y in 2 clips, z in 1 clips; tell it in the map if that is wrong" in notes
 
 
 def test_faults_are_kept_in_the_record(tmp_path: Path) -> None:
     chosen, walk = load_skeleton("cmu_daz"), synthesize_clip("walking", 1, seconds=2.0)
     write(tmp_path, performed(chosen, replace(walk, trans=walk.trans + np.array([0, 0, 2.0]))).text())
-    report = import_folder(tmp_path / "clip.bvh", tmp_path / "out", How(floor=NONE))
+    report = import_folder(tmp_path / "clip.bvh", tmp_path / "out", ImportSettings(floor=NONE))
     assert report.clips[0].faults[0].startswith("the feet stay 2.")
     record = json.loads((tmp_path / "out" / "import.json").read_text())
     assert record["clips"][0]["faults"] == list(report.clips[0].faults)
@@ -288,7 +288,7 @@ def test_clips_with_faults_are_left_out_where_only_sound_ones_are_wanted(tmp_pat
     write(tmp_path / "in", performed(chosen, walk).text(), "sound.bvh")
     hanging = replace(walk, trans=walk.trans + np.array([0, 0, 2.0]))
     write(tmp_path / "in", performed(chosen, hanging).text(), "hanging.bvh")
-    report = import_folder(tmp_path / "in", tmp_path / "out", How(floor=NONE, sound=True))
+    report = import_folder(tmp_path / "in", tmp_path / "out", ImportSettings(floor=NONE, sound=True))
     assert [clip.clip for clip in report.clips] == ["sound.npz"]
     assert report.skipped[0].file == "hanging.bvh"
     assert "the feet stay 2." in report.skipped[0].reason

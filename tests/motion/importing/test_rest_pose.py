@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh import read_bvh
-from memmlp.motion.importing.recording import perform
+from memmlp.motion.importing.recording import pick_joints
 from memmlp.motion.importing.rest_pose import RestPose, find_rest_pose
 from memmlp.motion.importing.skeleton import SkeletonMap, load_skeleton
 from memmlp.motion.synthetic import synthesize_clip
@@ -33,7 +33,7 @@ def found(
 ) -> RestPose:
     """The stance of a file written by one map and read by another."""
     bvh = read_bvh(write(folder, performed(written, clip, turns=turns).text()))
-    return find_rest_pose(bvh, chosen, perform(bvh, chosen))
+    return find_rest_pose(bvh, chosen, pick_joints(bvh, chosen))
 
 
 def whole(turn: Rotation) -> np.ndarray:
@@ -64,7 +64,7 @@ def test_a_runner_whose_feet_point_back_is_no_stance(tmp_path: Path, walk: Clip)
     turns = random_turns(own_tree(DAZ), 1)
     first = found(tmp_path, walk, DAZ, turns=turns)
     bvh = read_bvh(tmp_path / "clip.bvh")
-    performance = perform(bvh, DAZ)
+    performance = pick_joints(bvh, DAZ)
     frame = int(first.source.split()[1].rstrip(","))
     for ankle, toes in ((7, 10), (8, 11)):
         foot = performance.positions[frame, toes] - performance.positions[frame, ankle]
@@ -110,10 +110,10 @@ def test_hips_at_one_place_are_refused(tmp_path: Path) -> None:
     chosen = load_skeleton("cmu_daz")
     flat = replace(bvh, offsets=offsets)
     with refuse(bvh.path, "the hips are at the same place"):
-        find_rest_pose(flat, chosen, perform(flat, chosen))
+        find_rest_pose(flat, chosen, pick_joints(flat, chosen))
     nothing = replace(bvh, offsets=bvh.offsets * 0, values=bvh.values * 0)
     with refuse(bvh.path, "pelvis and head are at the same place"):
-        find_rest_pose(nothing, chosen, perform(nothing, chosen))
+        find_rest_pose(nothing, chosen, pick_joints(nothing, chosen))
 
 
 # Left and right
@@ -160,7 +160,7 @@ def test_mirrored_bones_are_refused(tmp_path: Path) -> None:
     bvh, chosen = read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz")
     behind = replace(bvh, offsets=bvh.offsets * [-1, 1, 1])
     with refuse(bvh.path, "the feet point backward, so left and right may be swapped"):
-        find_rest_pose(behind, chosen, perform(behind, chosen))
+        find_rest_pose(behind, chosen, pick_joints(behind, chosen))
 
 
 # A map's rest

@@ -17,7 +17,7 @@ from memmlp.motion.formats.bvh import END, Bvh, read_bvh
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
 from memmlp.motion.importing.anatomy import segments
 from memmlp.motion.importing.convert import NONE, convert
-from memmlp.motion.importing.recording import perform
+from memmlp.motion.importing.recording import pick_joints
 from memmlp.motion.importing.retarget import Retargeting, fit
 from memmlp.motion.importing.skeleton import SkeletonMap, find_skeleton, load_skeleton
 from memmlp.motion.synthetic import synthesize_clip
@@ -32,7 +32,7 @@ def imported(bvh: Bvh, chosen: SkeletonMap, rest: np.ndarray = REST) -> Clip:
 
 
 def fitted(bvh: Bvh, chosen: SkeletonMap, rest: np.ndarray = REST) -> Retargeting:
-    return fit(bvh, chosen, perform(bvh, chosen), rest)
+    return fit(bvh, chosen, pick_joints(bvh, chosen), rest)
 
 
 def on_body(clip: Clip, body: np.ndarray = REST) -> tuple[np.ndarray, np.ndarray]:

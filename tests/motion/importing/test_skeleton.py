@@ -11,8 +11,8 @@ from bvh_samples import TREES, person, read, refuse, write
 
 from memmlp.common.errors import InputError
 from memmlp.motion.formats.bvh import read_bvh
-from memmlp.motion.importing.folder import How, import_folder
-from memmlp.motion.importing.recording import perform
+from memmlp.motion.importing.folder import ImportSettings, import_folder
+from memmlp.motion.importing.recording import pick_joints
 from memmlp.motion.importing.skeleton import SKELETONS, find_skeleton, load_skeleton, shipped_skeletons
 
 
@@ -24,7 +24,7 @@ def test_shipped_maps() -> None:
 
 @pytest.mark.parametrize("skeleton", TREES)
 def test_units_give_people(tmp_path: Path, skeleton: str) -> None:
-    own = perform(read(tmp_path, skeleton), load_skeleton(skeleton)).zero
+    own = pick_joints(read(tmp_path, skeleton), load_skeleton(skeleton)).zero
     assert 0.75 < sum(np.linalg.norm(own[child] - own[joint]) for joint, child in ((1, 4), (4, 7))) < 0.9
 
 
@@ -60,7 +60,7 @@ def test_a_users_map(tmp_path: Path) -> None:
     path = user_map(tmp_path, unit=0.011, calibration_frame=False)
     assert load_skeleton(str(path)).unit == 0.011
     file = write(tmp_path, person("cmu_daz", 4, 0).text())
-    report = import_folder(file, tmp_path / "out", How(skeleton=str(path)))
+    report = import_folder(file, tmp_path / "out", ImportSettings(skeleton=str(path)))
     assert [(clip.skeleton, clip.frames) for clip in report.clips] == [("mine", 4)]
 
 

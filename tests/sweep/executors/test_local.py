@@ -15,7 +15,7 @@ import pytest
 from processes import ignoring_interrupts, until
 
 from memmlp.sweep.executors.local import Debug, Local
-from memmlp.sweep.executors.submitted import Requeued
+from memmlp.sweep.executors.submitit_jobs import Requeued
 
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # logs stay open
 

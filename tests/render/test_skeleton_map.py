@@ -14,7 +14,7 @@ from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.importing.skeleton import find_skeleton
 from memmlp.motion.importing.stance import find_stance
-from memmlp.render.skeleton import HEIGHT, LEFT, MIDDLE, RIGHT, WIDTH, skeleton_png, spread
+from memmlp.render.skeleton_map import HEIGHT, LEFT, MIDDLE, RIGHT, WIDTH, skeleton_png, spread
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,8 @@
-"""Several processes that train one run together, as torchrun starts them: each with its share of a batch.
+"""Data-parallel training of one run by several processes, as torchrun starts them.
 
-Every process draws the whole batch of a step, from the same seed, and works on its own rows. What is learned
-from is the mean over all, so that the run is the one that a single process trains. Without torchrun there is
-one process, and nothing here does anything.
+Every process draws the whole batch of a step, from the same seed, and works on its own rows, its share of the
+batch. What is learned from is the mean over all, so that the run is the one that a single process trains.
+Without torchrun there is one process, and nothing here does anything.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def of_first(value: T) -> T:
 
 @contextlib.contextmanager
 def sharing() -> Iterator[None]:
-    """Work on this process' share of a batch herein, where there are several processes."""
+    """Within this context, tensors are this process' share of the batch, if there are several processes."""
     _Step.shared = size() > 1
     try:
         yield
@@ -112,7 +112,7 @@ def whole(rows: Tensor) -> Tensor:
 
 
 def drawn(draw: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
-    """Return this process' rows of what is drawn for the whole batch, as a single process draws it.
+    """Draw random numbers for the whole batch, as a single process does, and return this process' rows.
 
     Args:
         draw: draws, given a tensor with the shape of the whole batch.
@@ -124,7 +124,7 @@ def drawn(draw: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
 
 
 def mean(values: Tensor) -> Tensor:
-    """Return the mean over all processes of a tensor, each of which is a mean over as many rows."""
+    """Average a tensor over all processes, whose shares of the batch are equally large."""
     if size() == 1:
         return values
     from torch import distributed

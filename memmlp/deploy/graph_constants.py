@@ -28,7 +28,7 @@ class Constants:
             self.known[name] = self.graph.initializer[-1]
         return name
 
-    def sweep(self) -> None:
+    def remove_unused(self) -> None:
         """Take out the constants that no node uses any more."""
         used = {name for node in self.graph.node for name in node.input}
         used |= {output.name for output in self.graph.output}

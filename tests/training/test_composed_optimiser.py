@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from memmlp.training.composed import ComposedOptimiser
+from memmlp.training.composed_optimiser import ComposedOptimiser
 
 
 def network() -> nn.Linear:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.common.errors import InputError
 from memmlp.pipeline.experiment import Experiment
 from memmlp.pipeline.run_stages import Outcome, run_experiment
 from memmlp.runs.run import Run
 
 
-def run_together(experiment: Experiment) -> Outcome | None:
+def run_distributed(experiment: Experiment) -> Outcome | None:
     """Bring the experiment's run to its end; without torchrun that is `run_experiment`.
 
     The first process holds the run's lock, prepares the data, writes, evaluates and deploys. It tells the
@@ -18,21 +18,21 @@ def run_together(experiment: Experiment) -> Outcome | None:
     Returns:
         None in the processes that trained along.
     """
-    if experiment.base and parallel.size() > 1:
+    if experiment.base and distributed.size() > 1:
         raise InputError("refiner: several processes can't train it; allowed is one process, or refiner=null")
-    parallel.connect(experiment.device.type)
-    if not parallel.first():
+    distributed.connect(experiment.device.type)
+    if not distributed.first():
         _train_along(experiment)
         return None
     outcome = run_experiment(experiment)
-    parallel.of_first("end")
-    parallel.leave()
+    distributed.of_first("end")
+    distributed.leave()
     return outcome
 
 
 def _train_along(experiment: Experiment) -> None:
     """Train the stages that the first process names, until it is at the end."""
-    while (stage := parallel.of_first("")) != "end":
+    while (stage := distributed.of_first("")) != "end":
         data = experiment.data.prepare()  # the first process has prepared it
         chain = [*experiment.above(data.digest), experiment.identity(data.digest)]
         runs = [Run.of(experiment.outputs, identity.id) for identity in chain]
@@ -40,4 +40,4 @@ def _train_along(experiment: Experiment) -> None:
         training = (*experiment.upstream, experiment.training)[number]
         weights = runs[number - 1].weights() if number else None
         training.train(experiment.architecture, data, weights, runs[number], experiment.device)
-    parallel.leave()
+    distributed.leave()

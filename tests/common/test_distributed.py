@@ -16,11 +16,11 @@ from shared_training import STEPS, dying, optim_of, precise, together
 from tiny_tasks import motion_task, weights
 from torch import nn
 
-from memmlp.common import parallel
+from memmlp.common import distributed
 from memmlp.common.errors import InputError
 from memmlp.networks import checkpoint, layers
 from memmlp.runs.run import Run
-from memmlp.training.loop import check_shares, train
+from memmlp.training.loop import check_divisible, train
 
 NAMES = ("streams", "joint", "avatar_poser", "agrol_diffusion", "muon", "schedule_free", "vqvae")
 """Tasks with all that could differ: states, blends, passes, codes that restart, dropout, noise, averages."""
@@ -92,20 +92,20 @@ def test_two_processes_train_the_weights_of_one_and_take_over_from_each_other(tm
 @pytest.fixture
 def two(monkeypatch: pytest.MonkeyPatch) -> None:
     """This process is the second of two, which are not connected."""
-    monkeypatch.setattr(parallel, "size", lambda: 2)
-    monkeypatch.setattr(parallel, "rank", lambda: 1)
+    monkeypatch.setattr(distributed, "size", lambda: 2)
+    monkeypatch.setattr(distributed, "rank", lambda: 1)
 
 
 def test_rows_and_draws_of_the_second_of_two(two: None):
     batch = torch.arange(8.0).reshape(4, 2)
-    assert torch.equal(parallel.own(batch), batch)  # outside of a step
-    with parallel.sharing():
-        assert torch.equal(parallel.own(batch), batch[2:])
+    assert torch.equal(distributed.own(batch), batch)  # outside of a step
+    with distributed.sharing():
+        assert torch.equal(distributed.own(batch), batch[2:])
         torch.manual_seed(3)
-        rows = parallel.drawn(torch.rand_like, batch[2:])
+        rows = distributed.drawn(torch.rand_like, batch[2:])
     torch.manual_seed(3)
     assert torch.equal(rows, torch.rand_like(batch)[2:])
-    assert torch.equal(parallel.own(batch), batch)
+    assert torch.equal(distributed.own(batch), batch)
 
 
 def test_dropout_is_that_of_the_whole_batch(two: None):
@@ -113,7 +113,7 @@ def test_dropout_is_that_of_the_whole_batch(two: None):
     torch.manual_seed(1)
     expected = layer(batch)
     torch.manual_seed(1)
-    with parallel.sharing():
+    with distributed.sharing():
         assert torch.equal(layer(batch[3:]), expected[3:])
         assert torch.equal(layer.eval()(batch), batch)
 
@@ -121,8 +121,8 @@ def test_dropout_is_that_of_the_whole_batch(two: None):
 def test_a_batch_that_cannot_be_shared_is_refused(two: None):
     task = motion_task()
     with pytest.raises(InputError, match=r"network: a batch of 5 .* on 2 .*: allowed is a multiple of 2"):
-        check_shares(task, replace(STEPS, batch=5), "network")
-    check_shares(task, STEPS, "network")
+        check_divisible(task, replace(STEPS, batch=5), "network")
+    check_divisible(task, STEPS, "network")
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_layers_that_would_draw_or_count_by_themselves_are_refused(two: None, la
     task = motion_task()
     task.module.add_module("own", layer)
     with pytest.raises(InputError, match=f"{name} on 2 processes"):
-        check_shares(task, STEPS, "network")
+        check_divisible(task, STEPS, "network")
 
 
 def test_layers_that_draw_for_the_whole_batch_or_nothing_are_not():
@@ -147,10 +147,10 @@ def test_one_process_shares_nothing(monkeypatch: pytest.MonkeyPatch):
     """Variables that a cluster sets for its own jobs are none of torchrun's."""
     monkeypatch.setenv("WORLD_SIZE", "4")
     monkeypatch.delenv("TORCHELASTIC_RUN_ID", raising=False)
-    assert (parallel.size(), parallel.rank(), parallel.first()) == (1, 0, True)
+    assert (distributed.size(), distributed.rank(), distributed.first()) == (1, 0, True)
     value = torch.rand(3)
-    with parallel.sharing():
-        assert parallel.own(value) is value
-        assert parallel.whole(value) is value
-        assert parallel.mean(value) is value
-    assert parallel.of_first("a") == "a"
+    with distributed.sharing():
+        assert distributed.own(value) is value
+        assert distributed.whole(value) is value
+        assert distributed.mean(value) is value
+    assert distributed.of_first("a") == "a"

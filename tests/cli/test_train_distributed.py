@@ -20,10 +20,12 @@ ROOT = Path(__file__).parent.parent.parent
 
 @pytest.mark.slow
 def test_two_processes_make_the_run_of_one(tiny_home: Path, tmp_path: Path):
-    """Its VQ-VAE and its network; the first process alone writes, evaluates and deploys."""
+    """Its VQ-VAE and its network; the first process alone writes and evaluates (and would deploy)."""
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-    ran = finished([*TORCHRUN, "-m", "memmlp", "train", *TINY], cwd=tmp_path, env=environment)
+    ran = finished(
+        [*TORCHRUN, "-m", "memmlp", "train", *TINY, "export.graph=off"], cwd=tmp_path, env=environment
+    )
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert ran.stdout.count("MPJPE") == 1
     runs = {run.id: run for run in list_runs(tmp_path / "outputs")}
@@ -32,9 +34,9 @@ def test_two_processes_make_the_run_of_one(tiny_home: Path, tmp_path: Path):
         other = runs[one.id]
         assert (one.manifest["processes"], other.manifest["processes"]) == (1, 2)
         assert [m.step for m in one.metrics()] == [m.step for m in other.metrics()]
-        assert [a["stage"] for a in one.manifest["attempts"]] == [
-            a["stage"] for a in other.manifest["attempts"]
-        ]
+        stages = [attempt["stage"] for attempt in one.manifest["attempts"]]
+        own = [stage for stage in stages if stage != "deployment"]
+        assert [attempt["stage"] for attempt in other.manifest["attempts"]] == own
         assert other.verify() == []
         ours, theirs = checkpoint.read(one.model)[0], checkpoint.read(other.model)[0]
         for name, tensor in ours.items():

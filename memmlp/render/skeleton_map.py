@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.lines import Line2D
@@ -59,11 +60,11 @@ def _place(positions: np.ndarray, middle: float, axis: int, scale: float) -> np.
     return np.stack([middle + scale * positions[:, axis], height - scale * positions[:, 1]], -1)
 
 
-def _line(sheet: Sheet, points: np.ndarray, **style: object) -> None:
+def _line(sheet: Sheet, points: np.ndarray, **style: Any) -> None:
     """Add a line through points (n, 2) of the picture."""
     size = sheet.figure.get_size_inches() * DPI
     x, y = points[:, 0] / size[0], 1 - points[:, 1] / size[1]
-    sheet.figure.add_artist(Line2D(x, y, **style))  # type: ignore[arg-type]
+    sheet.figure.add_artist(Line2D(x, y, **style))
 
 
 def _colour(joint: str) -> str:

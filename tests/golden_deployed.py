@@ -1,0 +1,58 @@
+"""Numbers of exported streams, for tests/golden.py."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import tiny
+from golden_numbers import Numbers, summary
+
+from memmlp.deploy import latency
+from memmlp.deploy.export import export
+from memmlp.deploy.half import halve
+from memmlp.deploy.parity import streamed
+from memmlp.deploy.quantization import quantise
+from memmlp.deploy.session import OnnxStream
+from memmlp.networks.streaming import streaming
+
+GRAPHS: dict[str, Callable] = {"graph.streaming": streaming, "graph.naive": lambda network: network}
+
+
+def deployed(graph: str) -> Numbers:
+    """An exported stream on a clip, and what its sizes are."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "step.onnx"
+        path.write_bytes(exported(graph))
+        motion = streamed(OnnxStream(path), tiny.clip(25))
+    return summary("motion", motion) | {"macs": float(latency.macs(GRAPHS[graph](tiny.model())))}
+
+
+@cache
+def exported(graph: str) -> bytes:
+    """The ONNX file of a graph of the first tiny network."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "step.onnx"
+        export(GRAPHS[graph](tiny.model()), path, "0" * 16)
+        return path.read_bytes()
+
+
+def int8() -> Numbers:
+    """An exported stream in int8."""
+    stream = streaming(tiny.model())
+    with tempfile.TemporaryDirectory() as folder:
+        exact, quantised = (Path(folder) / f"{name}.onnx" for name in ("exact", "quantised"))
+        exact.write_bytes(exported("graph.streaming"))
+        quantise(exact, quantised, stream.ends, [tiny.clip(40)])
+        return summary("motion", streamed(OnnxStream(quantised), tiny.clip(25)))
+
+
+def fp16() -> Numbers:
+    """An exported stream in fp16."""
+    with tempfile.TemporaryDirectory() as folder:
+        exact, half = (Path(folder) / f"{name}.onnx" for name in ("exact", "half"))
+        exact.write_bytes(exported("graph.streaming"))
+        halve(exact, half, streaming(tiny.model()).ends)
+        return summary("motion", streamed(OnnxStream(half), tiny.clip(25)))
