@@ -63,12 +63,17 @@ settings.load_profile("memmlp")
 # Networks are tiny and test processes many: more threads only wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-# Begun first, so that no process is left alone with one of them at the end.
+# Begun first, so that no process is left alone with one of them at the end. Those that mostly wait for other
+# processes stand among those that compute.
 LONGEST = (
-    "kills/test_rounds", "kills/test_search", "kills/test_sweep", "cli/test_tune", "config/test_build",
-    "pipeline/test_run_stages", "cli/test_sweep", "live/test_full_graph", "deploy/test_deployment",
-    "pipeline/test_experiment", "kills/test_command", "pipeline/test_baselines", "live/test_stream",
-    "networks/test_streaming", "kills/test_training", "config/test_compose",
+    "cli/test_sweep", "deploy/test_deployment", "config/test_build", "pipeline/test_run_stages",
+    "kills/test_search", "pipeline/test_experiment", "live/test_full_graph", "pipeline/test_baselines",
+    "test_example_package", "networks/test_streaming", "training/test_loop", "config/test_baselines",
+    "kills/test_rounds", "config/test_compose", "cli/test_main", "live/test_stream",
+    "kills/test_sweep", "tables/test_rounds", "networks/baselines/test_baselines", "deploy/test_export",
+    "cli/test_tune", "web/test_page", "ui/test_page", "kills/test_command", "kills/test_training",
+    "cli/test_train_distributed", "tracking/test_mlflow_server", "tracking/test_mlflow_tracker",
+    "live/player/test_live_page", "training/test_distributed", "cli/test_look",
 )  # fmt: skip
 
 SLOW_TIMEOUT = 3600  # seconds: ends what hangs, but not what is slow on a machine with much other work
