@@ -73,7 +73,7 @@ LONGEST = (
     "kills/test_sweep", "tables/test_rounds", "networks/baselines/test_baselines", "deploy/test_export",
     "cli/test_tune", "web/test_page", "ui/test_page", "kills/test_command", "kills/test_training",
     "cli/test_train_distributed", "tracking/test_mlflow_server", "tracking/test_mlflow_tracker",
-    "live/player/test_live_page", "training/test_distributed", "cli/test_look",
+    "live/player/test_live_page", "common/test_distributed", "cli/test_look",
 )  # fmt: skip
 
 SLOW_TIMEOUT = 3600  # seconds: ends what hangs, but not what is slow on a machine with much other work
