@@ -54,7 +54,8 @@
   }
 
   // Play frames of trackers (joints) at 60 Hz with devices that sit on the body as `offsets` say; resolves at the end.
-  kept.play = async (frames, offsets) => {
+  // The last one is kept until `over()` holds.
+  kept.play = async (frames, offsets, over = () => true) => {
     const { inverse, minus, multiply, rotate } = await import('./rotations.js');
     const worn = trackers => trackers.map(({ position, rotation }, i) => {
       const turned = multiply(rotation, inverse(offsets.rotations[i]));
@@ -63,8 +64,8 @@
     const began = performance.now();
     for (;;) {
       const frame = Math.floor((performance.now() - began) * 0.06);
-      if (frame >= frames.length) return frames.length;
-      kept.put(worn(frames[frame]));
+      if (frame >= frames.length && over()) return frames.length;
+      kept.put(worn(frames[Math.min(frame, frames.length - 1)]));
       await new Promise(resolve => kept.session.requestAnimationFrame(resolve));
     }
   };

@@ -116,7 +116,7 @@ def worn(browser: Browser, site: Made) -> dict[str, Any]:
         "import('./headset.js').then(module => { window.offsets = module.usualOffsets('controllers'); })"
     )
     browser.value(f"window.tPose = {json.dumps(t_pose(site))}; headset.pull()")
-    browser.resolved("headset.play(Array(210).fill(tPose), offsets)")
+    browser.resolved(f"headset.play([tPose], offsets, () => {SITE}.calibrated)")
     browser.resolved(f"headset.play({json.dumps(joints())}, offsets)")
     browser.resolved("headset.session.end()")
     browser.value("document.querySelector('#save').click()")

@@ -145,6 +145,7 @@ class Wear {
     if (kind === null || kind === worn.kind) return;
     if (worn.kind !== null && worn.calibrated) this.mirror.tell(`Now ${kind}:`, ...INVITE);
     Object.assign(worn, { kind, calibrated: false });
+    delete document.documentElement.dataset.calibrated;
     worn.stream.offsets = usualOffsets(kind);
     worn.stream.reset();
   }
@@ -165,6 +166,7 @@ class Wear {
       if (!trackers.includes(null)) this.scaled(trackers[0]);
       worn.stream.calibrate(...trackers);
       worn.calibrated = true;
+      document.documentElement.dataset.calibrated = 'yes';
       this.stand(trackers[0]);
       mirror.tell(`Calibrated, ${worn.tall.toFixed(2)} m tall.`, 'Pull a trigger or pinch to do it again.');
       worn.tape?.push({ calibrated: worn.stream.offsets, height: worn.tall });
