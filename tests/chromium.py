@@ -19,6 +19,11 @@ from processes import until
 SETPRIV = shutil.which("setpriv")
 MODEST = [SETPRIV, "--bounding-set=-sys_nice"] if SETPRIV and os.geteuid() == 0 else []
 """What keeps a root's browser from a priority above all others', which its drawing by software takes."""
+DRAWN = """{
+  const display = window.requestAnimationFrame.bind(window);
+  window.requestAnimationFrame = callback => setTimeout(() => display(callback), 40);
+}"""
+"""What lets a page draw so seldom that everything else has its turn, too: software draws slowly."""
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
@@ -48,6 +53,7 @@ class Browser:
         self.size(width, height)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[scheme])
+        self.before(DRAWN)
 
     def size(self, width: int, height: int) -> None:
         """The page's size in pixels."""

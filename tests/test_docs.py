@@ -77,12 +77,12 @@ def checks(text: str) -> None:
         given = [words[at + 1].partition("=")[0] for at, word in enumerate(words) if word == "--build-arg"]
         assert set(given) <= set(known)
     else:
-        known = words[:2] in INSTALLS or words[:3] == SERVER
+        known = words[:2] in INSTALLS or words[:3] in MODULES
         assert known or program in ("git", "cd", "source", "build/full_body"), text
 
 
 INSTALLS = (["pip", "install"], ["npm", "install"], ["cmake", "--build"])
-SERVER = ["python", "-m", "http.server"]
+MODULES = (["python", "-m", "http.server"], ["python", "-m", "venv"])
 
 
 def runs_example(words: list[str]) -> None:

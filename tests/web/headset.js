@@ -1,9 +1,6 @@
 // A headset in software (IWER), whose head and hands a test moves. It runs before the page's own scripts.
 
 (() => {
-  // Software draws slowly: the display has so few frames a second that the page's other work has its turn, too.
-  const display = window.requestAnimationFrame.bind(window);
-  window.requestAnimationFrame = callback => setTimeout(() => display(callback), window.betweenFrames ?? 0);
   const device = new IWER.XRDevice(IWER.metaQuest3, { stereoEnabled: false });
   device.installRuntime({ forceInstall: true });
   const kept = { device, saved: null };

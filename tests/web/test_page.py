@@ -55,7 +55,6 @@ def test_it_is_worn_played_timed_and_copied_without_the_server(site: Made, tmp_p
     (script,) = package_files(IWER, "build/iwer.min.js")
     with Browser(tmp_path / "profile", 360, 280) as browser:
         browser.before(script.decode() + HEADSET.read_text())
-        browser.before("window.betweenFrames = 40")
         browser.before(COPY)
         server = Server(site.folder)
         try:

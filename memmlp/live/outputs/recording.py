@@ -138,7 +138,7 @@ class Recorder:
         """Return what must be known of the files' frames."""
         remarks = []
         if self.breaks:
-            remarks.append(f"{self.breaks} breaks left out")
+            remarks.append(f"{self.breaks} break{'s' * (self.breaks > 1)} left out")
         if self.filled:
             remarks.append(f"{self.filled} of {self.count} frames interpolated")
         return "".join(f", {remark}" for remark in remarks)

@@ -187,7 +187,8 @@ class ClipSource:
         now = self.clock()
         self.began = now if self.began is None else self.began
         due = int((now - self.began) * self.hz + 1e-6)
-        dropped = max(due - self.next, 0)
+        last = self.rounds * self.count - 1  # who comes late to the end gets it, and no round that is none
+        dropped = int(max(min(due, last) - self.next, 0))
         index = self.next + dropped
         self.sleep(max(self.began + index / self.hz - now, 0))
         self.next = index + 1

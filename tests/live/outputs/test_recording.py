@@ -61,7 +61,7 @@ def test_breaks_are_left_out_and_told(recording, tmp_path: Path, told: list[str]
         made.take(frame(5 + later + index / 60, restarted=index == 0))
     made.close()
     assert len(read_clip(tmp_path / "a.npz", "a")) == 20
-    assert told[0].endswith("0.3 s, 1 breaks left out")
+    assert told[0].endswith("0.3 s, 1 break left out")
 
 
 def test_nothing_is_written_before_the_end_and_nothing_without_a_frame(recording, tmp_path: Path, told):

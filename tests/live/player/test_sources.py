@@ -87,6 +87,17 @@ def test_a_round_follows_after_a_pause(clip: TrackedClip):
     assert np.array_equal(played.truth(samples[120].time), played.truth(0.0))
 
 
+def test_who_is_late_at_the_end_gets_the_last_sample(clip: TrackedClip):
+    clock = Clock()
+    played = source(clip, 60, clock)
+    for _ in range(115):
+        played.read()
+    clock.now += 0.5
+    sample = played.read()
+    assert (sample.time, sample.dropped) == (pytest.approx(119 / 60), 4)
+    assert played.over
+
+
 @pytest.mark.parametrize(("kind", "space"), [("udp", "amass"), ("osc", "unity")])
 def test_a_clip_arrives_as_packets(clip: TrackedClip, kind: str, space: str):
     pack, parse = PACKETS[kind]
