@@ -114,6 +114,7 @@ def test_a_second_owner_is_refused(home: Path):
         ("~search.n_trials", "search.n_trials: has no value"),
         ("+search.nonsense=1", "search.nonsense: no such key; allowed are name"),
         ("executor=cloud", "executor=cloud: allowed is local, slurm, ray or dask"),
+        ("executor=debug", "executor=debug: allowed of a search is local, slurm, ray or dask"),
     ],
 )
 def test_bad_searches_are_refused_before_anything_runs(tmp_path: Path, word: str, message: str):

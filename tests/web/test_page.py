@@ -132,7 +132,7 @@ def check_wearer(recording: dict[str, Any], site: Made) -> None:
     worn = recording["worn"]  # how the devices sat on the network's own body, laid as near as it can be
     np.testing.assert_allclose(offsets.rotations, worn["rotations"], atol=1e-5)
     np.testing.assert_allclose(offsets.positions[0], 2 / 3 * np.array(worn["positions"][0]), atol=1e-5)
-    found = stream.calibrate(*given(recording["samples"][begun - 1]["trackers"]))
+    found = stream.calibrate(*given(calibrated[0]["at"]))
     np.testing.assert_allclose(found.positions, offsets.positions, atol=1e-5)
     stream.offsets = matrices(offsets)
     for sample in recording["samples"][begun + 1 :]:
