@@ -16,15 +16,15 @@ import tiny
 import torch
 from golden_deployed import deployed, fp16, int8
 from golden_numbers import Numbers, changed, summary, tolerance
-from tiny_tasks import part_task
-from torch import Tensor, nn
+from golden_trained import frames, optimised, parts, refiner, training, vqvae
+from torch import Tensor
 
 from memmlp.evaluation import metrics
 from memmlp.evaluation import modes as evaluation
 from memmlp.evaluation.ik import LBFGS
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.coordinates import Heading, HeadRelative, World
-from memmlp.motion.dataset import MotionDataset, WindowSampler
+from memmlp.motion.dataset import WindowSampler
 from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.cells import CELLS
@@ -35,18 +35,14 @@ from memmlp.networks.memory import (
     LSTMMemory,
     NoCodesMemory,
     NoMemory,
-    State,
 )
 from memmlp.networks.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
-from memmlp.networks.refiner import SAGERefiner
-from memmlp.networks.vqvae import VQVAE
 from memmlp.networks.window_model import WindowModel
 from memmlp.runs.recipe_numbers import RECIPES
-from memmlp.training.loop import seed_step, train_step
+from memmlp.training.loop import seed_step
 from memmlp.training.losses import (
     AGRoLLoss,
     AvatarPoserLoss,
-    Fixed,
     HandFK,
     HandPosition,
     Loss,
@@ -54,25 +50,15 @@ from memmlp.training.losses import (
     MotionLoss,
     NoHand,
     OwnLoss,
-    Terms,
     TermsLoss,
     Uncertainty,
 )
 from memmlp.training.losses.terms import ERRORS, TERMS
-from memmlp.training.network import MotionTask
-from memmlp.training.optim import Muon, Optim, ScheduleFree, vqvae_optim
-from memmlp.training.refiner import RefinerTask, RefinerTraining, sage_loss
+from memmlp.training.optim import Muon, Optim, ScheduleFree
 from memmlp.training.rollout import OwnPredictions, PersistentStreams, Rollout, TeacherForcing
-from memmlp.training.sage import PARTS, DroppingOptim, PartTask
-from memmlp.training.vqvae import VQVAETask
 
 PATH = Path(__file__).with_name("golden.json")
 BOTH = frozenset({"rotation", "position"})
-
-
-def frames() -> MotionDataset:
-    """Three clips, one shorter than most windows are not."""
-    return tiny.frames((60, 45, 80))
 
 
 def pair() -> tuple[Tensor, Tensor]:
@@ -120,29 +106,6 @@ def _used(model: WindowModel, clip: Tensor) -> Numbers:
     return found
 
 
-def vqvae(codebook: str = "ema") -> Numbers:
-    """Three steps of its training, and what it then makes of frames."""
-    torch.manual_seed(3)
-    model = VQVAE(codes=8, width=12, encoder_depth=2, codebook=codebook)
-    optim = vqvae_optim(3, 16, 1e-3, 0.1)
-    task = VQVAETask(model, tiny.normalizer(), frames(), frames(), optim, seed=0)
-    return _trained(task, optim) | task.validate()
-
-
-def _trained(task: VQVAETask | MotionTask | RefinerTask | PartTask, optim: Optim) -> Numbers:
-    """The losses of three steps, and the weights after them."""
-    optimiser, found = optim.build(task.parameter_groups()), {}
-    average = optim.average(task.module, optimiser)
-    for step in range(optim.steps):
-        seed_step(0, step)
-        result = train_step(task, optim, optimiser, step)
-        average.update(step + 1)
-        found |= {f"{name} {step}": float(term.detach()) for name, term in result.terms.items()}
-    average.put_in_place()
-    weights = torch.cat([p.detach().flatten() for p in task.module.parameters()])
-    return found | summary("weights", weights)
-
-
 def sampler() -> Numbers:
     """Draws by frames and by clips."""
     found = {}
@@ -164,69 +127,6 @@ def schedule(name: str) -> Numbers:
     """Its course."""
     optim = Optim(steps=20, batch=1, lr=1e-2, final_lr=1e-4, schedule=name, drop_at=0.6)
     return {str(step): optim.factor(step) for step in range(20)}
-
-
-class Line(WindowModel):
-    """A linear map of each frame: a network for the training loop alone."""
-
-    branches = BOTH
-
-    def __init__(self) -> None:
-        super().__init__(tiny.normalizer(World()), 7)
-        self.map = nn.Linear(SPARSE_DIM, 198)
-
-    def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        inputs, kept = self.taken_in(sparse, state)
-        return self.map(inputs[:, -(newest or self.frames) :]), kept
-
-    def auxiliary_losses(self, truth: Tensor) -> Terms:
-        return {"own": self.map.bias.square().sum()}
-
-
-class Squares(Loss):
-    """The mean square: a loss for the training loop alone."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.weighting = Fixed({"square": 2.0})
-
-    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
-        return {"square": (motion - truth).square().mean()}
-
-
-def training() -> Numbers:
-    """Three steps of the loop, with AdamW and Adam, and clipped."""
-    found = {}
-    for name, changes in {"adamw": {}, "adam": {"decoupled": False}, "clipped": {"clip_norm": 0.1}}.items():
-        found |= {f"{name} {key}": value for key, value in optimised(**changes).items()}
-    return found
-
-
-def optimised(kind: type[Optim] = Optim, **changes: float) -> Numbers:
-    """Three steps of the loop with an optimiser."""
-    torch.manual_seed(2)
-    optim = kind(steps=3, batch=4, lr=1e-2, final_lr=1e-3, weight_decay=0.1, **changes)
-    task = MotionTask(Line(), Squares(), TeacherForcing(), frames(), optim, 0, lambda network: {})
-    return _trained(task, optim)
-
-
-def refiner() -> Numbers:
-    """Three steps of its training behind a network, and what both then stream."""
-    model, split, optim = tiny.refined(), frames(), Optim(steps=3, batch=4, lr=1e-2)
-    pieces = RefinerTraining(0, SAGERefiner(6, 2, 20, 6), optim, "frames").drawn(split)
-    task = RefinerTask(model, sage_loss(), split, pieces, optim, validate=lambda: {})
-    return _trained(task, optim) | summary("stream", evaluation.stream(model.eval(), [tiny.clip(25)])[0])
-
-
-def parts() -> Numbers:
-    """Three steps of each of SAGE-Net's parts that has a training of its own, and its errors then."""
-    optim = DroppingOptim(steps=3, batch=4, lr=1e-2, drops=(0.5,), drop=0.25)
-    found = {}
-    for kind in PARTS[:-1]:
-        task = part_task(kind, optim)
-        numbers = _trained(task, optim) | task.validate()
-        found |= {f"{kind} {name}": value for name, value in numbers.items()}
-    return found
 
 
 def rollout(make: Callable[[], Rollout]) -> Numbers:

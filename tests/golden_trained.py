@@ -1,0 +1,118 @@
+"""The numbers of golden.py that a few steps of training make: losses, and the weights after them."""
+
+from __future__ import annotations
+
+import tiny
+import torch
+from golden_numbers import Numbers, summary
+from tiny_tasks import part_task
+from torch import Tensor, nn
+
+from memmlp.evaluation import modes as evaluation
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.motion.coordinates import World
+from memmlp.motion.dataset import MotionDataset
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.memory import State
+from memmlp.networks.refiner import SAGERefiner
+from memmlp.networks.vqvae import VQVAE
+from memmlp.networks.window_model import WindowModel
+from memmlp.training.loop import seed_step, train_step
+from memmlp.training.losses import Fixed, Loss, Terms
+from memmlp.training.network import MotionTask
+from memmlp.training.optim import Optim, vqvae_optim
+from memmlp.training.refiner import RefinerTask, RefinerTraining, sage_loss
+from memmlp.training.rollout import TeacherForcing
+from memmlp.training.sage import PARTS, DroppingOptim, PartTask
+from memmlp.training.vqvae import VQVAETask
+
+
+def frames() -> MotionDataset:
+    """Three clips, one shorter than most windows are not."""
+    return tiny.frames((60, 45, 80))
+
+
+def vqvae(codebook: str = "ema") -> Numbers:
+    """Three steps of its training, and what it then makes of frames."""
+    torch.manual_seed(3)
+    model = VQVAE(codes=8, width=12, encoder_depth=2, codebook=codebook)
+    optim = vqvae_optim(3, 16, 1e-3, 0.1)
+    task = VQVAETask(model, tiny.normalizer(), frames(), frames(), optim, seed=0)
+    return _trained(task, optim) | task.validate()
+
+
+def _trained(task: VQVAETask | MotionTask | RefinerTask | PartTask, optim: Optim) -> Numbers:
+    """The losses of three steps, and the weights after them."""
+    optimiser, found = optim.build(task.parameter_groups()), {}
+    average = optim.average(task.module, optimiser)
+    for step in range(optim.steps):
+        seed_step(0, step)
+        result = train_step(task, optim, optimiser, step)
+        average.update(step + 1)
+        found |= {f"{name} {step}": float(term.detach()) for name, term in result.terms.items()}
+    average.put_in_place()
+    weights = torch.cat([p.detach().flatten() for p in task.module.parameters()])
+    return found | summary("weights", weights)
+
+
+class Line(WindowModel):
+    """A linear map of each frame: a network for the training loop alone."""
+
+    branches = frozenset({"rotation", "position"})
+
+    def __init__(self) -> None:
+        super().__init__(tiny.normalizer(World()), 7)
+        self.map = nn.Linear(SPARSE_DIM, 198)
+
+    def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
+        inputs, kept = self.taken_in(sparse, state)
+        return self.map(inputs[:, -(newest or self.frames) :]), kept
+
+    def auxiliary_losses(self, truth: Tensor) -> Terms:
+        return {"own": self.map.bias.square().sum()}
+
+
+class Squares(Loss):
+    """The mean square: a loss for the training loop alone."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weighting = Fixed({"square": 2.0})
+
+    def terms(self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer) -> Terms:
+        return {"square": (motion - truth).square().mean()}
+
+
+def training() -> Numbers:
+    """Three steps of the loop, with AdamW and Adam, and clipped."""
+    found = {}
+    for name, changes in {"adamw": {}, "adam": {"decoupled": False}, "clipped": {"clip_norm": 0.1}}.items():
+        found |= {f"{name} {key}": value for key, value in optimised(**changes).items()}
+    return found
+
+
+def optimised(kind: type[Optim] = Optim, **changes: float) -> Numbers:
+    """Three steps of the loop with an optimiser."""
+    torch.manual_seed(2)
+    optim = kind(steps=3, batch=4, lr=1e-2, final_lr=1e-3, weight_decay=0.1, **changes)
+    task = MotionTask(Line(), Squares(), TeacherForcing(), frames(), optim, 0, lambda network: {})
+    return _trained(task, optim)
+
+
+def refiner() -> Numbers:
+    """Three steps of its training behind a network, and what both then stream."""
+    model, split, optim = tiny.refined(), frames(), Optim(steps=3, batch=4, lr=1e-2)
+    pieces = RefinerTraining(0, SAGERefiner(6, 2, 20, 6), optim, "frames").drawn(split)
+    task = RefinerTask(model, sage_loss(), split, pieces, optim, validate=lambda: {})
+    return _trained(task, optim) | summary("stream", evaluation.stream(model.eval(), [tiny.clip(25)])[0])
+
+
+def parts() -> Numbers:
+    """Three steps of each of SAGE-Net's parts that has a training of its own, and its errors then."""
+    optim = DroppingOptim(steps=3, batch=4, lr=1e-2, drops=(0.5,), drop=0.25)
+    found = {}
+    for kind in PARTS[:-1]:
+        task = part_task(kind, optim)
+        numbers = _trained(task, optim) | task.validate()
+        found |= {f"{kind} {name}": value for name, value in numbers.items()}
+    return found
