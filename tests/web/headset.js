@@ -51,7 +51,7 @@
   }
 
   // Play frames of trackers (joints) at 60 Hz with devices that sit on the body as `offsets` say; resolves at the end.
-  // The last one is kept until `over()` holds.
+  // A slow machine gets the clip slower: at least every fourth frame is drawn. The last one is kept until `over()` holds.
   kept.play = async (frames, offsets, over = () => true) => {
     const { inverse, minus, multiply, rotate } = await import('./rotations.js');
     const worn = trackers => trackers.map(({ position, rotation }, i) => {
@@ -59,8 +59,8 @@
       return { position: minus(position, rotate(turned, offsets.positions[i])), rotation: turned };
     });
     const began = performance.now();
-    for (;;) {
-      const frame = Math.floor((performance.now() - began) * 0.06);
+    for (let frame = 0; ;) {
+      frame = Math.min(Math.floor((performance.now() - began) * 0.06), frame + 4);
       if (frame >= frames.length && over()) return frames.length;
       kept.put(worn(frames[Math.min(frame, frames.length - 1)]));
       await new Promise(resolve => kept.session.requestAnimationFrame(resolve));
