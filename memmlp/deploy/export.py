@@ -10,6 +10,8 @@ from __future__ import annotations
 import json
 import logging
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import onnx
@@ -87,26 +89,19 @@ def save(
     Raises:
         InputError: for an opset that the step cannot be brought to.
     """
-    quiet = logging.getLogger("torch.onnx")
-    level = quiet.level
-    quiet.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings(), deterministic(step):
-            warnings.simplefilter("ignore")  # users can do nothing about the exporter's own deprecations
-            program = torch.onnx.export(
-                step,
-                arguments,
-                input_names=inputs,
-                output_names=outputs,
-                opset_version=NATIVE,
-                dynamo=True,
-                verbose=False,
-                optimize=False,
-            )
-    finally:
-        quiet.setLevel(level)
-    assert program is not None
-    simplify(program.model)
+    with silenced(), deterministic(step):
+        program = torch.onnx.export(
+            step,
+            arguments,
+            input_names=inputs,
+            output_names=outputs,
+            opset_version=NATIVE,
+            dynamo=True,
+            verbose=False,
+            optimize=False,
+        )
+        assert program is not None
+        simplify(program.model)
     graph = converted(program.model_proto, opset)
     onnx.helper.set_model_props(graph, meta)
     unfinished = temporary(path)
@@ -115,6 +110,22 @@ def save(
         publish(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+@contextmanager
+def silenced() -> Iterator[None]:
+    """Keep the exporter's warnings from users, who can do nothing about them."""
+    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnx_ir")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 SIMPLER = onnx_ir.passes.Sequential(
