@@ -65,12 +65,16 @@ def interleaved(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key,
     """
     streams = {key: OnnxStream(path) for key, path in paths.items()}
     seconds = {key: np.zeros((rounds, steps)) for key in paths}
-    sparse = np.random.default_rng(0).standard_normal((1, SPARSE_DIM), np.float32)
+    random = np.random.default_rng(0)
+    given = {
+        key: [np.asarray(random.normal(size=array.shape), np.float32) for array in stream.inputs.values()]
+        for key, stream in streams.items()
+    }
     for index in range(rounds):
         for key, stream in streams.items():
             for step in range(-SETTLING, steps):
                 start = time.perf_counter()
-                stream.step(sparse)
+                stream.step(*given[key])
                 if step >= 0:
                     seconds[key][index, step] = time.perf_counter() - start
     return seconds

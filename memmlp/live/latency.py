@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Hashable, Mapping
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
+from memmlp.deploy.latency import SETTLING
 from memmlp.deploy.session import OnnxStream
 from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.stream import Stream
 from memmlp.motion.body import SPARSE_DIM
 
 WARM_UP = 30  # samples before the timed ones
+Key = TypeVar("Key", bound=Hashable)
 LEAST = 200  # samples are timed, however few are asked for
 
 
@@ -27,6 +31,20 @@ def measure_pose(path: Path, steps: int) -> dict[str, float]:
         "pose_median_ms": 1000 * float(np.median(seconds)),
         "pose_p95_ms": 1000 * float(np.percentile(seconds, 95)),
     }
+
+
+def interleaved_poses(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, np.ndarray]:
+    """Time whole poses of exported networks on one thread, the files in turn in each round.
+
+    Returns:
+        For each file the seconds of its poses (rounds, steps); the first ones of a round do not count.
+    """
+    streams = {key: Stream(path) for key, path in paths.items()}
+    seconds = {key: np.zeros((rounds, steps)) for key in paths}
+    for index in range(rounds):
+        for key, stream in streams.items():
+            seconds[key][index] = alternate(stream, None, SETTLING + steps)[SETTLING:, 1]
+    return seconds
 
 
 def alternate(stream: Stream, network: OnnxStream | None, frames: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""`memmlp bench latency`: a step of each network as it was trained, as its stream, in fp16 and in int8."""
+"""`memmlp bench latency`: each network alone, its step as it was trained, as its stream, in fp16 and int8."""
 
 from __future__ import annotations
 
@@ -13,8 +13,14 @@ from memmlp.cli.options import config_dir_option, plugins_option
 if TYPE_CHECKING:
     import numpy as np
 
-BASE = ("avatar_poser", "naive")
-"""The network and graph that the others are compared with: AvatarPoser as published."""
+Timed = tuple[str, str]
+"""A network of MODELS and a graph of VARIANTS."""
+BASE = ("avatar_poser", "network")
+"""What all steps are compared with: AvatarPoser's network alone, a window of features in, rotations out."""
+POSE_BASE = ("avatar_poser", "naive")
+"""What all whole poses are compared with: AvatarPoser's."""
+CHECK = ("avatar_poser", "torch's own layers")
+"""The same layers, written and exported without this project."""
 
 MODELS: dict[str, tuple[str, ...]] = {
     "avatar_poser": ("model=avatar_poser",),
@@ -32,10 +38,12 @@ MODELS: dict[str, tuple[str, ...]] = {
     "avatar_jlm": ("model=avatar_jlm",),
     "manikin_l": ("model=manikin_l",),
     "sage": ("model=sage",),
+    "recurrent_poser": ("model=recurrent_poser",),
 }
 SLOW = ("bodiffusion", "avatar_jlm", "manikin_l", "sage")
 """Seconds a step, or gigabytes of files: timed where they are asked for."""
-VARIANTS = ("naive", "streaming", "fp16", "int8")
+DEPLOYED = ("naive", "streaming", "fp16", "int8")
+VARIANTS = ("network", *DEPLOYED)
 
 
 @click.command("latency")
@@ -74,10 +82,11 @@ def latency(
 ) -> None:
     """Time a step of every network.
 
-    All run in ONNX Runtime, in turn in one process, on one thread; and of each a whole pose, from a sample of
-    the trackers to the joints. OVERRIDES are those of `memmlp train`; the
-    default is profile=paper. Weights are random: they do not matter for the time. The ratio is to AvatarPoser
-    as published, of each round's medians.
+    All run in ONNX Runtime, in turn in one process, on one thread: the network alone, from features to its
+    own outputs; the steps that are deployed, which convert coordinates and make joints beside; and of these a
+    whole pose, from a sample of the trackers to the joints. OVERRIDES are those of `memmlp train`; the
+    default is profile=paper. Weights are random: they do not matter for the time. Ratios are of each round's
+    medians: a step's to AvatarPoser's network alone, a pose's to AvatarPoser's pose.
     """
     import tempfile
 
@@ -106,14 +115,13 @@ def latency(
             show_profile(paths[name, variant])
 
 
-def exported(
-    models: list[str], overrides: tuple[str, ...], folder: Path
-) -> Iterator[tuple[tuple[str, str], Path]]:
+def exported(models: list[str], overrides: tuple[str, ...], folder: Path) -> Iterator[tuple[Timed, Path]]:
     """Export each model in all variants, with a progress bar, and yield (model, variant) with the file."""
     from memmlp.common.progress import progress_bar
     from memmlp.config.build import untrained
     from memmlp.deploy.export import export
     from memmlp.deploy.half import halve
+    from memmlp.deploy.network_alone import network_alone
     from memmlp.deploy.quantization import quantise
     from memmlp.networks.streaming import streaming
 
@@ -122,12 +130,26 @@ def exported(
         model = untrained(("profile=paper", *overrides, *MODELS[name]))
         paths = {variant: folder / f"{name}.{variant}.onnx" for variant in VARIANTS}
         stream = streaming(model)
+        export(network_alone(model), paths["network"], "random")
         export(model, paths["naive"], "random")
         export(stream, paths["streaming"], "random")
         halve(paths["streaming"], paths["fp16"], stream.ends)
         quantise(paths["streaming"], paths["int8"], stream.ends, clips)
         for variant, path in paths.items():
             yield (name, variant), path
+        if name == CHECK[0]:
+            yield CHECK, exported_independently(overrides, folder / "independent.onnx")
+
+
+def exported_independently(overrides: tuple[str, ...], path: Path) -> Path:
+    """Export AvatarPoser of torch's own layers in the config's sizes, and return the file."""
+    from memmlp.cli.bench.independent import TorchAvatarPoser, export_plainly
+    from memmlp.config.compose import composed
+
+    sizes = composed(["profile=paper", *overrides, *MODELS[CHECK[0]]]).model
+    names = ("frames", "width", "depth", "heads", "feedforward")
+    export_plainly(TorchAvatarPoser(**{name: sizes[name] for name in names}), path)
+    return path
 
 
 def calibration_clips() -> list[Any]:
@@ -139,66 +161,65 @@ def calibration_clips() -> list[Any]:
     return [0.1 * torch.randn(60, FRAME_DIM, generator=torch.Generator().manual_seed(0))]
 
 
-def timed(paths: dict[tuple[str, str], Path], rounds: int, steps: int) -> list[dict[str, Any]]:
-    """Time all files in turn, and return a row for each.
-
-    A row has the median and 95th percentile in milliseconds, the ratio to AvatarPoser and its spread, and the
-    median of a whole pose.
-    """
-    import numpy as np
-
+def timed(paths: dict[Timed, Path], rounds: int, steps: int) -> list[dict[str, Any]]:
+    """Time all files in turn, their steps and then the whole poses of those that make any; see `row`."""
     from memmlp.deploy.latency import interleaved
-    from memmlp.live.latency import measure_pose
+    from memmlp.live.latency import interleaved_poses
 
     seconds = interleaved(paths, rounds, steps)
-    base = np.median(seconds[BASE], 1)
+    deployed = {key: path for key, path in paths.items() if key[1] in DEPLOYED}
+    poses = interleaved_poses(deployed, rounds, steps)
     return [
-        row(model, variant, times, np.median(times, 1) / base) | measure_pose(paths[model, variant], steps)
-        for (model, variant), times in seconds.items()
+        {"model": key[0], "variant": key[1]}
+        | summary("", times, seconds[BASE])
+        | (summary("pose_", poses[key], poses[POSE_BASE]) if key in poses else {})
+        for key, times in seconds.items()
     ]
 
 
-def row(model: str, variant: str, seconds: np.ndarray, ratios: np.ndarray) -> dict[str, Any]:
-    """Make a file's row.
+def summary(prefix: str, seconds: np.ndarray, base: np.ndarray) -> dict[str, float]:
+    """Summarise a file's times.
 
     Args:
-        model: the model's name.
-        variant: one of VARIANTS.
+        prefix: what the keys begin with.
         seconds: the time of each step (rounds, steps).
-        ratios: each round's median over the median of `BASE` in that round (rounds,).
+        base: the time of each step of what it is compared with (rounds, steps).
+
+    Returns:
+        Median and 95th percentile in milliseconds; the median, least and most over the rounds of the ratio of
+        both medians.
     """
     import numpy as np
 
+    ratios = np.median(seconds, 1) / np.median(base, 1)
     return {
-        "model": model,
-        "variant": variant,
-        "median_ms": 1000 * float(np.median(seconds)),
-        "p95_ms": 1000 * float(np.percentile(seconds, 95)),
-        "ratio_to_avatar_poser": float(np.median(ratios)),
-        "ratio_least": float(ratios.min()),
-        "ratio_most": float(ratios.max()),
+        f"{prefix}median_ms": 1000 * float(np.median(seconds)),
+        f"{prefix}p95_ms": 1000 * float(np.percentile(seconds, 95)),
+        f"{prefix}ratio_to_avatar_poser": float(np.median(ratios)),
+        f"{prefix}ratio_least": float(ratios.min()),
+        f"{prefix}ratio_most": float(ratios.max()),
     }
 
 
 def show(rows: list[dict[str, Any]], rounds: int) -> None:
-    """Print the rows as a table."""
+    """Print the rows as a table, a line each however narrow the terminal is."""
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=f"one step on one thread, {rounds} rounds in turn", title_justify="left")
+    print(f"milliseconds on one thread, {rounds} rounds in turn; x: of AvatarPoser's network, or of its pose")
+    table = Table(box=None, pad_edge=False)
     for name in ("network", "graph"):
-        table.add_column(name)
-    for name in ("median ms", "p95 ms", "to AvatarPoser", "over rounds", "whole pose ms"):
-        table.add_column(name, justify="right")
+        table.add_column(name, no_wrap=True)
+    for name in ("step", "p95", "x", "rounds", "pose", "p95", "x"):
+        table.add_column(name, justify="right", no_wrap=True)
     for r in rows:
+        pose = ["pose_median_ms", "pose_p95_ms", "pose_ratio_to_avatar_poser"]
         table.add_row(
             r["model"],
             r["variant"],
-            f"{r['median_ms']:.2f}",
-            f"{r['p95_ms']:.2f}",
-            f"{r['ratio_to_avatar_poser']:.2f}",
-            f"{r['ratio_least']:.2f} to {r['ratio_most']:.2f}",
-            f"{r['pose_median_ms']:.2f}",
+            *(f"{r[key]:.2f}" for key in ("median_ms", "p95_ms", "ratio_to_avatar_poser")),
+            f"{r['ratio_least']:.2f}-{r['ratio_most']:.2f}",
+            *(f"{r[key]:.2f}" if key in r else "" for key in pose),
             end_section=r["variant"] == VARIANTS[-1],
         )
     Console().print(table)

@@ -36,6 +36,7 @@ class SeededSplitConfig:
     seed: int = at_least(0)
     groups: list[str] = key(EachOf(empty=True))
     groups_file: Optional[str] = optional(Existing("file"))
+    train_fraction: float = standing(1.0, Within(0, 1))
 
 
 @dataclass
@@ -47,6 +48,7 @@ class ListSplitConfig:
     seed: int = at_least(0)
     groups: list[str] = key(EachOf(empty=True))
     groups_file: Optional[str] = optional(Existing("file"))
+    train_fraction: float = standing(1.0, Within(0, 1))
 
 
 @dataclass
@@ -59,6 +61,7 @@ class SubsetSplitConfig:
     seed: int = at_least(0)
     groups: list[str] = key(EachOf(empty=True))
     groups_file: Optional[str] = optional(Existing("file"))
+    train_fraction: float = standing(1.0, Within(0, 1))
 
 
 @dataclass

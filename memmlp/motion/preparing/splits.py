@@ -3,8 +3,9 @@
 A clip's name is its path below the data root without suffix, `/`-separated. Clips that belong together
 (`Grouping`) are never divided. Fractions count groups, and a clip that nothing ties to another is a group of
 its own. Nothing depends on the order of the names: groups are ranked by a hash of seed and name, so a clip
-that is added later moves few others. Entries of lists and names of subsets fit AMASS' clips whatever release
-these are from (`memmlp.motion.preparing.amass`).
+that is added later moves few others, and a smaller `train_fraction` takes some of the clips of a larger one.
+Entries of lists and names of subsets fit AMASS' clips whatever release these are from
+(`memmlp.motion.preparing.amass`).
 """
 
 from __future__ import annotations
@@ -82,6 +83,7 @@ class _Grouped:
 
     groups: Sequence[str]
     groups_file: Path | str | None
+    train_fraction: float
 
     @cached_property
     def grouping(self) -> Grouping:
@@ -106,6 +108,7 @@ class SeededSplit(_Grouped):
         seed: seed of the order in which groups are taken.
         groups: patterns of clips that stay together.
         groups_file: column file that says which clips stay together; None for none.
+        train_fraction: fraction of the groups left to train that are used; the others are left out.
     """
 
     test: float = 0.1
@@ -113,14 +116,14 @@ class SeededSplit(_Grouped):
     seed: int = 0
     groups: Sequence[str] = ()
     groups_file: Path | str | None = field(default=None, repr=False)
+    train_fraction: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_fractions(test=self.test, val=self.val)
+        _check_fractions(self.train_fraction, test=self.test, val=self.val)
 
     def assign(self, names: Sequence[str]) -> Assignment:
         seen = {name: name for name in names}
-        fractions = {"test": self.test, "val": self.val}
-        parts = _divide(seen, fractions, self.seed, self.grouping)
+        parts = _divide(seen, {"test": self.test, "val": self.val}, self)
         return Assignment(parts, self.grouping.names(seen))
 
     def missing(self, names: Collection[str]) -> tuple[str, ...]:
@@ -202,6 +205,7 @@ class ListSplit(_Grouped):
         seed: seed of the validation part.
         groups: patterns of clips that stay together in the validation part.
         groups_file: column file that says which clips stay together; None for none.
+        train_fraction: fraction of the groups left to train that are used; the others are left out.
     """
 
     folder: Path
@@ -209,10 +213,11 @@ class ListSplit(_Grouped):
     seed: int = 0
     groups: Sequence[str] = ()
     groups_file: Path | str | None = field(default=None, repr=False)
+    train_fraction: float = 1.0
     entries: Mapping[str, str] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        _check_fractions(val=self.val)
+        _check_fractions(self.train_fraction, val=self.val)
         object.__setattr__(self, "entries", read_lists(Path(self.folder)))
 
     def assign(self, names: Sequence[str]) -> Assignment:
@@ -247,6 +252,7 @@ class SubsetSplit(_Grouped):
         seed: seed of the validation part.
         groups: patterns of clips that stay together in the validation part.
         groups_file: column file that says which clips stay together; None for none.
+        train_fraction: fraction of the groups left to train that are used; the others are left out.
     """
 
     train: Sequence[str]
@@ -255,9 +261,10 @@ class SubsetSplit(_Grouped):
     seed: int = 0
     groups: Sequence[str] = ()
     groups_file: Path | str | None = field(default=None, repr=False)
+    train_fraction: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_fractions(val=self.val)
+        _check_fractions(self.train_fraction, val=self.val)
         both = set(map(subset, self.train)) & set(map(subset, self.test))
         if both:
             raise InputError(f"data.split: subsets {', '.join(sorted(both))} are both in train and in test")
@@ -284,10 +291,13 @@ def _carving(split: SeededSplit | ListSplit | SubsetSplit) -> dict[str, Any]:
     """Return the settings that every split has."""
     digest = split.grouping.digest
     file = {"groups_file_sha256": digest} if digest else {}
-    return {"val": split.val, "seed": split.seed, "groups": list(split.groups), **file}
+    fewer = {"train_fraction": split.train_fraction} if split.train_fraction < 1 else {}
+    return {"val": split.val, "seed": split.seed, "groups": list(split.groups), **file, **fewer}
 
 
-def _check_fractions(**fractions: float) -> None:
+def _check_fractions(train_fraction: float, **fractions: float) -> None:
+    if not 0 < train_fraction <= 1:
+        raise InputError(f"data.train_fraction: {train_fraction} is none; allowed: 0 < train_fraction <= 1")
     for key, value in fractions.items():
         if not 0 <= value < 1:
             raise InputError(f"data.{key}: {value} is no fraction; allowed: 0 <= {key} < 1")
@@ -305,24 +315,28 @@ def _carved(
     train = {name: seen[name] for name, part in parts.items() if part == "train"}
     if not train:
         raise InputError("data.split: no clip of its train part is below data.root; is it the right root?")
-    carved = {**parts, **_divide(train, {"val": split.val}, split.seed, split.grouping)}
+    carved = {**parts, **_divide(train, {"val": split.val}, split)}
     return Assignment(carved, split.grouping.names(seen), missing)
 
 
 def _divide(
-    seen: Mapping[str, str], fractions: Mapping[str, float], seed: int, grouping: Grouping
-) -> dict[str, str]:
+    seen: Mapping[str, str], fractions: Mapping[str, float], split: SeededSplit | ListSplit | SubsetSplit
+) -> dict[str, str | None]:
     """Map clips to parts: the first groups in a seeded order fill those of `fractions`, the rest train.
 
-    `seen` maps each clip to the name by which patterns and the seed know it.
+    `seen` maps each clip to the name by which patterns and the seed know it. Of the rest the last groups are
+    left out, as the split's `train_fraction` says.
     """
-    ranked = sorted(grouping.tied(seen), key=lambda group: _rank(seen[group[0]], seed))
-    parts = dict.fromkeys(seen, "train")
+    ranked = sorted(split.grouping.tied(seen), key=lambda group: _rank(seen[group[0]], split.seed))
+    parts: dict[str, str | None] = dict.fromkeys(seen, "train")
     start = 0
     for part, count in _counts(len(ranked), fractions).items():
         for group in ranked[start : start + count]:
             parts.update(dict.fromkeys(group, part))
         start += count
+    used = max(1, round(split.train_fraction * (len(ranked) - start)))
+    for group in ranked[start + used :]:
+        parts.update(dict.fromkeys(group, None))
     return parts
 
 

@@ -28,6 +28,47 @@ def test_groups_stay_on_one_side():
     assert SeededSplit(0.2, 0.2, 0, TWINS).assign(NAMES).parts != SeededSplit(0.2, 0.2, 0).assign(NAMES).parts
 
 
+def part(parts, name):
+    return {clip for clip, found in parts.items() if found == name}
+
+
+def test_a_fraction_of_the_training_groups():
+    """It leaves validation and test as they are, and is part of a larger one; no group is divided."""
+    whole = SeededSplit(0.2, 0.2, 1, TWINS).assign(NAMES).parts
+    before = part(whole, "train")
+    for fraction in (0.75, 0.5, 0.25):
+        fewer = SeededSplit(0.2, 0.2, 1, TWINS, train_fraction=fraction).assign(NAMES).parts
+        assert [part(fewer, name) for name in ("val", "test")] == [
+            part(whole, name) for name in ("val", "test")
+        ]
+        used = part(fewer, "train")
+        assert used < before
+        assert part(fewer, None) == part(whole, "train") - used
+        assert all((f"salsa/{n:02}" in used) == (f"salsa/{n + 15:02}" in used) for n in range(1, 16))
+        before = used
+    groups = {(int(name[-2:]) - 1) % 15 if "salsa" in name else name for name in used}
+    assert len(groups) == round(0.25 * 15)
+    assert part(SeededSplit(0.2, 0.2, 1, train_fraction=1e-9).assign(NAMES).parts, "train")
+
+
+def test_a_fraction_says_so_of_itself():
+    """All is what there was before there were fractions; what was prepared then stays."""
+    assert "train_fraction" not in SeededSplit().describe()
+    assert SeededSplit(train_fraction=0.5).describe()["train_fraction"] == 0.5
+
+
+def test_a_fraction_of_lists_and_subsets(tmp_path):
+    names = [f"{subset}/{n}" for subset in (*S2_TRAIN, *S2_TEST) for n in range(10)]
+    parts = SubsetSplit(S2_TRAIN, S2_TEST, val=0.1, train_fraction=0.5).assign(names).parts
+    assert [len(part(parts, name)) for name in ("train", "val", "test", None)] == [54, 12, 20, 54]
+    (tmp_path / "CMU").mkdir()
+    (tmp_path / "CMU" / "train_split.txt").write_text("\n".join(f"CMU/01/{n}_poses.npz" for n in range(8)))
+    (tmp_path / "CMU" / "test_split.txt").write_text("CMU/02/1_poses.npz\n")
+    listed = [*(f"CMU/01/{n}_poses" for n in range(8)), "CMU/02/1_poses"]
+    parts = ListSplit(tmp_path, val=0.25, train_fraction=0.5).assign(listed).parts
+    assert [len(part(parts, name)) for name in ("train", "val", "test", None)] == [3, 2, 1, 3]
+
+
 def test_lists_in_agrols_format(tmp_path):
     (tmp_path / "CMU").mkdir()
     lines = [f"./CMU/01/{n}_poses.npz" for n in range(8)] + ["amass/CMU/gone_poses.npz", ""]
@@ -56,7 +97,15 @@ def test_subsets_by_folder():
 
 
 @pytest.mark.parametrize(
-    "bad", [{"test": -0.1}, {"val": 1.0}, {"test": 0.6, "val": 0.5}, {"test": float("nan")}]
+    "bad",
+    [
+        {"test": -0.1},
+        {"val": 1.0},
+        {"test": 0.6, "val": 0.5},
+        {"test": float("nan")},
+        {"train_fraction": 0.0},
+        {"train_fraction": 1.1},
+    ],
 )
 def test_bad_fractions(bad):
     with pytest.raises(InputError, match="data"):

@@ -1,0 +1,46 @@
+"""AvatarPoser of torch's own layers, with which `bench latency` checks the time of its network."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from memmlp.motion.body import N_JOINTS, SPARSE_DIM
+
+
+class TorchAvatarPoser(nn.Module):
+    """The layers of AvatarPoser, none of them this project's.
+
+    Args:
+        frames: T, the window's length.
+        width, depth, heads, feedforward: the sizes of its encoder.
+    """
+
+    def __init__(self, frames: int, width: int, depth: int, heads: int, feedforward: int):
+        super().__init__()
+        self.frames = frames
+        self.embedding = nn.Linear(SPARSE_DIM, width)
+        layer = nn.TransformerEncoderLayer(width, heads, feedforward, batch_first=True)
+        self.encoder = nn.TransformerEncoder(layer, depth)
+        self.orientation = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 6))
+        self.rotation = nn.Sequential(
+            nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 6 * (N_JOINTS - 1))
+        )
+
+    def forward(self, window: Tensor) -> Tensor:
+        """Map a window of features (1, T, 54) to the newest frame's rotations (1, 132)."""
+        newest = self.encoder(self.embedding(window))[:, -1]
+        return torch.cat([self.orientation(newest), self.rotation(newest)], -1)
+
+
+def export_plainly(network: TorchAvatarPoser, path: Path) -> None:
+    """Write a network by `torch.onnx.export` and nothing else."""
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        window = torch.zeros(1, network.frames, SPARSE_DIM)
+        torch.onnx.export(network.eval(), (window,), path, dynamo=True, verbose=False, external_data=False)

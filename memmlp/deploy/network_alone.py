@@ -1,0 +1,52 @@
+"""A network alone: features in, its own outputs out, which is what papers time.
+
+The step that is deployed converts coordinates and makes joints by forward kinematics beside.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import TypeVar
+
+import torch.nn.functional as F
+from torch import Tensor
+
+from memmlp.motion.body import MOTION_DIM, ROTATION
+from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.window_model import WindowModel
+
+Model = TypeVar("Model", bound=WindowModel)
+
+
+class NoConversion(Normalizer):
+    """A normalizer that leaves everything as it is: inputs are features, outputs are in network space."""
+
+    def encode_sparse(self, sparse: Tensor, origin: Tensor) -> Tensor:
+        """Return the inputs (..., 54)."""
+        return sparse
+
+    def encode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
+        """Return the motion (..., 198)."""
+        return motion
+
+    def decode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
+        """Return the motion (..., 198)."""
+        return motion
+
+    def posed(self, rotation: Tensor, sparse: Tensor) -> Tensor:
+        """Return the rotations (..., 132) as motion (..., 198) whose positions are zeros."""
+        return F.pad(rotation, (0, MOTION_DIM - ROTATION.stop))
+
+
+def network_alone(model: Model) -> Model:
+    """Copy a network without the conversions before and after it and without its forward kinematics.
+
+    What a network does with joints between its own layers (AvatarJLM's tokens, MANIKIN's limbs) is its own
+    and stays. The copy is good for timing alone.
+    """
+    made = copy.deepcopy(model)
+    for module in list(made.modules()):
+        for name, child in module.named_children():
+            if isinstance(child, Normalizer):
+                setattr(module, name, NoConversion(child.coordinates, child.rest, child.mean, child.std))
+    return made

@@ -1,0 +1,71 @@
+"""`memmlp bench latency`: AvatarPoser alone takes the time of the same layers, written by others."""
+
+import json
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from conftest import Memmlp, one_line
+
+from memmlp.cli.bench.independent import TorchAvatarPoser
+from memmlp.cli.bench.latency import CHECK, VARIANTS, summary
+from memmlp.motion.body import SPARSE_DIM
+from memmlp.networks.baselines.avatar_poser import AvatarPoser
+
+
+def test_a_summary_by_hand():
+    seconds = np.array([[1, 2, 3], [4, 4, 4], [6, 6, 6]]) * 1e-3
+    found = summary("pose_", seconds, np.full((3, 2), 2e-3))
+    assert found["pose_median_ms"] == pytest.approx(4)
+    assert [found[f"pose_ratio_{key}"] for key in ("least", "most")] == [1, 3]
+    assert found["pose_ratio_to_avatar_poser"] == pytest.approx(2)
+
+
+def weights_of_torch(ours: AvatarPoser) -> dict[str, torch.Tensor]:
+    """The weights of a network under the names of torch's own layers."""
+    made = {}
+    for name, value in ours.state_dict().items():
+        if not name.startswith(("normalizer", "layers")):
+            made[name] = value
+    for i, layer in enumerate(ours.layers):
+        parts = (layer.attention.query, layer.attention.key, layer.attention.value)
+        others = {
+            "self_attn.out_proj": layer.attention.out, "linear1": layer.widen, "linear2": layer.narrow,
+            "norm1": layer.attention_norm, "norm2": layer.norm,
+        }  # fmt: skip
+        for kind in ("weight", "bias"):
+            start = f"encoder.layers.{i}."
+            made[f"{start}self_attn.in_proj_{kind}"] = torch.cat([getattr(part, kind) for part in parts])
+            made |= {f"{start}{name}.{kind}": getattr(part, kind) for name, part in others.items()}
+    return made
+
+
+@torch.no_grad()
+def test_the_independent_network_is_the_same():
+    ours = tiny.baseline("avatar_poser")
+    theirs = TorchAvatarPoser(frames=7, width=16, depth=2, heads=4, feedforward=32).eval()
+    theirs.load_state_dict(weights_of_torch(ours))
+    window = torch.randn(1, 7, SPARSE_DIM)
+    torch.testing.assert_close(theirs(window), ours.rotations(window), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_every_graph_is_timed_and_compared(memmlp: Memmlp, tmp_path):
+    file = tmp_path / "rows.json"
+    said = memmlp(
+        "bench", "latency", "profile=tiny", "--models", "avatar_poser", "--steps", "2", "--json", file
+    )
+    rows = {(row["model"], row["variant"]): row for row in json.loads(file.read_text())}
+    assert said.code == 0
+    assert list(rows) == [*(("avatar_poser", variant) for variant in VARIANTS), CHECK]
+    assert rows["avatar_poser", "network"]["ratio_to_avatar_poser"] == 1
+    assert rows["avatar_poser", "naive"]["pose_ratio_to_avatar_poser"] == 1
+    assert all(row["median_ms"] > 0 for row in rows.values())
+    timed = [key[1] for key, row in rows.items() if "pose_median_ms" in row]
+    assert timed == list(VARIANTS[1:])
+    assert "torch's own layers" in said.out
+
+
+def test_the_control_can_not_be_left_out(memmlp: Memmlp):
+    assert one_line(memmlp("bench", "latency", "--models", "mem_mlp_41"), "avatar_poser")
