@@ -141,17 +141,17 @@ def _check_space(setup: Setup) -> str:
     for word in setup.words:
         if word.partition("=")[0].lstrip("+") in {one.key for one in space}:
             raise InputError(f"{word}: is searched; leave it out of the space with search.space....=null")
-    base = _experiments(setup, {})[0].config
-    for one in space:
-        if not isinstance(base.get(one.key), Mapping) and not trained_with(one.key, base):
-            raise InputError(f"search.space: {one.key}: changes no training; allowed are keys that do")
-    most = max(len(one.corners()) for one in space)
-    for number in range(most):
+    configs = [_experiments(setup, {})[0].config]
+    for number in range(max(len(one.corners()) for one in space)):
         corner = {one.key: one.corners()[number % len(one.corners())] for one in space}
         try:
-            _experiments(setup, corner)
+            configs.append(_experiments(setup, corner)[0].config)
         except InputError as error:
             raise InputError(f"search.space: {error}") from None
+    for one in space:
+        counts = any(trained_with(one.key, config) for config in configs)  # some do at other values than 0
+        if not isinstance(configs[0].get(one.key), Mapping) and not counts:
+            raise InputError(f"search.space: {one.key}: changes no training; allowed are keys that do")
     first = _tasks(setup, setup.search.first())[0][-1]
     often = f"validated every {first.config['optim']['validate_every']} steps"  # when trials may be pruned
     return f"{first.id}, {often}, used with {inference(first.config)}"

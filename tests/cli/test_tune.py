@@ -145,12 +145,13 @@ def test_a_search_is_named_after_what_its_trials_follow_from(tmp_path: Path, mon
 
 
 def test_a_folder_of_ones_own_searches(tmp_path: Path):
+    """Of a learning rate and of a warm-up, which changes no training where it is 0, as it is in the base."""
     (tmp_path / "own/search").mkdir(parents=True)
-    space = "space: {loss: null, optim: {lr: {low: 1.0e-4, high: 0.1}}}"
+    space = "space: {loss: null, optim: {lr: {low: 1.0e-4, high: 0.1}, warmup: {low: 0, high: 3}}}"
     text = f"defaults: [loss_weights, _self_]\nname: rates\nbase: []\n{space}\n"
     (tmp_path / "own/search/rates.yaml").write_text(text)
     setup = prepare_search([*TINY, "search=rates"], tmp_path / "own", tmp_path)
-    assert [one.key for one in setup.search.space] == ["optim.lr"]
+    assert [one.key for one in setup.search.space] == ["optim.lr", "optim.warmup"]
     assert setup.folder.name.startswith("rates-")
 
 
