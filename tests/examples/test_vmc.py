@@ -1,4 +1,4 @@
-"""The example that prints hips and head of VMC packets, sent by another implementation of OSC."""
+"""The example that prints the bones of VMC packets, sent by another implementation of OSC."""
 
 from __future__ import annotations
 
@@ -16,7 +16,14 @@ from scipy.spatial.transform import Rotation
 builder = pytest.importorskip("pythonosc.osc_bundle_builder")
 message = pytest.importorskip("pythonosc.osc_message_builder")
 
-CHAIN = ("root", "Hips", "Spine", "Chest", "Neck", "Head")  # a body without an upper chest
+PARENTS = {  # a body without an upper chest and without toes
+    "root": None, "Hips": "root", "Spine": "Hips", "Chest": "Spine", "Neck": "Chest", "Head": "Neck",
+    "LeftShoulder": "Chest", "LeftUpperArm": "LeftShoulder", "LeftLowerArm": "LeftUpperArm",
+    "LeftHand": "LeftLowerArm", "RightShoulder": "Chest", "RightUpperArm": "RightShoulder",
+    "RightLowerArm": "RightUpperArm", "RightHand": "RightLowerArm", "LeftUpperLeg": "Hips",
+    "LeftLowerLeg": "LeftUpperLeg", "LeftFoot": "LeftLowerLeg", "RightUpperLeg": "Hips",
+    "RightLowerLeg": "RightUpperLeg", "RightFoot": "RightLowerLeg",
+}  # fmt: skip
 FRAMES = 4
 
 
@@ -36,31 +43,37 @@ def packet(name: str, values: np.ndarray) -> bytes:
 
 
 @pytest.mark.slow
-def test_it_prints_hips_and_head():
+@pytest.mark.parametrize("words", [[], ["--all"]])
+def test_it_prints_where_bones_are(words):
     random = np.random.default_rng(0)
-    frames = random.normal(size=(FRAMES + 1, len(CHAIN), 7))
+    frames = random.normal(size=(FRAMES + 1, len(PARENTS), 7))
     frames[..., 3:] /= np.linalg.norm(frames[..., 3:], axis=-1, keepdims=True)
     command = [sys.executable, str(EXAMPLES / "vmc/receive.py"), "--port", "0", "--frames", str(FRAMES)]
     with (
-        started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
+        started([*command, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
     ):
         port = int(re.search(r"\d+", process.stderr.readline())[0])
         for frame in frames:  # the last is what ends the one before it
-            for name, values in zip(CHAIN, frame, strict=True):
+            for name, values in zip(PARENTS, frame, strict=True):
                 sender.sendto(packet(name, values), ("127.0.0.1", port))
         said, wrong = process.communicate(timeout=60)
     assert (process.returncode, wrong) == (0, "")
-    found = np.array([line.split()[1:4] + line.split()[5:] for line in said.splitlines()], float)
-    np.testing.assert_allclose(found, [hips_and_head(frame) for frame in frames[:-1]], atol=1e-3)
+    lines = said.splitlines()
+    assert len(lines) == FRAMES
+    for line, frame in zip(lines, frames, strict=False):
+        found = {name: np.array(at, float) for name, *at in (bone.split() for bone in line.split("  "))}
+        true = by_matrices(frame)
+        assert set(found) == (set(PARENTS) if words else {"Hips", "Head"})
+        for name, position in found.items():
+            np.testing.assert_allclose(position, true[name], atol=1e-3)
 
 
-def hips_and_head(frame: np.ndarray) -> list[float]:
-    """By matrices."""
-    world, found = np.eye(4), {}
-    for name, values in zip(CHAIN, frame, strict=True):
+def by_matrices(frame: np.ndarray) -> dict[str, np.ndarray]:
+    """Where each bone is."""
+    world: dict[str | None, np.ndarray] = {None: np.eye(4)}
+    for (name, parent), values in zip(PARENTS.items(), frame, strict=True):
         local = np.eye(4)
         local[:3, :3], local[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]
-        world = world @ local
-        found[name] = world[:3, 3]
-    return [*found["Hips"], *found["Head"]]
+        world[name] = world[parent] @ local
+    return {name: matrix[:3, 3] for name, matrix in world.items()}

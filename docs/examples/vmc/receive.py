@@ -1,10 +1,12 @@
-"""Prints hips and head from VMC packets, with Python alone.
+"""Prints hips and head, or all bones, from VMC packets, with Python alone.
 
     python receive.py --port 39539
+    python receive.py --all
 
-A line for each frame: the hips' x, y, z and the head's, metres, in Unity's axes (left-handed, Y up). VMC
-(protocol.vmc.info/english) sends each bone's position and quaternion x y z w relative to its parent's, as OSC
-messages in UDP datagrams: `/VMC/Ext/Bone/Pos` name, px, py, pz, qx, qy, qz, qw.
+A line for each frame: x, y, z of hips and head, metres, in Unity's axes (left-handed, Y up); with --all those
+of every bone that came. VMC (protocol.vmc.info/english) sends each bone's position and quaternion x y z w
+relative to its parent's, as OSC messages in UDP datagrams: `/VMC/Ext/Bone/Pos` name, px, py, pz, qx, qy, qz,
+qw.
 """
 
 from __future__ import annotations
@@ -18,7 +20,11 @@ from collections.abc import Iterator
 from typing import Any
 
 BONE, ROOT = "/VMC/Ext/Bone/Pos", "/VMC/Ext/Root/Pos"
-CHAIN = ("root", "Hips", "Spine", "Chest", "UpperChest", "Neck", "Head")  # a body may lack some
+CHAINS = (  # from the root outward; a body may lack some
+    ("root", "Hips", "Spine", "Chest", "UpperChest", "Neck", "Head"),
+    *(("UpperChest", f"{s}Shoulder", f"{s}UpperArm", f"{s}LowerArm", f"{s}Hand") for s in ("Left", "Right")),
+    *(("Hips", f"{s}UpperLeg", f"{s}LowerLeg", f"{s}Foot", f"{s}Toes") for s in ("Left", "Right")),
+)
 Vector = tuple[float, ...]
 
 
@@ -75,17 +81,18 @@ def product(a: Vector, b: Vector) -> Vector:
 
 
 def places(bones: dict[str, Vector]) -> dict[str, Vector]:
-    """Follow the bones from the root to the head, and return where each is in the world."""
-    position: Vector = (0, 0, 0)
-    rotation: Vector = (0, 0, 0, 1)
-    found = {}
-    for name in CHAIN:
-        if name in bones:
-            away = turned(rotation, bones[name][:3])
-            position = tuple(a + b for a, b in zip(position, away, strict=True))
-            rotation = product(rotation, bones[name][3:])
-            found[name] = position
-    return found
+    """Follow the bones from the root outward, and return where each is in the world."""
+    found: dict[str, tuple[Vector, Vector]] = {}
+    for first, *others in CHAINS:
+        last = found.get(first) or found.get("Chest") or ((0, 0, 0), (0, 0, 0, 1))
+        for name in (first, *others):
+            if name in bones and name not in found:
+                position, rotation = last
+                away = turned(rotation, bones[name][:3])
+                moved = tuple(a + b for a, b in zip(position, away, strict=True))
+                found[name] = moved, product(rotation, bones[name][3:])
+            last = found.get(name, last)
+    return {name: position for name, (position, _) in found.items()}
 
 
 def frames(listener: socket.socket) -> Iterator[dict[str, Vector]]:
@@ -103,8 +110,9 @@ def frames(listener: socket.socket) -> Iterator[dict[str, Vector]]:
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(description="Prints hips and head from VMC packets.")
+    made = argparse.ArgumentParser(description="Prints hips and head, or all bones, from VMC packets.")
     made.add_argument("--port", type=int, default=39539, help="UDP port; 0 for any that is free")
+    made.add_argument("--all", action="store_true", help="print every bone, a line for each frame")
     made.add_argument("--frames", type=int, help="how many to print; by default until Ctrl-C")
     return made
 
@@ -117,8 +125,9 @@ def main() -> None:
         print(f"listening on UDP port {listener.getsockname()[1]}", file=sys.stderr, flush=True)
         for count, bones in enumerate(frames(listener), 1):
             found = places(bones)
-            hips, head = (found.get(name, ()) for name in ("Hips", "Head"))
-            print("hips", *(f"{x:.4f}" for x in hips), "head", *(f"{x:.4f}" for x in head), flush=True)
+            wanted = [name for name in found if asked.all or name in ("Hips", "Head")]
+            lines = [" ".join([name, *(f"{x:.4f}" for x in found[name])]) for name in wanted]
+            print("  ".join(lines), flush=True)
             if count == asked.frames:
                 break
 

@@ -1,0 +1,44 @@
+"""The example that sends head and wrists: packets that `memmlp live` takes, of a person's arms."""
+
+from __future__ import annotations
+
+import runpy
+import socket
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from engine_clips import EXAMPLES
+from scipy.spatial.transform import Rotation
+
+from memmlp.live.player.packets import from_json
+
+SEND = EXAMPLES / "udp/send.py"
+sender = runpy.run_path(str(SEND))
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.7, 9.0])
+def test_wrists_turn_as_the_arms_do(seconds):
+    made = sender["packet"](seconds)
+    sway = made["head"][0]
+    for name, side in (("left", -1), ("right", 1)):
+        values = np.array(made[name])
+        shoulder = np.array([side * sender["SHOULDER"][0] + sway, *sender["SHOULDER"][1:]])
+        along = Rotation.from_quat(values[3:]).apply([side, 0, 0])
+        np.testing.assert_allclose(values[:3], shoulder + sender["ARM"] * along, atol=1e-12)
+    assert made["left"][1] < 1.0 or seconds < 2
+
+
+@pytest.mark.slow
+def test_it_sends_what_live_takes():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(60)
+        port = listener.getsockname()[1]
+        subprocess.run(
+            [sys.executable, str(SEND), "--port", str(port), "--seconds", "0.1"], check=True, timeout=60
+        )
+        packets = [from_json(listener.recv(65536)) for _ in range(6)]
+    assert [packet.time for packet in packets] == pytest.approx([frame / 60 for frame in range(6)])
+    assert all(tracker is not None for packet in packets for tracker in packet.trackers)
