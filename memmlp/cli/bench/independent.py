@@ -25,7 +25,7 @@ class TorchAvatarPoser(nn.Module):
         self.frames = frames
         self.embedding = nn.Linear(SPARSE_DIM, width)
         layer = nn.TransformerEncoderLayer(width, heads, feedforward, batch_first=True)
-        self.encoder = nn.TransformerEncoder(layer, depth)
+        self.encoder = nn.TransformerEncoder(layer, depth)  # copies the layer with its weights
         self.orientation = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 6))
         self.rotation = nn.Sequential(
             nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 6 * (N_JOINTS - 1))
@@ -38,7 +38,12 @@ class TorchAvatarPoser(nn.Module):
 
 
 def export_plainly(network: TorchAvatarPoser, path: Path) -> None:
-    """Write a network by `torch.onnx.export` and nothing else."""
+    """Write a network by `torch.onnx.export` and nothing else, each layer with random weights of its own.
+
+    Layers with the same weights would share them in the file, and be quicker than any trained network's.
+    """
+    for parameter in network.parameters():
+        nn.init.normal_(parameter, std=0.03)
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -19,7 +19,7 @@ BASE = ("avatar_poser", "network")
 """What all steps are compared with: AvatarPoser's network alone, a window of features in, rotations out."""
 POSE_BASE = ("avatar_poser", "naive")
 """What all whole poses are compared with: AvatarPoser's."""
-CHECK = ("avatar_poser", "torch's own layers")
+CHECK = ("avatar_poser", "torch")
 """The same layers, written and exported without this project."""
 
 MODELS: dict[str, tuple[str, ...]] = {
@@ -207,22 +207,26 @@ def show(rows: list[dict[str, Any]], rounds: int) -> None:
     from rich.table import Table
 
     print(f"milliseconds on one thread, {rounds} rounds in turn; x: of AvatarPoser's network, or of its pose")
+    print("torch: AvatarPoser's network of torch's own layers, which checks the time of ours")
     table = Table(box=None, pad_edge=False)
     for name in ("network", "graph"):
         table.add_column(name, no_wrap=True)
-    for name in ("step", "p95", "x", "rounds", "pose", "p95", "x"):
+    for name in ("step", "p95", "x", "rounds", "pose", "x"):
         table.add_column(name, justify="right", no_wrap=True)
     for r in rows:
-        pose = ["pose_median_ms", "pose_p95_ms", "pose_ratio_to_avatar_poser"]
         table.add_row(
             r["model"],
             r["variant"],
-            *(f"{r[key]:.2f}" for key in ("median_ms", "p95_ms", "ratio_to_avatar_poser")),
-            f"{r['ratio_least']:.2f}-{r['ratio_most']:.2f}",
-            *(f"{r[key]:.2f}" if key in r else "" for key in pose),
-            end_section=r["variant"] == VARIANTS[-1],
+            *(short(r[key]) for key in ("median_ms", "p95_ms", "ratio_to_avatar_poser")),
+            f"{short(r['ratio_least'])}-{short(r['ratio_most'])}",
+            *(short(r[key]) if key in r else "" for key in ("pose_median_ms", "pose_ratio_to_avatar_poser")),
         )
     Console().print(table)
+
+
+def short(number: float) -> str:
+    """Return a number in at most four characters, so that a row is a line of 80."""
+    return f"{number:.2f}" if number < 10 else f"{number:.1f}" if number < 100 else f"{number:.0f}"
 
 
 def show_profile(path: Path) -> None:
