@@ -115,7 +115,7 @@ def save(
 @contextmanager
 def silenced() -> Iterator[None]:
     """Keep the exporter's warnings from users, who can do nothing about them."""
-    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnx_ir")]
+    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnx_ir", "onnxscript")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(logging.ERROR)

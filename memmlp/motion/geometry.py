@@ -6,6 +6,8 @@ al. 2019, as every code base of the field has it). Angles are radians.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -88,14 +90,49 @@ def geodesic_angle(a: Tensor, b: Tensor) -> Tensor:
 def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
     """Return the joints' global rotations (..., 22, 3, 3) and positions (..., 22, 3).
 
+    Joints that are equally far from the root are computed together, which takes the fewest operations.
+
     Args:
         local: local rotations (..., 22, 3, 3), the root's global.
         root: position of the root joint (..., 3), metres, world.
         rest: rest positions (22, 3), metres; only the offsets between joint and parent count.
     """
-    rotations, positions = [local[..., 0, :, :]], [root]
-    for joint, parent in enumerate(PARENTS[1:], start=1):
-        offset = rest[joint] - rest[parent]
-        positions.append(positions[parent] + rotations[parent] @ offset)
-        rotations.append(rotations[parent] @ local[..., joint, :, :])
-    return torch.stack(rotations, -3), torch.stack(positions, -2)
+    offsets = (rest - rest[list(PARENTS)])[..., None]  # the root's is not used
+    rotations, positions = [local[..., :1, :, :]], [root[..., None, :, None]]
+    for joints, parents in LEVELS:
+        above = _taken(rotations[-1], parents)
+        positions.append(_taken(positions[-1], parents) + above @ offsets[joints])
+        rotations.append(above @ local[..., joints, :, :])
+    return torch.cat(rotations, -3), torch.cat(positions, -3)[..., 0]
+
+
+def _levels() -> Iterator[tuple[slice, list[slice]]]:
+    """Yield the joints that are equally far from the root, which are numbered level by level.
+
+    Yields:
+        The joints of a level behind the root's, and the runs of joints of the level before it, counted from
+        that level's first, that are their parents.
+    """
+    starts = [0]
+    for joint, parent in enumerate(PARENTS):
+        if parent >= starts[-1]:
+            starts.append(joint)
+    bounds = [*starts, len(PARENTS)]
+    for before, start, stop in zip(bounds, bounds[1:], bounds[2:], strict=False):
+        runs: list[slice] = []
+        for parent in PARENTS[start:stop]:
+            goes_on = runs and runs[-1].stop == parent - before
+            first = runs.pop().start if goes_on else parent - before
+            runs.append(slice(first, parent - before + 1))
+        yield slice(start, stop), runs
+
+
+def _taken(values: Tensor, runs: list[slice]) -> Tensor:
+    """Return the rows of values (..., n, a, b) that lie in runs, one run after the other."""
+    if runs == [slice(0, values.shape[-3])]:
+        return values
+    parts = [values[..., run, :, :] for run in runs]
+    return parts[0] if len(parts) == 1 else torch.cat(parts, -3)
+
+
+LEVELS = tuple(_levels())
