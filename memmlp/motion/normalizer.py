@@ -101,6 +101,5 @@ class Normalizer(nn.Module):
         """
         motion = F.pad(rotation, (0, MOTION_DIM - ROTATION.stop))
         world = self.decode_motion(motion, self.origin(sparse))
-        with torch.no_grad():
-            positions = self.pose(world, sparse).flatten(-2)
+        positions = self.pose(world.detach(), sparse).flatten(-2)
         return torch.cat([world[..., ROTATION], positions], -1)

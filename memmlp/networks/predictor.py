@@ -131,8 +131,8 @@ class RotationOnly(nn.Module):
             Motion (B, newest, 198) in network space.
         """
         rotation, sparse = self.rotation(h, past, newest), sparse[..., -newest:, :]
-        with torch.no_grad():
-            motion = normalizer.encode_motion(normalizer.posed(rotation, sparse), normalizer.origin(sparse))
+        posed = normalizer.posed(rotation.detach(), sparse)
+        motion = normalizer.encode_motion(posed, normalizer.origin(sparse))
         position = motion[..., ROTATION.stop :]
         return torch.cat([rotation, position], -1)
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.cells import CELLS, Cell
+from memmlp.networks.layers import in_float32
 from memmlp.networks.memory import State
 from memmlp.networks.stream_model import StreamModel
 
@@ -35,7 +36,7 @@ class RecurrentBlock(nn.Module):
     def forward(self, h: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Map a sequence (B, n, d) and the cell's state to (B, n, d) and the state after it."""
         x = self.cell_norm(h)
-        with torch.autocast(h.device.type, enabled=False):  # a state adds up what bfloat16 rounds
+        with in_float32(h.device):  # a state adds up what bfloat16 rounds
             made, state = self.cell(x.float() if x.dtype == torch.bfloat16 else x, state)
         return self.mixed(h + made), state
 

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from memmlp.motion.body import POSITION, ROTATION
 from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.layers import in_float32
 from memmlp.networks.memory import State
 from memmlp.networks.window_model import WindowModel
 
@@ -121,11 +122,11 @@ class Refined(WindowModel):
             Motion (B, n, 198), and the hidden states after it.
         """
         rotation = motion[..., ROTATION]
-        with torch.autocast(motion.device.type, enabled=False):
+        with in_float32(motion.device):
             features, after = self.layers(rotation, hidden.transpose(0, 1).contiguous())
         rotation = rotation + self.head(features)
         positions = motion[..., POSITION]
         if "position" not in self.branches:
-            with torch.no_grad():
-                positions = self.normalizer.pose(torch.cat([rotation, positions], -1), sparse).flatten(-2)
+            refined = torch.cat([rotation, positions], -1).detach()
+            positions = self.normalizer.pose(refined, sparse).flatten(-2)
         return torch.cat([rotation, positions], -1), after.transpose(0, 1)

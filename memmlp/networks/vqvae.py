@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from memmlp.common import distributed
 from memmlp.motion.body import FRAME_DIM, ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.layers import in_float32
 
 
 class Quantised(NamedTuple):
@@ -81,7 +82,7 @@ class EMACodebook(Codebook):
 
     def learn(self, latent: Tensor) -> Quantised:
         """Quantise latents (B, width) and move the code-vectors towards them."""
-        with torch.autocast(latent.device.type, enabled=False):  # running means need float32
+        with in_float32(latent.device):  # running means need float32
             codes, index = self._follow(latent.detach().to(self.vectors.dtype))
         return Quantised(codes, index, self.commitment * F.mse_loss(latent, codes))
 

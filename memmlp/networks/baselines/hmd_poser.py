@@ -24,6 +24,7 @@ from memmlp.motion.body import (
 from memmlp.motion.geometry import matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.encoder import EncoderLayer
+from memmlp.networks.layers import in_float32
 from memmlp.networks.memory import State
 from memmlp.networks.stream_model import StreamModel
 
@@ -114,7 +115,7 @@ class NormedLSTM(nn.Module):
         pairs = zip(self.directions, self.gains, strict=True)
         weights = [F.normalize(direction, dim=1) * gain for direction, gain in pairs]
         states = [state.contiguous()[None] for state in (hidden, cell)]
-        with torch.autocast(x.device.type, enabled=False):  # not every CPU has an LSTM in bfloat16
+        with in_float32(x.device):  # not every CPU has an LSTM in bfloat16
             made, *after = torch.lstm(
                 x.float() if x.dtype == torch.bfloat16 else x,
                 states, [*weights, *self.biases], True, 1, 0.0, self.training, False, True,

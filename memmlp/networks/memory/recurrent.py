@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import register_flop_formula
 
 from memmlp.motion.body import SPARSE_DIM
+from memmlp.networks.layers import in_float32
 from memmlp.networks.memory.features import Past, Recurred, RecurredFeature, State
 from memmlp.networks.memory.slot import FeatureMemory
 from memmlp.networks.vqvae import VQVAE
@@ -46,7 +47,7 @@ class Recurrence(nn.Module):
         Returns:
             Features (B, n, k), and the states after the last input.
         """
-        with torch.autocast(sparse.device.type, enabled=False):  # not every CPU has an LSTM in bfloat16
+        with in_float32(sparse.device):  # not every CPU has an LSTM in bfloat16
             output, states = self.run(self.norm(sparse), [state.contiguous()[None] for state in carried])
         return F.silu(output), [state[0] for state in states]
 
