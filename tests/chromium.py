@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import subprocess
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -41,9 +42,11 @@ class Browser:
         ]  # fmt: skip
         (theirs_in, self.write), (self.read, theirs_out) = os.pipe(), os.pipe()
         line = [*MODEST, "bash", "-c", f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}', "bash", *command]
+        self.litter = tempfile.TemporaryDirectory(prefix="chromium-", ignore_cleanup_errors=True)
         self.process = subprocess.Popen(
-            line, pass_fds=(theirs_in, theirs_out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
+            line, pass_fds=(theirs_in, theirs_out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            env={**os.environ, "TMPDIR": self.litter.name},
+        )  # fmt: skip
         os.close(theirs_in), os.close(theirs_out)
         self.buffer, self.count, self.session, self.errors = b"", 0, None, []
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
@@ -127,3 +130,4 @@ class Browser:
         self.process.kill()
         self.process.wait()
         os.close(self.write), os.close(self.read)
+        self.litter.cleanup()
