@@ -22,24 +22,6 @@ def _remember_exporter(module: Any) -> None:
         module.onnxscript_apis.get_torchlib_ops = functools.cache(module.onnxscript_apis.get_torchlib_ops)
 
 
-def _pass_over_other_operators(module: Any) -> None:
-    """Of onnxscript's optimiser: a pattern is not looked for at a node of another operator than its own.
-
-    It would list the whole graph for each node, a third of an export. The file is the same.
-    """
-    matcher = module.SimplePatternMatcher
-    if hasattr(matcher.match, "__wrapped__"):
-        return
-
-    @functools.wraps(matcher.match)
-    def match(self: Any, model: Any, graph: Any, node: Any, **options: Any) -> Any:
-        if self.pattern.output_nodes[0].op.matches(node.op_type):
-            return match.__wrapped__(self, model, graph, node, **options)
-        return module._basics.MatchResult().fail("another operator")
-
-    matcher.match = match
-
-
 def _remember_interpolations(module: Any) -> None:
     """Of OmegaConf: the parts of an interpolation such as ${seed}, which it only reads."""
     if not hasattr(module.parse, "cache_info"):
@@ -72,7 +54,6 @@ def _stamp(folder: str, name: str) -> tuple[int, int] | None:
 
 PATCHES = {
     "torch.onnx._internal.exporter._registration": _remember_exporter,
-    "onnxscript.rewriter._matcher": _pass_over_other_operators,
     "omegaconf.base": _remember_interpolations,
     "hydra._internal.config_repository": _remember_configs,
 }
