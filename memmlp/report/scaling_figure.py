@@ -27,6 +27,8 @@ STYLE: Any = {
 SIZE = (2.7, 1.9)  # of a panel, inches
 DOTS = 110  # an inch
 CURVE = 60  # points of a line
+WIDEST = 2.0  # of the measured decades: as many more are shown for a prediction, or it is left to the table
+HIGHEST = 1.0  # of the measured heights: as many more are shown on either side for a prediction
 DIGITS = 5  # of the numbers that decide whether a figure is drawn again
 DATA = "Comment"  # the entry of the file that has the digest of what is drawn
 
@@ -96,8 +98,12 @@ def _label(found: Trends) -> str:
 
 
 def _ahead(found: Trends) -> float | None:
-    """Return the compute that effects are predicted for, where it is on the figure's axis."""
-    return found.compute if found.against[0] == COMPUTE else None
+    """Return the compute that effects are predicted for, where it fits on the figure's axis."""
+    ends = found.measured(COMPUTE)
+    if found.against[0] != COMPUTE or found.compute is None or ends is None:
+        return None
+    beyond, span = math.log10(found.compute / ends[1]), math.log10(ends[1] / ends[0])
+    return found.compute if beyond <= WIDEST * span else None
 
 
 def _panel(axis: Axes, trend: Trend, found: Trends) -> None:
@@ -126,14 +132,16 @@ def _panel(axis: Axes, trend: Trend, found: Trends) -> None:
 
 
 def _limits(trend: Trend, name: str, ahead: float | None) -> tuple[float, float]:
-    """Return the ends of a panel: all but the bars of single cells, which may go on beyond it."""
+    """Return the ends of a panel, beyond which a cell's bar may go on, and a wide prediction does."""
     x = [point.values[name] for point in trend.points]
     ends = trend.curve([{name: min(x)}, {name: max(x)}])
     every = [0.0, *(point.effect.mean for point in trend.points), *ends.low, *ends.high]
+    low, high = min(every), max(every)
+    margin = 0.15 * (high - low or 1.0)
     if ahead is not None and trend.predicted is not None:
-        every += [trend.predicted.effect.low, trend.predicted.effect.high]
-    margin = 0.15 * (max(every) - min(every) or 1.0)
-    return min(every) - margin, max(every) + margin
+        there, room = trend.predicted.effect, HIGHEST * (high - low)
+        low, high = min(low, max(there.low, low - room)), max(high, min(there.high, high + room))
+    return low - margin, high + margin
 
 
 def _point(axis: Axes, point: Point, name: str, trend: Trend) -> None:
