@@ -9,7 +9,7 @@ from jinja2 import Environment, StrictUndefined, TemplateError
 
 from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept
-from memmlp.report.scaling import scaling_section
+from memmlp.report.scaling import scaling_section, scaling_summary
 from memmlp.report.unbacked_claims import claims
 from memmlp.statistics import Verdict
 from memmlp.tables.formats import escaped, markdown
@@ -187,8 +187,13 @@ class Words:
         return origin_words(self.sources[name].kept)
 
     def summary(self, name: str, mode: str = "stream") -> str:
-        """Return a table with a line for each arm: measured differences, their verdicts, and the paper's."""
+        """Return a table with a line for each arm: measured differences, their verdicts, and the paper's.
+
+        Of a sweep with a scale it is a list of what the lines through its cells say.
+        """
         table = self._table(name)
+        if (trends := self.sources[name].trends) is not None:
+            return scaling_summary(trends)
         metrics = table.measured_metrics
         lines = [
             f"| arm | compared with | {' | '.join(metrics)} |",

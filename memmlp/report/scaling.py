@@ -17,7 +17,7 @@ NEAR = 0.5
 
 def scaling_section(found: Trends) -> str:
     """Return the section in Markdown: how to read it, the figure, a table of lines, what they predict."""
-    parts = [f"### Effects against {_listed(found.against)}: {escaped(found.title)}"]
+    parts = [f"### Effects against {escaped(_listed(found.against))}: {escaped(found.title)}"]
     parts.append("\n".join(f"- {line}" for line in _explained(found)))
     if any(trend.line for trend in found.trends):
         parts.append(f"![The effects of {escaped(found.name)} with their lines]({picture_name(found)})")
@@ -26,6 +26,12 @@ def scaling_section(found: Trends) -> str:
     without = [trend for trend in found.trends if trend.line is None]
     words = dict.fromkeys(f"- '{escaped(trend.series)}': {escaped(trend.reason)}" for trend in without)
     return "\n\n".join([*parts, *(["No lines:\n\n" + "\n".join(words)] if words else [])]) + "\n"
+
+
+def scaling_summary(found: Trends) -> str:
+    """Return in Markdown what the lines say of each effect, a bullet each."""
+    readings = _readings(found)
+    return "\n".join(f"- {line}" for line in ([*_reach(found), *readings] if readings else ["no line yet"]))
 
 
 def picture_name(found: Trends) -> str:
@@ -168,7 +174,7 @@ def _reach(found: Trends) -> list[str]:
 def _held(found: Trends, where: str) -> list[str]:
     """Say what else is held at its largest measured value in the prediction."""
     others = [name for name in found.against if name != COMPUTE and _has(found, name)]
-    words = [f"{name}={ends[1]:g}" for name in others if (ends := found.measured(name)) is not None]
+    words = [f"`{name}={ends[1]:g}`" for name in others if (ends := found.measured(name)) is not None]
     return [f"the prediction for {where} has {_listed(words)}, the largest measured"] if words else []
 
 

@@ -27,11 +27,17 @@ def test_a_training_grows_with_steps_batch_and_width():
         flops_of(composed([*TINY, "refiner=sage"]))
 
 
-def test_a_finished_run_is_counted_from_its_own_config(tiny_home: Path):
-    run = next(run for run in list_runs(tiny_home / "outputs") if run.manifest["kind"] == "memmlp")
-    found = with_flops({"a": {0: load(run.folder)}})["a"][0]
-    assert found.training["flops"] == flops_of(composed(list(command_line.TINY)))
-    assert found.training["seconds"] == run.manifest["seconds"]["train"]
+def test_finished_runs_are_counted_from_their_own_configs(tiny_home: Path, home: Path):
+    runs = [
+        next(run for run in list_runs(one / "outputs") if run.manifest["kind"] == "memmlp")
+        for one in (tiny_home, home)
+    ]
+    changed = runs[1].config_path
+    changed.write_text(changed.read_text().replace("steps: 6", "steps: 12"))
+    found = with_flops({"a": {0: load(runs[0].folder)}, "b": {0: load(runs[1].folder)}})
+    once = flops_of(composed(list(command_line.TINY)))
+    assert [found[label][0].training["flops"] for label in "ab"] == [once, 2 * once]
+    assert found["a"][0].training["seconds"] == runs[0].manifest["seconds"]["train"]
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from fake_cells import STEP, cells
 from PIL import Image
 
 from memmlp.report.kept_results import Kept, dumps, load_kept, overrides_of, save
-from memmlp.report.markdown import KeptTable, pages
+from memmlp.report.markdown import KeptTable, Words, pages
 from memmlp.report.scaling import bounds_words, power, scaling_section
 from memmlp.report.scaling_figure import figure_is_of, scaling_figure
 from memmlp.tables.build_table import collect
@@ -45,7 +45,7 @@ def test_the_section_has_what_the_lines_say(found: Trends):
     assert "from 5.0 · 10¹¹ FLOP to 8.0 · 10¹² FLOP" in text
     assert "`profile=paper` is 2.4 · 10¹⁴ FLOP, 30 times the largest measured compute: 1.5 decades" in text
     assert "too far to trust a straight line" in text
-    assert "the prediction for `profile=paper` has data.split.train_fraction=1" in text
+    assert "the prediction for `profile=paper` has `data.split.train_fraction=1`" in text
     assert "14 of 14 cells (arm x point of the axes), 2 seeds each; their trainings took 2.3 hours" in text
     assert "- **none**: against compute grows in MPJPE" in text
     assert "![The effects of cells with their lines](cells.png)" in text
@@ -72,6 +72,8 @@ def test_a_sweep_with_a_scale_has_the_section_before_its_table(kept: Kept, found
     text = pages({"cells": KeptTable(kept, table, (), found)}, {})["cells.md"]
     assert text.index("### Effects against compute") < text.index("### Memory with more steps")
     assert text.count("of 'none' from 'full' in the same cell") == 1
+    summary = Words({"cells": KeptTable(kept, table, (), found)}).summary("cells")
+    assert [line[:12] for line in summary.splitlines()] == ["- `profile=p", "- the predic", "- **none**: "]
 
 
 def test_what_trainings_took_is_kept(kept: Kept, tmp_path: Path):

@@ -68,7 +68,7 @@ def test_the_line_is_that_of_the_cells_differences(tmp_path: Path):
     assert (trend.clips, trend.lost) == (12, 0)
 
 
-def test_a_prediction_is_wider_than_the_line_and_signs_are_corrected(tmp_path: Path):
+def test_a_prediction_is_wider_than_the_line(tmp_path: Path):
     sweep, runs = cells(tmp_path, course(1.0, 1.4))
     found = trends(sweep, runs, PAPER)
     trend = found.trends[0]
@@ -78,10 +78,17 @@ def test_a_prediction_is_wider_than_the_line_and_signs_are_corrected(tmp_path: P
     assert there.effect.mean == pytest.approx(line.mean)
     assert there.effect.low < line.low < line.high < there.effect.high
     assert there.sign == 1
-    assert {one.predicted.sign for one in trends(sweep, runs, {"profile=paper": STEP}).trends} <= {-1, 0, 1}
     assert trends(sweep, runs).trends[0].predicted is None
-    alone = trend.line.at(np.array([[1, math.log10(found.compute), 0]]), another=True).p[0]
-    assert alone < 0.05
+
+
+def test_signs_of_predictions_are_corrected_for_their_number(tmp_path: Path):
+    """Two that are each significant alone are not, where neither is significant at half the level."""
+    sweep, runs = cells(tmp_path, course(1.0, 1.01))
+    found = trends(sweep, runs, {"profile=paper": STEP * 1e5})
+    there = np.array([[1, math.log10(STEP * 1e5), 0]])
+    alone = [trend.line.at(there, another=True).p[0] for trend in found.trends]
+    assert [0.025 < p < 0.05 for p in alone] == [True, True]
+    assert [trend.predicted.sign for trend in found.trends] == [0, 0]
 
 
 def test_cells_of_the_same_runs_count_once(tmp_path: Path):
