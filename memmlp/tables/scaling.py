@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -229,32 +230,58 @@ def _trend(
     """Return an effect in a metric, whose slopes have no verdicts yet."""
     assert sweep.scale is not None
     own = [(arm, other) for arm, other in _in_cells(sweep) if arm.series == series]
-    cells: dict[tuple[frozenset[str], frozenset[str]], tuple[Arm, Arm, Paired]] = {}
-    for arm, other in own:
-        pair = pairs.get(Key(arm.label, MODE, metric))
-        if pair is not None:  # cells of the same runs are one
-            cells.setdefault((_ids(runs[arm.label]), _ids(runs[other.label])), (arm, other, pair))
-    values = [_values(sweep, arm, runs[other.label]) for arm, other, _ in cells.values()]
-    points = [_point(arm, value, pair) for (arm, _, pair), value in zip(cells.values(), values, strict=True)]
-    differences, groups, lost = _shared([pair for *_, pair in cells.values()])
-    varied = tuple(name for name in sweep.scale.against if len({value.get(name) for value in values}) > 1)
-    reason = _reason(sweep, values, varied)
-    x = np.array([[1.0, *(math.log10(value[name]) for name in varied)] for value in values if not reason])
-    line = None if reason else fit(differences, x, groups)
-    if not reason and line is None:
-        reason = (
-            f"{len(points)} cells are too few, or too alike, for a line of {1 + len(varied)} coefficients"
-        )
-    slopes = {
-        name: Slope(_bounds(estimate)[0], float(estimate.p[0]), None)
-        for number, name in enumerate(varied, 1)
-        if line is not None
-        for estimate in [line.slope(number)]
-    }
-    control = own[0][1].series
+    cells = _cells(sweep, runs, {arm.label: pairs.get(Key(arm.label, MODE, metric)) for arm, _ in own}, own)
+    differences, groups, lost = _shared([cell.pair for cell in cells])
+    values = [cell.values for cell in cells]
+    varied = tuple(name for name in sweep.scale.against if len({one.get(name) for one in values}) > 1)
+    reason, line = _reason(sweep.scale.against, values, varied, differences), None
+    if not reason:
+        x = np.array([[1.0, *(math.log10(one[name]) for name in varied)] for one in values])
+        line = fit(differences, x, groups)
+        few = f"{len(cells)} cells are too few, or too alike, for a line of {1 + len(varied)} coefficients"
+        reason = "" if line else few
     return Trend(
-        series, control, metric, tuple(points), differences.shape[1], lost, varied, line, slopes, reason
+        series=series,
+        control=own[0][1].series,
+        metric=metric,
+        points=tuple(map(_point, cells)),
+        clips=differences.shape[1],
+        lost=lost,
+        varied=varied,
+        line=line,
+        slopes=_slopes(line, varied) if line else {},
+        reason=reason,
     )
+
+
+class _Cell(NamedTuple):
+    """A measured cell: an arm, what effects are shown against, and its differences from its control."""
+
+    arm: Arm
+    values: Mapping[str, float]
+    pair: Paired
+
+
+def _cells(
+    sweep: Sweep,
+    runs: Mapping[str, Runs],
+    pairs: Mapping[str, Paired | None],
+    own: Sequence[tuple[Arm, Arm]],
+) -> list[_Cell]:
+    """Return the measured cells of a series; cells of the same runs are one."""
+    found: dict[tuple[frozenset[str], frozenset[str]], _Cell] = {}
+    for arm, other in own:
+        pair = pairs[arm.label]
+        if pair is not None:
+            ids = (_ids(runs[arm.label]), _ids(runs[other.label]))
+            found.setdefault(ids, _Cell(arm, _values(sweep, arm, runs[other.label]), pair))
+    return list(found.values())
+
+
+def _slopes(line: Line, varied: Sequence[str]) -> dict[str, Slope]:
+    """Return a line's slopes by name, with p-values of their own."""
+    estimates = {name: line.slope(number) for number, name in enumerate(varied, 1)}
+    return {name: Slope(_bounds(one)[0], float(one.p[0]), None) for name, one in estimates.items()}
 
 
 def _ids(runs: Runs) -> frozenset[str]:
@@ -270,21 +297,26 @@ def _values(sweep: Sweep, arm: Arm, control: Runs) -> dict[str, float]:
     return found | ({COMPUTE: float(np.mean(flops))} if COMPUTE in sweep.scale.against and flops else {})
 
 
-def _reason(sweep: Sweep, values: Sequence[Mapping[str, float]], varied: Sequence[str]) -> str:
+def _reason(
+    against: Sequence[str],
+    values: Sequence[Mapping[str, float]],
+    varied: Sequence[str],
+    differences: np.ndarray,
+) -> str:
     """Say why there can be no line; empty where there may be one."""
-    assert sweep.scale is not None
-    first = sweep.scale.against[0]
     if not values:
         return "no cell is measured"
-    if any(name not in value for value in values for name in sweep.scale.against):
+    if any(name not in one for one in values for name in against):
         return "the compute of some cells is not kept; memmlp results save counts it"
-    return "" if first in varied else f"all cells have the same {first}"
+    if not differences.size:
+        return "its cells share no test clip"
+    return "" if against[0] in varied else f"all cells have the same {against[0]}"
 
 
-def _point(arm: Arm, values: Mapping[str, float], pair: Paired) -> Point:
-    found = paired_effects(pair.matrix[None], pair.groups)
+def _point(cell: _Cell) -> Point:
+    found = paired_effects(cell.pair.matrix[None], cell.pair.groups)
     effect = Bounds(float(found.mean[0]), float(found.low[0]), float(found.high[0]))
-    return Point(arm.cell, values, effect, len(pair.matrix))
+    return Point(cell.arm.cell, cell.values, effect, len(cell.pair.matrix))
 
 
 def _shared(pairs: Sequence[Paired]) -> tuple[np.ndarray, np.ndarray, int]:

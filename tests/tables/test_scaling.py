@@ -82,12 +82,12 @@ def test_a_prediction_is_wider_than_the_line(tmp_path: Path):
 
 
 def test_signs_of_predictions_are_corrected_for_their_number(tmp_path: Path):
-    """Two that are each significant alone are not, where neither is significant at half the level."""
+    """One of two that is significant alone is not, where it is not so at half the level."""
     sweep, runs = cells(tmp_path, course(1.0, 1.01))
     found = trends(sweep, runs, {"profile=paper": STEP * 1e5})
     there = np.array([[1, math.log10(STEP * 1e5), 0]])
     alone = [trend.line.at(there, another=True).p[0] for trend in found.trends]
-    assert [0.025 < p < 0.05 for p in alone] == [True, True]
+    assert 0.025 < min(alone) < 0.05
     assert [trend.predicted.sign for trend in found.trends] == [0, 0]
 
 
