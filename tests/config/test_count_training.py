@@ -6,6 +6,7 @@ from pathlib import Path
 
 import command_line
 import pytest
+import yaml
 
 from memmlp.common.errors import InputError
 from memmlp.config.compose import composed
@@ -32,8 +33,9 @@ def test_finished_runs_are_counted_from_their_own_configs(tiny_home: Path, home:
         next(run for run in list_runs(one / "outputs") if run.manifest["kind"] == "memmlp")
         for one in (tiny_home, home)
     ]
-    changed = runs[1].config_path
-    changed.write_text(changed.read_text().replace("steps: 6", "steps: 12"))
+    config = runs[1].config
+    config["optim"]["steps"] *= 2
+    runs[1].config_path.write_text(yaml.safe_dump(config))
     found = with_flops({"a": {0: load(runs[0].folder)}, "b": {0: load(runs[1].folder)}})
     once = flops_of(composed(list(command_line.TINY)))
     assert [found[label][0].training["flops"] for label in "ab"] == [once, 2 * once]

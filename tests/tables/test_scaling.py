@@ -119,6 +119,16 @@ def test_clips_that_some_cells_lack_are_counted(tmp_path: Path):
     assert (len(trend.points), trend.clips, trend.lost) == (7, 11, 1)
 
 
+def test_cells_that_share_no_clip_have_no_line(tmp_path: Path):
+    sweep, runs = cells(tmp_path, course(1.0, 1.3))
+    for number, arm in enumerate(sweep.arms[-2:]):
+        for run in runs[arm.label].values():
+            for clip in list(run.clips.values())[number::2]:
+                clip["stream"]["rotation"]["MPJPE"] = math.nan
+    trend = trends(sweep, runs).trends[0]
+    assert (trend.line, trend.clips, trend.reason) == (None, 0, "its cells share no test clip")
+
+
 @pytest.mark.parametrize(
     ("axes", "against", "reason"),
     [
