@@ -16,6 +16,8 @@ from memmlp.common.errors import InputError
 if TYPE_CHECKING:
     from memmlp.report.kept_results import Kept
     from memmlp.report.markdown import KeptTable
+    from memmlp.sweep.spec import Sweep
+    from memmlp.tables.scaling import Trends
     from memmlp.tables.table import Table
 
 FOLDER = Path("docs/results")
@@ -65,6 +67,10 @@ def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | N
     kept = Kept(source, without_paths(words), found, overrides_of(sweep), rounds, known.flags)
     if not kept.every:
         raise InputError(f"sweep {name}: no finished run to keep; make them with: {kept.command}")
+    if sweep.scale:
+        from memmlp.config.count_training import predicted_flops, with_flops
+
+        kept = replace(kept, runs=with_flops(found), predicted=predicted_flops(sweep))
     path = out / f"{stem or sweep.name}.json"
     merged = _merged(path, load_kept(path), kept) if path.exists() else kept
     save(path, merged)
@@ -89,18 +95,22 @@ def docs(folder: Path, check: bool) -> None:
     """
     from memmlp.report.markdown import check_claims, pages
 
-    made = pages(sources(folder), _templates(folder))
+    found = sources(folder)
+    made = pages(found, _templates(folder))
+    drawn = _pictures(folder, found)
     if PROSE.exists():
         check_claims(str(PROSE), PROSE.read_text(encoding="utf-8"))
     differing = [name for name, text in made.items() if _text(folder / name) != text]
     stale = _stale(folder, made)
     if check:
+        differing = [*differing, *drawn]
         for name in [*differing, *stale]:
             click.echo(f"differs: {folder / name}; make it again with: memmlp results docs", err=True)
         if differing or stale:
             raise SystemExit(1)
     else:
         _write(folder, made, stale)
+        _draw(folder, drawn)
     click.echo(f"{len(made)} pages, {len(differing)} {'differ' if check else 'written'}")
 
 
@@ -116,8 +126,31 @@ def sources(folder: Path) -> dict[str, KeptTable]:
         # Verdicts of rounds are those of all clips together, and of no source alone.
         names = () if kept.rounds else kept.sources
         by_source = tuple(titled(_table(kept, name), name) for name in names)
-        found[path.stem] = KeptTable(kept, _table(kept), by_source)
+        found[path.stem] = KeptTable(kept, _table(kept), by_source, _trends(kept, path.stem))
     return found
+
+
+def _trends(kept: Kept, stem: str) -> Trends | None:
+    """Return the effects of kept results against their sweep's scale; None where it has none.
+
+    Args:
+        kept: the results.
+        stem: the name of their page.
+    """
+    from memmlp.config.plan_sweep import find_sweep
+    from memmlp.tables.scaling import trends
+
+    sweep = find_sweep(kept.sweep)
+    if sweep.scale is None:
+        return None
+    sweep = _with_seeds(sweep, kept)
+    return replace(trends(sweep, kept.of(sweep), kept.predicted), name=stem)
+
+
+def _with_seeds(sweep: Sweep, kept: Kept) -> Sweep:
+    """Return the sweep with the seeds that any of the kept runs has."""
+    seeds = sorted({seed for runs in kept.runs.values() for seed in runs})
+    return sweep.with_overrides([f"seed={','.join(map(str, seeds))}"])
 
 
 def _table(kept: Kept, source: str | None = None) -> Table:
@@ -138,8 +171,7 @@ def _table(kept: Kept, source: str | None = None) -> Table:
         spent = rounds.spent(sweep)
         table = collect(spent, kept.of(spent), command=f"{kept.command} --until-decided", rounds=rounds)
     else:
-        seeds = sorted({seed for runs in kept.runs.values() for seed in runs})
-        sweep = sweep.with_overrides([f"seed={','.join(map(str, seeds))}"])
+        sweep = _with_seeds(sweep, kept)
         runs = kept.of(sweep)
         if source is not None:
             sweep, runs, left_out = on_source(sweep, runs, source)
@@ -179,6 +211,32 @@ def _stale(folder: Path, made: Mapping[str, str]) -> list[str]:
 
     every = {path.name for path in folder.glob("*.md") if (_text(path) or "").startswith(MARK)}
     return sorted(every - made.keys())
+
+
+def _pictures(folder: Path, found: Mapping[str, KeptTable]) -> dict[str, Trends]:
+    """Return the figures whose files are not there or show other numbers, by the files' names."""
+    from memmlp.report.scaling import picture_name
+
+    wanted = {
+        picture_name(one.trends): one.trends
+        for one in found.values()
+        if one.trends and any(trend.line for trend in one.trends.trends)
+    }
+    if not wanted:
+        return {}
+    from memmlp.report.scaling_figure import figure_is_of
+
+    return {name: trends for name, trends in wanted.items() if not figure_is_of(folder / name, trends)}
+
+
+def _draw(folder: Path, wanted: Mapping[str, Trends]) -> None:
+    """Draw figures into their files."""
+    from memmlp.common.files import atomic_write
+
+    for name, trends in wanted.items():
+        from memmlp.report.scaling_figure import scaling_figure
+
+        atomic_write(folder / name, scaling_figure(trends))
 
 
 def _write(folder: Path, made: Mapping[str, str], stale: list[str]) -> None:

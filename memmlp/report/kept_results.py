@@ -11,7 +11,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -38,6 +38,7 @@ class Kept:
         arms: the overrides of each arm with which the runs were made.
         rounds: the rounds in which seeds were spent, as JSON holds them; None where they were not.
         flags: what a reader has to know of how the seeds came about.
+        predicted: the FLOPs of a training with other overrides in place of the axes', by these overrides.
     """
 
     sweep: str
@@ -46,6 +47,7 @@ class Kept:
     arms: Mapping[str, tuple[str, ...]]
     rounds: Mapping[str, Any] | None = None
     flags: tuple[str, ...] = ()
+    predicted: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def command(self) -> str:
@@ -73,7 +75,8 @@ class Kept:
         labels = dict.fromkeys([*self.runs, *other.runs])
         runs = {label: {**self.runs.get(label, {}), **other.runs.get(label, {})} for label in labels}
         arms, flags = {**self.arms, **other.arms}, tuple(dict.fromkeys([*self.flags, *other.flags]))
-        return replace(self, runs=runs, arms=arms, rounds=other.rounds, flags=flags)
+        predicted = {**self.predicted, **other.predicted}
+        return replace(self, runs=runs, arms=arms, rounds=other.rounds, flags=flags, predicted=predicted)
 
     def check(self, arms: Mapping[str, tuple[str, ...]]) -> None:
         """Check that the arms have the overrides with which their runs were made.
@@ -138,6 +141,7 @@ def dumps(kept: Kept) -> str:
         "arms": {label: list(words) for label, words in sorted(kept.arms.items())},
         "rounds": kept.rounds,
         **({"flags": list(kept.flags)} if kept.flags else {}),
+        **({"predicted_flops": dict(kept.predicted)} if kept.predicted else {}),
         "clips": dict(sorted(clips.items())),
         "cells": {
             label: {str(seed): runs[seed].id for seed in sorted(runs)}
@@ -167,7 +171,8 @@ def load_kept(path: Path) -> Kept:
         }
         arms = {label: tuple(words) for label, words in content["arms"].items()}
         words, flags = tuple(content["overrides"]), tuple(content.get("flags", ()))
-        return Kept(content["sweep"], words, cells, arms, content["rounds"], flags)
+        predicted = content.get("predicted_flops", {})
+        return Kept(content["sweep"], words, cells, arms, content["rounds"], flags, predicted)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: no file of results ({error}); make it with memmlp results save") from None
 
@@ -194,7 +199,9 @@ def _record(run: Measured) -> dict[str, Any]:
     for name in ("partial", "processes", "offline"):  # files from before there were these have none
         if origin[name] == getattr(Origin, name):
             del origin[name]
-    return {"origin": origin, "clips": _clips_key(run), "costs": costs, "errors": errors}
+    training = {"training": {name: _short(number) for name, number in run.training.items()}}
+    record = {"origin": origin, "clips": _clips_key(run), "costs": costs}
+    return record | (training if run.training else {}) | {"errors": errors}
 
 
 def _clips(run: Measured) -> list[list[str]]:
@@ -220,6 +227,7 @@ def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str
         sources={clip: source[0] for clip, _, *source in clips if source},
         costs=record["costs"],
         origin=Origin(**record["origin"]),
+        training=record.get("training", {}),
     )
 
 

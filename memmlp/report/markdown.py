@@ -9,10 +9,12 @@ from jinja2 import Environment, StrictUndefined, TemplateError
 
 from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept
+from memmlp.report.scaling import scaling_section, scaling_summary
 from memmlp.report.unbacked_claims import claims
 from memmlp.statistics import Verdict
 from memmlp.tables.formats import escaped, markdown
 from memmlp.tables.measured_run import UNKNOWN, Measured
+from memmlp.tables.scaling import Trends
 from memmlp.tables.table import Cell, Row, Table
 from memmlp.tables.table_text import MINUS, MISSING, caption, effect_words, number_words, unit, value_words
 
@@ -30,12 +32,14 @@ TURNED = {Verdict.HIGHER: Verdict.LOWER, Verdict.LOWER: Verdict.HIGHER}
 class KeptTable(NamedTuple):
     """What a page is made of: results that were kept, and the table that is computed of them today.
 
-    `by_source` are the tables of each source's test clips alone, where the data has several.
+    `by_source` are the tables of each source's test clips alone, where the data has several; `trends` the
+    effects against the sweep's scale, where it has one.
     """
 
     kept: Kept
     table: Table
     by_source: tuple[Table, ...] = ()
+    trends: Trends | None = None
 
 
 def pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -> dict[str, str]:
@@ -82,7 +86,8 @@ def _filled(name: str, text: str, words: Words) -> str:
 
 def _table_page(source: KeptTable) -> str:
     tables = "\n".join(map(markdown, (source.table, *source.by_source)))
-    return f"{MARK}\n\n{tables}\n{origin_words(source.kept)}\n"
+    scaling = f"{scaling_section(source.trends)}\n" if source.trends else ""
+    return f"{MARK}\n\n{scaling}{tables}\n{origin_words(source.kept)}\n"
 
 
 def origin_words(kept: Kept) -> str:
@@ -182,8 +187,13 @@ class Words:
         return origin_words(self.sources[name].kept)
 
     def summary(self, name: str, mode: str = "stream") -> str:
-        """Return a table with a line for each arm: measured differences, their verdicts, and the paper's."""
+        """Return a table with a line for each arm: measured differences, their verdicts, and the paper's.
+
+        Of a sweep with a scale it is a list of what the lines through its cells say.
+        """
         table = self._table(name)
+        if (trends := self.sources[name].trends) is not None:
+            return scaling_summary(trends)
         metrics = table.measured_metrics
         lines = [
             f"| arm | compared with | {' | '.join(metrics)} |",

@@ -9,7 +9,7 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import plain, read_json, write_json
-from memmlp.sweep.spec import Arm, Sweep
+from memmlp.sweep.spec import Arm, Scale, Sweep
 
 NAME = "sweep.json"
 
@@ -29,7 +29,11 @@ def kept(folder: Path) -> Sweep | None:
         return None
     try:
         content = json.loads(path.read_bytes())
-        content["arms"] = tuple(Arm(**_with_tuples(arm, ("overrides", "seeds"))) for arm in content["arms"])
+        content["arms"] = tuple(
+            Arm(**_with_tuples(arm, ("overrides", "seeds", "cell"))) for arm in content["arms"]
+        )
+        scale = content.get("scale")
+        content["scale"] = Scale(**_with_tuples(scale, ("against", "predict"))) if scale else None
         return Sweep(**_with_tuples(content, ("notes", "base", "seeds", "arms", "metrics", "extra")))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: not a sweep ({error}); start the sweep again") from None

@@ -14,6 +14,8 @@ arms:
   "2": {overrides: ['memory.layers=[2]'], paper: {MPJRE: 2.63}, note: as printed}
   "4": {overrides: ['memory.layers=[4]'], branch: rotation, against: "2"}     # its own branch and control
 axes: {model.frames: [11, 21], seed: [0, 1, 2]}      # a grid, instead of arms or over each of them
+axes: [{optim.steps: [500, 2000]}, {model.frames: [11]}]           # or a list of grids: the cells of all
+scale: {against: [compute], predict: [profile=paper]}    # effects as lines through the cells
 """
 
 from __future__ import annotations
@@ -31,13 +33,14 @@ import yaml
 
 from memmlp.common.errors import InputError, why_unreadable
 from memmlp.evaluation.units import SMALLEST, UNITS
-from memmlp.sweep.spec import BRANCHES, COSTS, Arm, Sweep, parse_branch, parse_seeds
+from memmlp.sweep.spec import BRANCHES, COMPUTE, COSTS, Arm, Scale, Sweep, parse_branch, parse_seeds
 
 KEYS = (
     "title", "table", "notes", "base", "seeds", "control", "metrics", "branch", "branch_source", "smallest",
-    "arms", "axes",
+    "arms", "axes", "scale",
 )  # fmt: skip
 ARM_KEYS = ("overrides", "branch", "against", "paper", "note")
+SCALE_KEYS = ("against", "predict")
 BASE = "base"  # the arm of a sweep that has only seeds
 
 
@@ -83,11 +86,10 @@ def parse_sweep(name: str, content: Any) -> Sweep:
     content = _mapping(content, "the file", KEYS)
     branch = parse_branch(content.get("branch", BRANCHES[0]), "branch")
     arms = [_arm(label, value, branch) for label, value in _labelled(content.get("arms", {})).items()]
-    axes = dict(_mapping(content.get("axes", {}), "axes"))
-    seeds = parse_seeds(axes.pop("seed", content.get("seeds", [0])), "seeds")
+    grids, seeds = _axes(content)
     if "axes" in content and not arms:
-        arms = [Arm("" if axes else BASE, branch=branch)]  # axes of seeds alone
-    arms = list(_grid(arms, axes)) if axes else arms
+        arms = [Arm("" if grids else BASE, branch=branch)]  # axes of seeds alone
+    arms = list(_over_cells(arms, _cells(grids))) if grids else arms
     runnable = [arm.label for arm in arms if arm.overrides is not None]
     if not runnable:
         raise InputError("arms: none to run; allowed is at least one arm with overrides, or axes")
@@ -108,6 +110,7 @@ def parse_sweep(name: str, content: Any) -> Sweep:
         metrics=_metrics(content.get("metrics", ["MPJRE", "MPJPE", "MPJVE", "Jitter"])),
         branch_source=None if source is None else _text(source, "branch_source"),
         smallest=SMALLEST | _smallest(content.get("smallest", {})),
+        scale=_scale(content["scale"], grids, arms) if "scale" in content else None,
     )
 
 
@@ -139,24 +142,94 @@ def _check_controls(arms: Sequence[Arm], runnable: Sequence[str]) -> None:
             )
 
 
-def _grid(arms: Sequence[Arm], axes: Mapping[str, Any]) -> Iterable[Arm]:
-    """Yield every arm with every combination of the axes' values.
+def _axes(content: Mapping[str, Any]) -> tuple[list[dict[str, list[Any]]], tuple[int, ...]]:
+    """Return the grids of the axes by key, none of them empty, and the sweep's seeds.
 
-    The paper's own arms stay as they are. An arm without a label gets that of its combination. An arm with a
-    control of its own is compared with that control at the same combination.
+    Seeds may be an axis of a single grid.
     """
-    for key, values in axes.items():
+    axes = content.get("axes", {})
+    several = isinstance(axes, list)
+    if several and not axes:
+        raise InputError("axes: an empty list; allowed is a mapping of keys, or a list of such mappings")
+    named = [(f"axes[{place}]", grid) for place, grid in enumerate(axes)] if several else [("axes", axes)]
+    grids = [dict(_mapping(grid, name)) for name, grid in named]
+    own = {} if several else grids[0]
+    seeds = parse_seeds(own.pop("seed", content.get("seeds", [0])), "seeds")
+    for (name, _), grid in zip(named, grids, strict=True):
+        _check_grid(grid, name, several)
+    return [grid for grid in grids if grid], seeds
+
+
+def _check_grid(grid: Mapping[str, Any], name: str, several: bool) -> None:
+    """Refuse a grid that gives no cells; several grids have no seeds of their own."""
+    if several and not grid:
+        raise InputError(f"{name}: empty; allowed is a mapping of at least one key")
+    for key, values in grid.items():
+        if several and str(key) == "seed":
+            raise InputError(f"{name}.seed: allowed in a single grid; the seeds of several are set by seeds")
         if not isinstance(values, list) or not values:
-            raise InputError(f"axes.{key}: allowed is a list of values, not empty")
+            raise InputError(f"{name}.{key}: allowed is a list of values, not empty")
+
+
+def _cells(grids: Sequence[Mapping[str, Sequence[Any]]]) -> list[tuple[str, ...]]:
+    """Return the cells of all grids as overrides, each cell once, in whatever order it names its keys."""
+    found: dict[frozenset[str], tuple[str, ...]] = {}
+    for grid in grids:
+        for values in itertools.product(*grid.values()):
+            words = tuple(f"{key}={_word(value)}" for key, value in zip(grid, values, strict=True))
+            found.setdefault(frozenset(words), words)
+    return list(found.values())
+
+
+def _over_cells(arms: Sequence[Arm], cells: Sequence[tuple[str, ...]]) -> Iterable[Arm]:
+    """Yield every arm in every cell.
+
+    The paper's own arms stay as they are. An arm without a label gets that of its cell. An arm with a control
+    of its own is compared with that control in the same cell.
+    """
     for arm in arms:
         if arm.overrides is None:
             yield arm
             continue
-        for values in itertools.product(*axes.values()):
-            words = [f"{key}={_word(value)}" for key, value in zip(axes, values, strict=True)]
+        for words in cells:
             label = ", ".join([arm.label, *words] if arm.label else words)
             control = f"{arm.against}, {', '.join(words)}" if arm.against else None
-            yield replace(arm, label=label, overrides=(*arm.overrides, *words), against=control)
+            overrides = (*arm.overrides, *words)
+            yield replace(
+                arm, label=label, overrides=overrides, against=control, series=arm.label, cell=words
+            )
+
+
+def _scale(value: Any, grids: Sequence[Mapping[str, Any]], arms: Sequence[Arm]) -> Scale:
+    """Return what the effects are shown against, checked to be there and to have numbers."""
+    value = _mapping(value or {}, "scale", SCALE_KEYS)
+    if not any(arm.cell and arm.against for arm in arms):
+        raise InputError("scale: allowed with axes, and arms that name their control with against")
+    against = _texts(value.get("against", [COMPUTE]), "scale.against")
+    if not against or len(set(against)) < len(against):
+        raise InputError("scale.against: allowed is a list of at least one, each once")
+    keys = [str(key) for grid in grids for key in grid]
+    for name in against:
+        if name != COMPUTE and name not in keys:
+            allowed = ", ".join(dict.fromkeys([COMPUTE, *keys]))
+            raise InputError(f"scale.against: '{name}' is no axis; allowed are {allowed}")
+        _check_numbers(name, grids)
+    return Scale(tuple(against), tuple(_overrides(value.get("predict", []), "scale.predict")))
+
+
+def _check_numbers(name: str, grids: Sequence[Mapping[str, Any]]) -> None:
+    """Refuse an axis that effects can't be shown against: every cell needs a number above 0."""
+    for place, grid in enumerate(grids) if name != COMPUTE else ():
+        if name not in grid:
+            raise InputError(f"scale.against: axes[{place}] has no {name}; allowed is a key of every grid")
+        for number in grid[name]:
+            if not _positive(number):
+                raise InputError(f"scale.against: {name}={_word(number)}; allowed are numbers above 0")
+
+
+def _positive(number: Any) -> bool:
+    """Return whether a value of a file is a finite number above 0."""
+    return isinstance(number, int | float) and not isinstance(number, bool) and 0 < number < math.inf
 
 
 def _word(value: Any) -> str:
@@ -247,8 +320,7 @@ def _smallest(value: Any) -> dict[str, float]:
     """Return the smallest effects of interest by metric."""
     values = dict(_mapping(value or {}, "smallest", [*UNITS]))
     for metric, number in values.items():
-        real = isinstance(number, int | float) and not isinstance(number, bool)
-        if not real or not 0 < number < math.inf:
+        if not _positive(number):
             raise InputError(f"smallest.{metric}: {number!r}; allowed is a number above 0")
     return values
 

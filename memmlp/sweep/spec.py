@@ -18,6 +18,9 @@ COSTS = ("FLOPs", "MACs", "parameters", "size", "ms", "pose ms", "ratio", "FPS")
 Their units: GFLOP, GMAC, millions, MB, ms, multiples of the yardstick's time, and frames a second.
 """
 
+COMPUTE = "compute"
+"""The FLOPs of a cell's training, its control's, as something that effects are shown against."""
+
 
 @dataclass(frozen=True)
 class Arm:
@@ -33,6 +36,8 @@ class Arm:
         fixed: whether the file gives the arm a branch of its own.
         seeds: its seeds in place of the sweep's, where seeds are spent on open verdicts alone; None for the
             sweep's.
+        series: its label in the file, which it shares with the same arm in other cells of the axes.
+        cell: the overrides that the axes give it, one a key; empty without axes.
     """
 
     label: str
@@ -43,6 +48,28 @@ class Arm:
     against: str | None = None
     fixed: bool = False
     seeds: tuple[int, ...] | None = None
+    series: str = ""
+    cell: tuple[str, ...] = ()
+
+    @property
+    def own(self) -> tuple[str, ...]:
+        """Its overrides without those of its cell."""
+        return tuple(word for word in self.overrides or () if word not in self.cell)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What the effects of a sweep with axes are shown against, as lines through its cells.
+
+    Attributes:
+        against: COMPUTE or keys of the axes, whose values are numbers above 0; the first is the figure's
+            axis, and the others are what the cells differ in beside it.
+        predict: overrides in place of the cells', at whose compute the effects are predicted; empty for no
+            prediction.
+    """
+
+    against: tuple[str, ...] = (COMPUTE,)
+    predict: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -72,6 +99,8 @@ class Sweep:
         branch_source: how we know which branch the paper's values belong to; None where the file does not
             say.
         smallest: the smallest effect of interest by metric, in its unit; every metric but costs has one.
+        scale: what the effects are shown against, as lines through the cells of its axes; None for tables
+            alone.
     """
 
     name: str
@@ -86,6 +115,7 @@ class Sweep:
     extra: tuple[str, ...] = ()
     branch_source: str | None = None
     smallest: Mapping[str, float] = field(default_factory=lambda: SMALLEST)
+    scale: Scale | None = None
 
     def with_branch(self, branch: str) -> Sweep:
         """Return the same sweep with its arms showing another branch.

@@ -137,4 +137,6 @@ def _row(sweep: Sweep, arm: Arm, runs: Runs | None, modes: Sequence[str], found:
     wanted = sweep.seeds_of(arm) if runs is not None else ()
     against = control_arm(sweep, arm)
     other = against.label if against else None
-    return Row(arm.label, arm.branch, other, arm.note, tuple(runs or ()), wanted, cells)
+    in_cell = against is not None and arm.cell and against.cell == arm.cell
+    pairing = f"'{arm.series}' from '{against.series}' in the same cell" if against and in_cell else ""
+    return Row(arm.label, arm.branch, other, arm.note, tuple(runs or ()), wanted, cells, pairing)

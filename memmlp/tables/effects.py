@@ -25,10 +25,14 @@ class Paired(NamedTuple):
     Attributes:
         matrix: the arm's errors less the control's (S, C), by seed and clip.
         groups: the number of each clip's group (C,).
+        clips: the names of these clips (C).
+        takes: the names of their groups (C).
     """
 
     matrix: np.ndarray
     groups: np.ndarray
+    clips: tuple[str, ...] = ()
+    takes: tuple[str, ...] = ()
 
 
 def control_arm(sweep: Sweep, arm: Arm) -> Arm | None:
@@ -106,7 +110,8 @@ def _paired(
     known = np.isfinite(matrix).all(0)
     names = [ours[seeds[0]].group(clip) for clip in clips] if seeds else []
     groups = np.unique(np.array(names, dtype=str), return_inverse=True)[1]
-    return Paired(matrix[:, known], groups[known])
+    left = [(clip, name) for clip, name, is_known in zip(clips, names, known, strict=False) if is_known]
+    return Paired(matrix[:, known], groups[known], *map(tuple, zip(*left, strict=True)))
 
 
 def _shared(ours: Runs, theirs: Runs) -> tuple[list[int], list[str]]:

@@ -77,6 +77,7 @@ class Measured:
         latency: everything that was measured of its streaming step.
         sources: the source of each clip, where the data has several.
         run: the run's folder; None where the results were kept without one.
+        training: what its training took, where that is known: `seconds`, and `flops` where results are kept.
     """
 
     id: str
@@ -88,6 +89,7 @@ class Measured:
     latency: Mapping[str, Any] = field(default_factory=dict)
     run: Run | None = None
     sources: Mapping[str, str] = field(default_factory=dict)
+    training: Mapping[str, float] = field(default_factory=dict)
 
     def value(self, mode: str, branch: str, metric: str) -> float | None:
         """Return a metric's mean over clips, or a cost; None where the run has none."""
@@ -173,7 +175,9 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     deployments = [run.deployment(name) for name in stages or () if run.deployment(name).done]
     latency = (deployments or [run.preferred_deployment])[-1].record
     origin = _evaluated(_origin(manifest), reports)
-    return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run, sources)
+    seconds = (manifest.get("seconds") or {}).get("train")
+    training = {} if seconds is None else {"seconds": float(seconds)}
+    return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run, sources, training)
 
 
 def _join(known: dict[str, Any], more: Mapping[str, Any]) -> None:

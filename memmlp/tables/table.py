@@ -108,6 +108,7 @@ class Row:
         found: the seeds of its finished runs.
         wanted: the seeds that it should have; none for a row that is the paper's alone.
         cells: its cells by mode and metric.
+        pairing: in words, which arm is its control in every cell of the axes; empty where it has one alone.
     """
 
     label: str
@@ -117,6 +118,7 @@ class Row:
     found: tuple[int, ...]
     wanted: tuple[int, ...]
     cells: Mapping[str, Mapping[str, Cell]]
+    pairing: str = ""
 
     @property
     def paper_only(self) -> bool:

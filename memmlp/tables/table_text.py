@@ -127,8 +127,12 @@ def _branches(table: Table) -> list[str]:
 
 def _differences(table: Table) -> str:
     """Explain the lines of differences, and which control each arm has."""
-    own = [row for row in table.rows if row.against not in (None, table.control)]
-    others = "".join(f", of '{row.label}' from '{row.against}'" for row in own)
+    own = [
+        row.pairing or f"'{row.label}' from '{row.against}'"
+        for row in table.rows
+        if row.pairing or row.against not in (None, table.control)
+    ]
+    others = "".join(f", of {words}" for words in dict.fromkeys(own))
     least = "its look's level" if table.looks else "0.05"
     star = f"; * p < {least} by Holm's correction over the table's {table.comparisons} comparisons"
     return (
@@ -221,15 +225,15 @@ def effect_words(cell: Cell, metric: str) -> tuple[str, ...]:
     if effect is None:
         return (MISSING,)
     if metric in COSTS:
-        return _signed(effect.mean, "+.3g"), *_ratio(cell.mean, effect.mean)
+        return signed(effect.mean, "+.3g"), *_ratio(cell.mean, effect.mean)
     if effect.low is None or effect.high is None:
-        return (_signed(effect.mean, "+.2f"),)
-    places = _places(effect.high - effect.low)
-    low, high = (_signed(number, f".{places}f") for number in (effect.low, effect.high))
+        return (signed(effect.mean, "+.2f"),)
+    digits = places(effect.high - effect.low)
+    low, high = (signed(number, f".{digits}f") for number in (effect.low, effect.high))
     star = "*" if effect.significant else ""
     at = f" ({effect.decided})" if effect.decided else ""
     verdict = () if effect.verdict is None else (f"{effect.verdict}{at}",)
-    return _signed(effect.mean, f"+.{places}f") + star, f"[{low}, {high}]", *verdict
+    return signed(effect.mean, f"+.{digits}f") + star, f"[{low}, {high}]", *verdict
 
 
 def number_words(value: float) -> str:
@@ -244,12 +248,12 @@ def _ratio(value: float | None, difference: float) -> tuple[str, ...]:
     return (f"(x {value / (value - difference):.3g})",)
 
 
-def _signed(number: float, form: str) -> str:
+def signed(number: float, form: str) -> str:
     """Return a number in a format, with a typographic minus; "0" for zero."""
     return format(number, form).replace("-", MINUS) if number else "0"
 
 
-def _places(width: float) -> int:
+def places(width: float) -> int:
     """Return the decimals (2 or 3) that show two digits of an interval's half width."""
     return min(max(1 - math.floor(math.log10(width / 2)), 2), 3) if width > 0 else 2
 
@@ -258,10 +262,10 @@ def paper_words(cell: Cell, metric: str) -> str:
     """Return the paper's value, its difference from the control, and whether it holds here."""
     if cell.paper is None:
         return MISSING
-    places = 1 if metric in ("ms", "pose ms", "FPS") else 2
-    value = f"{cell.paper:.{places}f}"
+    digits = 1 if metric in ("ms", "pose ms", "FPS") else 2
+    value = f"{cell.paper:.{digits}f}"
     if cell.paper_effect is None:
         return value
     mark = {None: "", True: " ✓", False: " ✗"}[cell.agrees]
     ratio = "".join(f" {words}" for words in _ratio(cell.paper, cell.paper_effect)) if metric in COSTS else ""
-    return f"{value} ({_signed(cell.paper_effect, f'+.{places}f')}{mark}){ratio}"
+    return f"{value} ({signed(cell.paper_effect, f'+.{digits}f')}{mark}){ratio}"

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import fake_cells
 import pytest
 from conftest import Memmlp, one_line
 from fake_runs import fake_sweep
 
+from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.spec import Sweep
 
@@ -38,6 +40,28 @@ def test_kept_results_become_pages(memmlp: Memmlp, planned: None):
     page = Path("docs/results/table14.md")
     assert page.read_text().count("| 3/3 |") == 8
     assert ", open" in Path("docs/results/README.md").read_text()
+
+
+def test_a_sweep_with_a_scale_has_a_figure_beside_its_page(
+    memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch
+):
+    """It is checked as the page is, by the numbers that it shows, and drawn again where they changed."""
+    sweep = parse_sweep("cells", fake_cells.content())
+    steps = {arm.label: fake_cells.steps_of(arm.cell) for arm in sweep.arms}
+    monkeypatch.setattr(
+        "memmlp.config.count_training.with_flops",
+        lambda found: {label: fake_cells.trained(runs, steps[label]) for label, runs in found.items()},
+    )
+    monkeypatch.setattr("memmlp.config.count_training.predicted_flops", lambda sweep: {"profile=paper": 1e15})
+    Path("cells.yaml").write_text(json.dumps(fake_cells.content()))
+    memmlp("results", "save", "cells.yaml", "--name", "small")
+    assert memmlp("results", "docs").out == "1 pages, 1 written\n"
+    page, figure = Path("docs/results/small.md"), Path("docs/results/small.png")
+    assert "(small.png)" in page.read_text()
+    figure.write_bytes(b"")
+    assert "differs: docs/results/small.png" in memmlp("results", "docs", "--check").err
+    memmlp("results", "docs")
+    assert memmlp("results", "docs", "--check").code == 0
 
 
 def test_check_names_the_page_that_differs(memmlp: Memmlp, planned: None):

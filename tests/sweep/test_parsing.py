@@ -13,6 +13,10 @@ from memmlp.evaluation.units import SMALLEST, UNITS
 from memmlp.sweep import parsing
 from memmlp.sweep.parsing import load_sweep, parse_sweep
 
+SCALED = {
+    "arms": {"full": [], "none": {"overrides": ["memory=none"], "against": "full"}},
+    "axes": [{"a": [1, 2], "b": [3]}, {"a": [None]}],
+}
 ARMS = {"full": [], "none": {"overrides": ["memory=none"], "paper": {"MPJPE": 4.13}}}
 
 
@@ -59,6 +63,21 @@ def test_every_metric_has_a_smallest_effect_that_a_file_may_set():
         ({"arms": ARMS, "metrics": ["FID"]}, "metrics: 'FID'; allowed are MPJRE"),
         ({"arms": ARMS, "table": "four"}, "table: 'four'"),
         ({"arms": ARMS, "axes": {"model.frames": 11}}, "axes.model.frames: allowed is a list of values"),
+        ({"arms": ARMS, "axes": []}, "axes: an empty list; allowed is a mapping"),
+        ({"arms": ARMS, "axes": 3}, "axes: 3; allowed is a mapping"),
+        ({"arms": ARMS, "axes": [{"model.width": [8]}, 3]}, "axes[1]: 3; allowed is a mapping"),
+        ({"arms": ARMS, "axes": [{"model.width": [8]}, {}]}, "axes[1]: empty; allowed is a mapping"),
+        ({"arms": ARMS, "axes": [{"model.width": 8}]}, "axes[0].model.width: allowed is a list of values"),
+        ({"arms": ARMS, "axes": [{"a": [1]}, {"seed": [0]}]}, "axes[1].seed: allowed in a single grid"),
+        ({"arms": ARMS, "scale": {}}, "scale: allowed with axes, and arms that name their control"),
+        ({"arms": ARMS, "axes": {"a": [1]}, "scale": {}}, "scale: allowed with axes, and arms that name"),
+        ({**SCALED, "scale": {"agianst": []}}, "scale.agianst: no such key; did you mean against?"),
+        ({**SCALED, "scale": {"against": []}}, "scale.against: allowed is a list of at least one"),
+        ({**SCALED, "scale": {"against": ["a", "a"]}}, "scale.against: allowed is a list of at least one"),
+        ({**SCALED, "scale": {"against": ["c"]}}, "scale.against: 'c' is no axis; allowed are compute, a, b"),
+        ({**SCALED, "scale": {"against": ["b"]}}, "scale.against: axes[1] has no b"),
+        ({**SCALED, "scale": {"against": ["a"]}}, "scale.against: a=null; allowed are numbers above 0"),
+        ({**SCALED, "scale": {"predict": ["pro file"]}}, "scale.predict: 'pro file'; allowed is KEY=VALUE"),
         ({"arms": {1: [], "1": []}}, "arms: two have the same label"),
         ({"arms": ARMS, "title": 5}, "title: 5; allowed is text"),
     ],

@@ -6,6 +6,7 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.sweep.parsing import parse_sweep
+from memmlp.sweep.spec import Scale
 
 ARMS = {"full": [], "none": {"overrides": ["memory=none"], "paper": {"MPJPE": 4.13}}}
 
@@ -64,6 +65,29 @@ def test_axes_are_a_grid_over_every_arm():
     assert seeds.seeds == (5, 6)
     alone = parse_sweep("s", {"axes": {"model.frames": [11, 21]}})
     assert [arm.label for arm in alone.arms] == ["model.frames=11", "model.frames=21"]
+
+
+def test_a_list_of_grids_gives_each_of_their_cells_once():
+    arms = {"full": [], "none": {"overrides": ["memory=none"], "against": "full"}}
+    axes = [{"a": [1, 2, 2], "b": [3]}, {"b": [3, 4], "a": [1]}]
+    sweep = parse_sweep("s", {"arms": arms, "axes": axes})
+    assert [arm.cell for arm in sweep.arms[:3]] == [("a=1", "b=3"), ("a=2", "b=3"), ("b=4", "a=1")]
+    assert len(sweep.arms) == 6
+    assert sweep.arms[4].label == "none, a=2, b=3"
+    assert sweep.control_of(sweep.arms[4]) == "full, a=2, b=3"
+    assert (sweep.arms[4].series, sweep.arms[4].own) == ("none", ("memory=none",))
+    assert parse_sweep("s", {"arms": arms, "axes": axes[0]}).arms == sweep.arms[:2] + sweep.arms[3:5]
+
+
+def test_a_scale_is_compute_where_the_file_names_nothing_else():
+    arms = {"full": [], "none": {"overrides": ["memory=none"], "against": "full"}}
+    axes = {"optim.steps": [5, 50]}
+    scales = [
+        parse_sweep("s", {"arms": arms, "axes": axes, "scale": scale}).scale
+        for scale in ({}, {"against": ["compute", "optim.steps"], "predict": ["profile=paper"]})
+    ]
+    assert scales == [Scale(), Scale(("compute", "optim.steps"), ("profile=paper",))]
+    assert parse_sweep("s", {"arms": arms, "axes": axes}).scale is None
 
 
 def test_rows_of_the_paper_alone_are_not_run():

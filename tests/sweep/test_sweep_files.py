@@ -233,6 +233,24 @@ TERMS = {
 # Facts that tell whether the transcription is right
 
 
+def test_the_cells_of_scaling_are_lines_through_one_point():
+    """Of each arm as many cells, with a memory in proportion to the width as the paper's is."""
+    sweep = load_sweep(FOLDER / "scaling.yaml")
+    assert len(sweep.runnable()) == 66
+    cells = [dict(word.split("=") for word in arm.cell) for arm in sweep.arms if arm.series == "Mem-MLP"]
+    centre = {"data.split.train_fraction": "1.0", "profile.width": "128", "optim.steps": "2000"}
+    away = [[key for key in centre if cell[key] != centre[key]] for cell in cells]
+    assert sorted(map(tuple, away)) == sorted(
+        [(), *[("optim.steps",)] * 4, *[("profile.width",)] * 3, *[("data.split.train_fraction",)] * 3]
+    )
+    for cell in cells:
+        assert 8 * int(cell["profile.memory_width"]) == 3 * int(cell["profile.width"])
+    paper = composed(["profile=paper"])
+    assert 8 * paper.memory.width == 3 * paper.model.width
+    for arm in sweep.arms:
+        assert arm.series == "Mem-MLP" or sweep.control_of(arm) == f"Mem-MLP, {', '.join(arm.cell)}"
+
+
 @pytest.mark.parametrize("table", FULL)
 def test_the_full_model_is_the_same_in_every_table(table: int):
     headline = row(1, "Mem-MLP-41") | ({"MPJVE": 15.08} if table in OTHER_MPJVE else {})

@@ -14,6 +14,7 @@ from memmlp.cli.rounds import look
 from memmlp.runs.run import Run
 from memmlp.sweep.kept_sweep import keep, kept
 from memmlp.sweep.plan import Plan, RunTask
+from memmlp.sweep.spec import Scale
 from memmlp.tables.build_table import collect, finished_runs
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import load
@@ -193,7 +194,11 @@ def test_a_kept_sweep_is_the_sweep(outputs: Path):
     folder = outputs / "sweeps" / "mine"
     sweep = kept(folder)
     assert sweep is not None
-    changed = sweep.with_overrides(["seed=4,5", "optim.lr=0.1"])
+    changed = replace(
+        sweep.with_overrides(["seed=4,5", "optim.lr=0.1"]),
+        scale=Scale(("compute", "a.b"), ("profile=paper",)),
+        arms=(*sweep.arms[1:], replace(sweep.arms[0], series="a", cell=("b=1", "c=2"))),
+    )
     keep(changed, folder)
     assert kept(folder) == changed
     assert kept(folder.parent) is None

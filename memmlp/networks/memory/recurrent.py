@@ -66,6 +66,14 @@ def lstm_flops(x: Sequence[int], to_gates: Sequence[int], again: Sequence[int], 
     return 2 * x[0] * x[1] * (to_gates[0] * to_gates[1] + again[0] * again[1])
 
 
+@register_flop_formula(torch.ops.aten.mkldnn_rnn_layer_backward)
+def lstm_backward_flops(
+    x: Sequence[int], to_gates: Sequence[int], again: Sequence[int], *shapes, **rest
+) -> int:
+    """Count the FLOPs of its gradients, those of the weights and those of the inputs; see `lstm_flops`."""
+    return 2 * lstm_flops(x, to_gates, again)
+
+
 class LSTM(Recurrence):
     """A recurrence with a hidden and a cell state."""
 

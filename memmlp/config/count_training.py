@@ -1,0 +1,72 @@
+"""What the trainings of configs take, counted without doing them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from memmlp.common.errors import InputError
+from memmlp.common.files import digest
+from memmlp.config.build import build_architecture, build_training, config_of
+from memmlp.config.compose import composed
+from memmlp.motion.body import builtin_rest_joints
+from memmlp.motion.normalizer import Normalizer
+from memmlp.sweep.spec import Sweep
+from memmlp.tables.effects import Runs
+from memmlp.tables.measured_run import Measured
+from memmlp.training.network import NetworkTraining
+from memmlp.training.training_flops import training_flops
+
+ELSEWHERE = ("seed", "data", "paths", "profile", "tracking", "evaluation", "export", "device", "threads")
+"""Groups and keys that a training's operations don't follow from."""
+
+
+def flops_of(cfg: DictConfig) -> int:
+    """Count the FLOPs of a checked config's training (see `memmlp.training.training_flops`).
+
+    Raises:
+        InputError: for a refiner, whose training is not that of a network.
+    """
+    training = build_training(cfg, {})
+    if not isinstance(training, NetworkTraining):
+        raise InputError("refiner: the operations of its training are not counted; allowed is refiner=null")
+    architecture = build_architecture(cfg)
+    with torch.random.fork_rng(devices=[]):
+        codes = architecture.vqvae().eval() if architecture.uses_codes else None
+        rest = torch.as_tensor(builtin_rest_joints(), dtype=torch.float32)
+        model = architecture.build(Normalizer.raw(architecture.coordinates, rest), codes)
+        return training_flops(model, training.loss(model.branches), training.optim)
+
+
+def with_flops(runs: Mapping[str, Runs]) -> dict[str, Runs]:
+    """Return finished runs with the FLOPs of their trainings, each counted from its own config."""
+    known: dict[str, int] = {}
+
+    def count(run: Measured) -> Measured:
+        assert run.run is not None
+        cfg = config_of(run.run)
+        config = OmegaConf.to_container(cfg, resolve=True)
+        assert isinstance(config, dict)
+        key = digest({name: value for name, value in config.items() if name not in ELSEWHERE})
+        if key not in known:
+            known[key] = flops_of(cfg)
+        return replace(run, training={**run.training, "flops": float(known[key])})
+
+    return {label: {seed: count(run) for seed, run in seeds.items()} for label, seeds in runs.items()}
+
+
+def predicted_flops(sweep: Sweep) -> dict[str, float]:
+    """Count the FLOPs of the control's training with `scale.predict` in place of its cell.
+
+    Returns:
+        The number by these overrides as one line; empty where nothing is to be predicted.
+    """
+    words = sweep.scale.predict if sweep.scale else ()
+    if not words:
+        return {}
+    control = next(arm for arm in sweep.arms if arm.label == sweep.control)
+    elsewhere = replace(control, overrides=(*control.own, *words))
+    return {" ".join(words): float(flops_of(composed(list(sweep.overrides(elsewhere)))))}

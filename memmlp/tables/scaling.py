@@ -1,0 +1,386 @@
+"""The effects of a sweep with axes as lines through its cells, against compute and what else differs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from memmlp.statistics import holm, paired_effects
+from memmlp.statistics.effects import LEVEL
+from memmlp.statistics.scaling import Estimate, Line, fit
+from memmlp.sweep.spec import COMPUTE, COSTS, Arm, Sweep
+from memmlp.tables.effects import Paired, Runs, control_arm, paired
+from memmlp.tables.table import Key
+
+MODE = "stream"
+
+
+class Change(StrEnum):
+    """What may be claimed of how an effect changes along the axes.
+
+    RISES and FALLS are changes whose size is known, but not that of the effect at either end.
+    """
+
+    GROWS = "grows"
+    FADES = "fades"
+    TURNS = "changes its sign"
+    RISES = "rises"
+    FALLS = "falls"
+    NONE = "no trend seen"
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """A number with its 95 % interval."""
+
+    mean: float
+    low: float
+    high: float
+
+    @property
+    def sign(self) -> int:
+        """1 or -1 where the interval leaves 0 out, else 0."""
+        return (self.low > 0) - (self.high < 0)
+
+
+@dataclass(frozen=True)
+class Point:
+    """The effect in one cell.
+
+    Attributes:
+        cell: the overrides of the cell.
+        values: what the effects are shown against, by name.
+        effect: the mean difference, with its own interval over clips, and over seeds where there are several.
+        seeds: how many seeds it is of.
+    """
+
+    cell: tuple[str, ...]
+    values: Mapping[str, float]
+    effect: Bounds
+    seeds: int
+
+
+@dataclass(frozen=True)
+class Slope:
+    """How an effect changes with a tenfold value of what it is shown against.
+
+    Attributes:
+        change: the change, with its interval.
+        p: its p-value, corrected over all slopes of the sweep; None where there is none.
+        verdict: what may be claimed of it; None where there is no p-value.
+    """
+
+    change: Bounds
+    p: float | None
+    verdict: Change | None
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The effect that one more cell would show elsewhere, if the line goes on straight.
+
+    Attributes:
+        effect: the effect, with its interval.
+        sign: 1 or -1 where it is above or below 0 after a correction over all predictions of the sweep, else
+            0; None where nothing can be said of it.
+    """
+
+    effect: Bounds
+    sign: int | None
+
+
+@dataclass(frozen=True)
+class Trend:
+    """An effect in a metric, and the line through it.
+
+    Attributes:
+        series: the arm's label in the file.
+        control: its control's.
+        metric: the metric.
+        points: the measured cells.
+        clips: how many test clips all of its cells share; `lost`, how many more single ones have.
+        varied: what differs between the cells, the names of the line's slopes.
+        line: the line; None where `reason` says why there is none.
+        slopes: its slopes by name.
+        reason: why there is no line; empty where there is one.
+        predicted: the effect at the compute that the sweep predicts for; None without one, or without a line
+            against compute.
+    """
+
+    series: str
+    control: str
+    metric: str
+    points: tuple[Point, ...]
+    clips: int
+    lost: int
+    varied: tuple[str, ...]
+    line: Line | None
+    slopes: Mapping[str, Slope]
+    reason: str = ""
+    predicted: Prediction | None = None
+
+    @property
+    def most(self) -> dict[str, float]:
+        """The largest measured value of what differs between the cells, by name."""
+        return {name: max(point.values[name] for point in self.points) for name in self.varied}
+
+    def at(self, values: Mapping[str, float] | None = None, another: bool = False) -> Bounds:
+        """Return the line at values by name, at the largest measured ones where they are not given.
+
+        Args:
+            values: the values.
+            another: whether the interval is for one more cell there (see `Line.at`).
+        """
+        return _bounds(self.curve([values or {}], another))[0]
+
+    def curve(self, values: Sequence[Mapping[str, float]], another: bool = False) -> Estimate:
+        """Return the line at several values; see `at`."""
+        assert self.line is not None
+        most = self.most
+        rows = [[1.0, *(math.log10(one.get(name, most[name])) for name in self.varied)] for one in values]
+        return self.line.at(np.array(rows), another=another)
+
+
+@dataclass(frozen=True)
+class Trends:
+    """All effects of a sweep against its scale.
+
+    Attributes:
+        name, title: the sweep's.
+        against: what they are shown against; the first is a figure's axis.
+        trends: the effects, series by series, each metric.
+        cells: how many cells were measured, of how many that the sweep has, each an arm's.
+        wanted: the latter number.
+        predict: the overrides whose compute the effects are predicted for; None for none.
+        compute: that compute, FLOPs; None where it is not known.
+        seconds: how long the trainings took together.
+    """
+
+    name: str
+    title: str
+    against: tuple[str, ...]
+    trends: tuple[Trend, ...]
+    cells: int
+    wanted: int
+    predict: str | None
+    compute: float | None
+    seconds: float
+
+    @property
+    def series(self) -> tuple[str, ...]:
+        """The arms whose effects these are, in the sweep's order."""
+        return tuple(dict.fromkeys(trend.series for trend in self.trends))
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """The metrics, in the sweep's order."""
+        return tuple(dict.fromkeys(trend.metric for trend in self.trends))
+
+    def measured(self, name: str) -> tuple[float, float] | None:
+        """Return the least and the largest measured value of one of `against`; None for none."""
+        every = [
+            point.values[name] for trend in self.trends for point in trend.points if name in point.values
+        ]
+        return (min(every), max(every)) if every else None
+
+
+def trends(sweep: Sweep, runs: Mapping[str, Runs], predicted: Mapping[str, float] | None = None) -> Trends:
+    """Return the effects of a sweep against its scale, in stream mode.
+
+    Args:
+        sweep: the sweep, which has a `scale`.
+        runs: the finished runs of every runnable arm, by seed.
+        predicted: FLOPs by the overrides that a prediction is for, as one line.
+    """
+    assert sweep.scale is not None
+    pairs = paired(sweep, runs, (MODE,))
+    metrics = [metric for metric in sweep.metrics if metric not in COSTS]
+    series = list(dict.fromkeys(arm.series for arm, _ in _in_cells(sweep)))
+    found = [_trend(sweep, runs, pairs, name, metric) for name in series for metric in metrics]
+    words = " ".join(sweep.scale.predict) or None
+    compute = (predicted or {}).get(words or "")
+    every = {run.id: run for seeds in runs.values() for run in seeds.values()}
+    return Trends(
+        name=sweep.name,
+        title=sweep.title,
+        against=sweep.scale.against,
+        trends=tuple(_predicted(_judged(found), compute)),
+        cells=sum(bool(runs.get(arm.label)) for arm in sweep.runnable()),
+        wanted=len(sweep.runnable()),
+        predict=words,
+        compute=compute,
+        seconds=sum(run.training.get("seconds", 0.0) for run in every.values()),
+    )
+
+
+def _in_cells(sweep: Sweep) -> list[tuple[Arm, Arm]]:
+    """Return the arms that are compared within their cell, each with its control."""
+    found = [(arm, control_arm(sweep, arm)) for arm in sweep.runnable() if arm.cell]
+    return [(arm, other) for arm, other in found if other is not None and other.cell == arm.cell]
+
+
+def _trend(
+    sweep: Sweep, runs: Mapping[str, Runs], pairs: Mapping[Key, Paired], series: str, metric: str
+) -> Trend:
+    """Return an effect in a metric, whose slopes have no verdicts yet."""
+    assert sweep.scale is not None
+    own = [(arm, other) for arm, other in _in_cells(sweep) if arm.series == series]
+    cells = _cells(sweep, runs, {arm.label: pairs.get(Key(arm.label, MODE, metric)) for arm, _ in own}, own)
+    differences, groups, lost = _shared([cell.pair for cell in cells])
+    values = [cell.values for cell in cells]
+    varied = tuple(name for name in sweep.scale.against if len({one.get(name) for one in values}) > 1)
+    reason, line = _reason(sweep.scale.against, values, varied, differences), None
+    if not reason:
+        x = np.array([[1.0, *(math.log10(one[name]) for name in varied)] for one in values])
+        line = fit(differences, x, groups)
+        few = f"{len(cells)} cells are too few, or too alike, for a line of {1 + len(varied)} coefficients"
+        reason = "" if line else few
+    return Trend(
+        series=series,
+        control=own[0][1].series,
+        metric=metric,
+        points=tuple(map(_point, cells)),
+        clips=differences.shape[1],
+        lost=lost,
+        varied=varied,
+        line=line,
+        slopes=_slopes(line, varied) if line else {},
+        reason=reason,
+    )
+
+
+class _Cell(NamedTuple):
+    """A measured cell: an arm, what effects are shown against, and its differences from its control."""
+
+    arm: Arm
+    values: Mapping[str, float]
+    pair: Paired
+
+
+def _cells(
+    sweep: Sweep,
+    runs: Mapping[str, Runs],
+    pairs: Mapping[str, Paired | None],
+    own: Sequence[tuple[Arm, Arm]],
+) -> list[_Cell]:
+    """Return the measured cells of a series; cells of the same runs are one."""
+    found: dict[tuple[frozenset[str], frozenset[str]], _Cell] = {}
+    for arm, other in own:
+        pair = pairs[arm.label]
+        if pair is not None:
+            ids = (_ids(runs[arm.label]), _ids(runs[other.label]))
+            found.setdefault(ids, _Cell(arm, _values(sweep, arm, runs[other.label]), pair))
+    return list(found.values())
+
+
+def _slopes(line: Line, varied: Sequence[str]) -> dict[str, Slope]:
+    """Return a line's slopes by name, with p-values of their own."""
+    estimates = {name: line.slope(number) for number, name in enumerate(varied, 1)}
+    return {name: Slope(_bounds(one)[0], float(one.p[0]), None) for name, one in estimates.items()}
+
+
+def _ids(runs: Runs) -> frozenset[str]:
+    return frozenset(run.id for run in runs.values())
+
+
+def _values(sweep: Sweep, arm: Arm, control: Runs) -> dict[str, float]:
+    """Return what is known of a cell of what effects are shown against: its words' numbers, its compute."""
+    assert sweep.scale is not None
+    words = dict(word.split("=", 1) for word in arm.cell)
+    found = {name: float(words[name]) for name in sweep.scale.against if name in words}
+    flops = [run.training["flops"] for run in control.values() if "flops" in run.training]
+    return found | ({COMPUTE: float(np.mean(flops))} if COMPUTE in sweep.scale.against and flops else {})
+
+
+def _reason(
+    against: Sequence[str],
+    values: Sequence[Mapping[str, float]],
+    varied: Sequence[str],
+    differences: np.ndarray,
+) -> str:
+    """Say why there can be no line; empty where there may be one."""
+    if not values:
+        return "no cell is measured"
+    if any(name not in one for one in values for name in against):
+        return "the compute of some cells is not kept; memmlp results save counts it"
+    if not differences.size:
+        return "its cells share no test clip"
+    return "" if against[0] in varied else f"all cells have the same {against[0]}"
+
+
+def _point(cell: _Cell) -> Point:
+    found = paired_effects(cell.pair.matrix[None], cell.pair.groups)
+    effect = Bounds(float(found.mean[0]), float(found.low[0]), float(found.high[0]))
+    return Point(cell.arm.cell, cell.values, effect, len(cell.pair.matrix))
+
+
+def _shared(pairs: Sequence[Paired]) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return the means over seeds of all cells on the clips that they share.
+
+    Returns:
+        Differences (K, C), the clips' groups (C,), and how many clips some cells have beside these.
+    """
+    takes = {clip: take for pair in pairs for clip, take in zip(pair.clips, pair.takes, strict=True)}
+    rows = [dict(zip(pair.clips, pair.matrix.mean(0), strict=True)) for pair in pairs]
+    clips = [clip for clip in takes if all(clip in row for row in rows)]
+    differences = np.array([[row[clip] for clip in clips] for row in rows]).reshape(len(pairs), len(clips))
+    return differences, np.array([takes[clip] for clip in clips], dtype=str), len(takes) - len(clips)
+
+
+def _judged(found: Sequence[Trend]) -> list[Trend]:
+    """Return the trends with verdicts on their slopes, corrected by Holm over all of them."""
+    places = [(number, name) for number, trend in enumerate(found) for name in trend.slopes]
+    corrected = holm(np.array([found[number].slopes[name].p for number, name in places], float))
+    slopes: list[dict[str, Slope]] = [{} for _ in found]
+    for (number, name), p in zip(places, corrected, strict=True):
+        trend = found[number]
+        known = not math.isnan(p)
+        verdict = _verdict(trend, name, p) if known else None
+        change = trend.slopes[name].change
+        slopes[number][name] = Slope(change, float(p) if known else None, verdict)
+    return [replace(trend, slopes=own) for trend, own in zip(found, slopes, strict=True)]
+
+
+def _predicted(found: Sequence[Trend], compute: float | None) -> list[Trend]:
+    """Return the trends with their predictions, whose signs are corrected by Holm over all of them."""
+
+    def there(trend: Trend) -> Estimate | None:
+        ahead = compute is not None and COMPUTE in trend.slopes
+        return trend.curve([{COMPUTE: float(compute or 0)}], another=True) if ahead else None
+
+    estimates = [there(trend) for trend in found]
+    corrected = holm(np.array([math.nan if one is None else one.p[0] for one in estimates]))
+    signs = [None if math.isnan(p) else int(p <= LEVEL) for p in corrected]
+    return [
+        trend
+        if one is None
+        else replace(trend, predicted=Prediction(_bounds(one)[0], _signed(sign, float(one.mean[0]))))
+        for trend, one, sign in zip(found, estimates, signs, strict=True)
+    ]
+
+
+def _signed(sure: int | None, mean: float) -> int | None:
+    return None if sure is None else sure * (1 if mean > 0 else -1)
+
+
+def _verdict(trend: Trend, name: str, p: float) -> Change:
+    """Return what may be claimed of a slope, from the signs that the line has at both ends for certain."""
+    if p > LEVEL:
+        return Change.NONE
+    every = [point.values[name] for point in trend.points]
+    first, last = (trend.at({name: value}) for value in (min(every), max(every)))
+    if not first.sign and not last.sign:
+        return Change.RISES if last.mean > first.mean else Change.FALLS
+    if first.sign * last.sign < 0:
+        return Change.TURNS
+    return Change.GROWS if abs(last.mean) > abs(first.mean) else Change.FADES
+
+
+def _bounds(estimate: Estimate) -> list[Bounds]:
+    ends = zip(estimate.mean, estimate.low, estimate.high, strict=True)
+    return [Bounds(*map(float, numbers)) for numbers in ends]

@@ -1,0 +1,54 @@
+"""The FLOPs of a training: those that torch counts in a real step, and what the networks' layers imply."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import tiny
+import tiny_tasks
+import torch
+from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
+
+from memmlp.networks.memory import NoMemory
+from memmlp.networks.memory.recurrent import LSTM
+from memmlp.training.loop import train_step
+from memmlp.training.training_flops import training_flops
+
+
+@pytest.mark.parametrize("name", ["mem_mlp", "avatar_poser", "agrol_mlp"])
+def test_a_training_is_as_many_steps_as_the_loop_takes(name: str):
+    """Of a batch and a loss as they are trained, in the loop's own step."""
+    optim = replace(tiny_tasks.OPTIM, steps=7, batch=5)
+    task = (
+        tiny_tasks.motion_task("forced", optim)
+        if name == "mem_mlp"
+        else tiny_tasks.baseline_task(name, optim)
+    )
+    optimiser = optim.build(task.parameter_groups())
+    with FlopCounterMode(display=False) as counter:
+        train_step(task, optim, optimiser, 0)
+    assert training_flops(task.model, task.loss, optim) == 7 * counter.get_total_flops()
+
+
+def test_a_linear_layers_share_is_six_operations_a_weight():
+    """3 x 2 x MACs, less the gradient of the inputs, which the stem does not need."""
+    model = tiny.model(NoMemory)
+    loss = tiny_tasks.motion_task("forced", kind=NoMemory).loss
+    optim = replace(tiny_tasks.OPTIM, steps=1, batch=4)
+    before = training_flops(model, loss, optim)
+    model.stem = nn.Sequential(model.stem, nn.Linear(16, 16))
+    assert training_flops(model, loss, optim) - before == 3 * 2 * 4 * 7 * 16 * 16
+
+
+def test_an_lstms_gradients_are_counted():
+    """Its backward pass is one kernel, which torch's counter does not know."""
+    layer = LSTM(6)
+    inputs = torch.randn(3, 5, 54, requires_grad=True)
+    with FlopCounterMode(display=False) as counter:
+        output, _ = layer(inputs, [torch.zeros(3, 6), torch.zeros(3, 6)])
+        forward = counter.get_total_flops()
+        output.sum().backward()
+    assert forward == 2 * 3 * 5 * 24 * (54 + 6)
+    assert counter.get_total_flops() == 3 * forward
