@@ -30,11 +30,12 @@ CURVE = 60  # points of a line
 WIDEST = 2.0  # of the measured decades: as many more are shown for a prediction, or it is left to the table
 HIGHEST = 1.0  # of the measured heights: as many more are shown on either side for a prediction
 DIGITS = 5  # of the numbers that decide whether a figure is drawn again
+LOOK = 1  # raised when the same numbers are drawn otherwise, so that figures are drawn again
 DATA = "Comment"  # the entry of the file that has the digest of what is drawn
 
 
 def figure_digest(found: Trends) -> str:
-    """Return a digest of the numbers that the figure shows."""
+    """Return a digest of the numbers that the figure shows, and of how it shows them."""
 
     def short(number: float) -> str:
         return f"{number:.{DIGITS}g}"
@@ -51,7 +52,7 @@ def figure_digest(found: Trends) -> str:
         ]
         for trend in found.trends
     ]
-    return digest([numbers, found.predict, found.compute, found.against])
+    return digest([LOOK, numbers, found.predict, found.compute, found.against])
 
 
 def figure_is_of(path: Path, found: Trends) -> bool:
