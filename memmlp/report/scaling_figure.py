@@ -11,7 +11,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from memmlp.common.files import digest
 from memmlp.sweep.spec import COMPUTE
@@ -111,6 +111,7 @@ def _panel(axis: Axes, trend: Trend, found: Trends) -> None:
     name, ahead = found.against[0], _ahead(found)
     axis.axhline(0, color=FAINT, zorder=0)
     axis.set_xscale("log")
+    axis.xaxis.set_minor_formatter(NullFormatter())
     axis.yaxis.set_major_locator(MaxNLocator(4))
     for point in trend.points:
         _point(axis, point, name, trend)
