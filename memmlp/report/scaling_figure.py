@@ -11,7 +11,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from memmlp.common.files import digest
 from memmlp.sweep.spec import COMPUTE
@@ -30,11 +30,12 @@ CURVE = 60  # points of a line
 WIDEST = 2.0  # of the measured decades: as many more are shown for a prediction, or it is left to the table
 HIGHEST = 1.0  # of the measured heights: as many more are shown on either side for a prediction
 DIGITS = 5  # of the numbers that decide whether a figure is drawn again
+LOOK = 1  # raised when the same numbers are drawn otherwise, so that figures are drawn again
 DATA = "Comment"  # the entry of the file that has the digest of what is drawn
 
 
 def figure_digest(found: Trends) -> str:
-    """Return a digest of the numbers that the figure shows."""
+    """Return a digest of the numbers that the figure shows, and of how it shows them."""
 
     def short(number: float) -> str:
         return f"{number:.{DIGITS}g}"
@@ -51,7 +52,7 @@ def figure_digest(found: Trends) -> str:
         ]
         for trend in found.trends
     ]
-    return digest([numbers, found.predict, found.compute, found.against])
+    return digest([LOOK, numbers, found.predict, found.compute, found.against])
 
 
 def figure_is_of(path: Path, found: Trends) -> bool:
@@ -110,6 +111,7 @@ def _panel(axis: Axes, trend: Trend, found: Trends) -> None:
     name, ahead = found.against[0], _ahead(found)
     axis.axhline(0, color=FAINT, zorder=0)
     axis.set_xscale("log")
+    axis.xaxis.set_minor_formatter(NullFormatter())
     axis.yaxis.set_major_locator(MaxNLocator(4))
     for point in trend.points:
         _point(axis, point, name, trend)
