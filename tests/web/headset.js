@@ -1,11 +1,19 @@
 // A headset in software (IWER), whose head and hands a test moves. It runs before the page's own scripts.
 
 (() => {
+  let awaited = 0; // answers of the page's worker
+  const post = Worker.prototype.postMessage;
+  Worker.prototype.postMessage = function (...words) {
+    if (!this.heard) this.heard = this.addEventListener('message', () => { awaited--; }) ?? true;
+    awaited++;
+    return post.apply(this, words);
+  };
+
   const device = new IWER.XRDevice(IWER.metaQuest3, { stereoEnabled: false });
   device.installRuntime({ forceInstall: true });
   const kept = { device, saved: null };
   const request = navigator.xr.requestSession.bind(navigator.xr);
-  navigator.xr.requestSession = async (...words) => (kept.session = await request(...words));
+  navigator.xr.requestSession = async (...words) => (kept.session = patient(await request(...words)));
   const address = URL.createObjectURL;
   URL.createObjectURL = blob => {
     blob.text().then(text => { kept.saved = text; });
@@ -51,21 +59,34 @@
   }
 
   // Play frames of trackers (joints) at 60 Hz with devices that sit on the body as `offsets` say; resolves at the end.
-  // A slow machine gets the clip slower: at least every fourth frame is drawn. The last one is kept until `over()` holds.
+  // The last frame is kept until `over()` holds.
   kept.play = async (frames, offsets, over = () => true) => {
     const { inverse, minus, multiply, rotate } = await import('./rotations.js');
     const worn = trackers => trackers.map(({ position, rotation }, i) => {
       const turned = multiply(rotation, inverse(offsets.rotations[i]));
       return { position: minus(position, rotate(turned, offsets.positions[i])), rotation: turned };
     });
-    const began = performance.now();
-    for (let frame = 0; ;) {
-      frame = Math.min(Math.floor((performance.now() - began) * 0.06), frame + 4);
+    const drawn = () => new Promise(resolve => kept.session.requestAnimationFrame(resolve));
+    const began = await drawn();
+    for (let now = began; ; now = await drawn()) {
+      const frame = Math.floor((now - began) * 0.06);
       if (frame >= frames.length && over()) return frames.length;
       kept.put(worn(frames[Math.min(frame, frames.length - 1)]));
-      await new Promise(resolve => kept.session.requestAnimationFrame(resolve));
     }
   };
+
+  // A display that shows 25 frames a second of its own time, each when the page's network is done with those before it:
+  // what a session shows does not follow from how quick the machine is.
+  function patient(session) {
+    const display = session.requestAnimationFrame.bind(session);
+    let [seen, now] = [null, performance.now()];
+    session.requestAnimationFrame = callback => display(function draw(time, frame) {
+      if (awaited > 0) return display(draw);
+      if (time !== seen) [seen, now] = [time, now + 40];
+      callback(now, frame);
+    });
+    return session;
+  }
 
   kept.pull = () => {
     device.controllers.right.updateButtonValue('trigger', 1);

@@ -141,7 +141,7 @@ def check_wearer(recording: dict[str, Any], site: Made) -> None:
             made = np.array(sample["pose"]["positions"]).reshape(-1, 3)
             apart.append(np.linalg.norm(made - pose.positions, axis=1).max())
         assert list(pose.held) == sample["held"]
-    assert len(apart) > 20
+    assert len(apart) > 80
     assert max(apart) <= TOLERANCE, max(apart)
 
 
