@@ -309,9 +309,12 @@ def own_code(experiment: Experiment) -> dict[str, Any]:
 
 
 def partial_words(experiment: Experiment, data: Prepared) -> str | None:
-    """Return in words which part of its list the data is; None where it is all of it."""
-    coverage = data.manifest.coverage
-    return None if coverage.whole else f"{experiment.config['data']['name']}, {coverage}"
+    """Return in words which part of its list and its training clips the data is; None where it is all."""
+    config, coverage = experiment.config["data"], data.manifest.coverage
+    fraction = config["split"].get("train_fraction", 1)
+    parts = [] if coverage.whole else [str(coverage)]
+    parts += [f"{100 * fraction:g} % of its training groups"] if fraction < 1 else []
+    return ", ".join([config["name"], *parts]) if parts else None
 
 
 def machine(experiment: Experiment) -> dict[str, Any]:

@@ -262,3 +262,24 @@ def test_a_single_group_of_test_clips_is_told_to_decide_nothing():
     assert "in groups: 1, which decides nothing; data.split.test" in run_stages.of_tests(
         [*train, *clips("a", "a")]
     )
+
+
+@pytest.mark.parametrize(
+    ("whole", "fraction", "words"),
+    [
+        (True, {}, None),
+        (True, {"train_fraction": 1.0}, None),
+        (True, {"train_fraction": 0.125}, "s1, 12.5 % of its training groups"),
+        (False, {}, "s1, 7 of 8"),
+        (False, {"train_fraction": 0.5}, "s1, 7 of 8, 50 % of its training groups"),
+    ],
+)
+def test_a_part_of_the_data_is_told(whole, fraction, words):
+    """A protocol with a part of its training clips is not the protocol, and says so."""
+
+    class Coverage(SimpleNamespace):
+        __str__ = lambda self: "7 of 8"  # noqa: E731
+
+    data = SimpleNamespace(manifest=SimpleNamespace(coverage=Coverage(whole=whole)))
+    experiment = SimpleNamespace(config={"data": {"name": "s1", "split": fraction}})
+    assert run_stages.partial_words(experiment, data) == words

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import logging
-import warnings
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
+from memmlp.deploy.export import silenced
 from memmlp.motion.body import N_JOINTS, SPARSE_DIM
 
 
@@ -44,8 +43,6 @@ def export_plainly(network: TorchAvatarPoser, path: Path) -> None:
     """
     for parameter in network.parameters():
         nn.init.normal_(parameter, std=0.03)
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with silenced():
         window = torch.zeros(1, network.frames, SPARSE_DIM)
         torch.onnx.export(network.eval(), (window,), path, dynamo=True, verbose=False, external_data=False)

@@ -162,7 +162,7 @@ def calibration_clips() -> list[Any]:
 
 
 def timed(paths: dict[Timed, Path], rounds: int, steps: int) -> list[dict[str, Any]]:
-    """Time all files in turn, their steps and then the whole poses of those that make any; see `row`."""
+    """Time all files in turn, their steps and then the whole poses of those that make any; see `summary`."""
     from memmlp.deploy.latency import interleaved
     from memmlp.live.latency import interleaved_poses
 
@@ -202,7 +202,7 @@ def summary(prefix: str, seconds: np.ndarray, base: np.ndarray) -> dict[str, flo
 
 
 def show(rows: list[dict[str, Any]], rounds: int) -> None:
-    """Print the rows as a table, a line each however narrow the terminal is."""
+    """Print the rows as a table of 80 columns, a line each."""
     from rich.console import Console
     from rich.table import Table
 

@@ -297,7 +297,9 @@ def _carving(split: SeededSplit | ListSplit | SubsetSplit) -> dict[str, Any]:
 
 def _check_fractions(train_fraction: float, **fractions: float) -> None:
     if not 0 < train_fraction <= 1:
-        raise InputError(f"data.train_fraction: {train_fraction} is none; allowed: 0 < train_fraction <= 1")
+        raise InputError(
+            f"data.split.train_fraction: {train_fraction} is none; allowed is above 0 and at most 1"
+        )
     for key, value in fractions.items():
         if not 0 <= value < 1:
             raise InputError(f"data.{key}: {value} is no fraction; allowed: 0 <= {key} < 1")
