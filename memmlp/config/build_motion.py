@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
+from memmlp.common.errors import InputError
 from memmlp.config.instantiate import built, located
 from memmlp.motion.preparing.cache import ClipFolder
 from memmlp.motion.preparing.folders import Folders, Root
@@ -64,11 +65,11 @@ class _Clips(NamedTuple):
 
 
 def _clips(data: DictConfig) -> _Clips:
-    """Return the folder or folders of the clips, and the split: each source is split alike, by itself."""
+    """Return the folder or folders of the clips, and the split: each source is split by itself."""
     split = built(data.split)
     if sources := data.get("sources"):
         folders = Folders({name: Path(source.root) for name, source in sources.items()})
-        own = {name: _own_split(split, source) for name, source in sources.items()}
+        own = {name: _own_split(split, name, source) for name, source in sources.items()}
         return _Clips(folders, MixedSplit(own))
     roots = list(data.root) if OmegaConf.is_list(data.root) else [data.root]
     if len(roots) == 1:
@@ -77,7 +78,11 @@ def _clips(data: DictConfig) -> _Clips:
     return _Clips(folders, MixedSplit(dict.fromkeys(folders.sources, split)))
 
 
-def _own_split(split: SeededSplit, source: DictConfig) -> SeededSplit:
-    """Return the split of one source, with what ties its own clips."""
+def _own_split(split: SeededSplit, name: str, source: DictConfig) -> SeededSplit:
+    """Return the split of one source, with what ties its own clips and the fractions that it has of its own."""
+    own = {part: source.get(part) for part in ("test", "val") if source.get(part) is not None}
     groups = [*split.groups, *(source.get("groups") or ())]
-    return replace(split, groups=groups, groups_file=source.get("groups_file"))
+    try:
+        return replace(split, groups=groups, groups_file=source.get("groups_file"), **own)
+    except InputError as error:
+        raise InputError(f"data.sources.{name}: {error}") from None

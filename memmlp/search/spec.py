@@ -11,7 +11,7 @@ space:                              # a tree of config keys; its leaves are rang
 objectives: [MPJPE]                 # on validation, to be lowered; [MPJPE, Jitter] gives a Pareto front
 n_trials: 30                        # in all, however often the search is started
 seeds: 1                            # runs of each trial, whose value is their mean; the first is pruned on
-sampler: tpe                        # or random
+sampler: tpe                        # or random; or grid: each combination of choices once
 startup: 10                         # random trials (after the first) before TPE learns from them
 seed: 0                             # of the sampler
 pruner: median                      # stops a trial that is worse than the median of the others; or none
@@ -21,6 +21,7 @@ storage: null                       # null: a journal in the search's folder; or
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,7 +31,7 @@ from typing import Any
 from memmlp.common.errors import InputError
 from memmlp.evaluation.units import HIGHER, UNITS
 
-SAMPLERS = ("tpe", "random")
+SAMPLERS = ("tpe", "random", "grid")
 PRUNERS = ("median", "none")
 BRANCHES = ("rotation", "position")
 KEYS = (
@@ -112,9 +113,17 @@ class Search:
     prune_after: int
     storage: str | None
 
-    def first(self) -> dict[str, Value]:
-        """Return the values that the first trial is given, by key; the sampler chooses the others."""
-        return {one.key: one.first for one in self.space if one.first is not None}
+    def given(self) -> list[dict[str, Value]]:
+        """Return the values by key that the first trials are given; the sampler chooses the others.
+
+        They are those of `first`, or of a grid all combinations, in order.
+        """
+        if self.sampler == "grid":
+            keys = [one.key for one in self.space]
+            every = itertools.product(*(one.choices for one in self.space))
+            return [dict(zip(keys, values, strict=True)) for values in every]
+        first = {one.key: one.first for one in self.space if one.first is not None}
+        return [first] if first else []
 
     def overrides(self, values: Mapping[str, Value]) -> tuple[str, ...]:
         """Return a trial's values as overrides of `memmlp train`."""
@@ -146,6 +155,8 @@ def parse_search(content: Mapping[str, Any]) -> Search:
         raise InputError(f"search.pruner={content['pruner']}: allowed with two objectives is none")
     if content["seeds"] != 1 and any(one.key == "seed" for one in space):
         raise InputError(f"search.seeds={content['seeds']}: allowed is 1 where the space has the seed")
+    if content["sampler"] == "grid":
+        _check_grid(space, content["n_trials"])
     name = str(content["name"])
     if not re.fullmatch(r"[\w-]{1,64}", name):
         raise InputError(f"search.name={name}: allowed are up to 64 letters, digits, - and _")
@@ -168,6 +179,16 @@ def parse_search(content: Mapping[str, Any]) -> Search:
         prune_after=_whole(content, "prune_after", 1),
         storage=storage,
     )
+
+
+def _check_grid(space: Sequence[Range], n_trials: Any) -> None:
+    """Raise InputError unless every key has choices, none a first value, and there are as many combinations."""
+    for one in space:
+        if not one.choices or one.first is not None:
+            raise InputError(f"search.space.{one.key}: with search.sampler=grid allowed are choices alone")
+    combinations = math.prod(len(one.choices) for one in space)
+    if n_trials != combinations:
+        raise InputError(f"search.n_trials={n_trials}: allowed with search.sampler=grid is {combinations}, all")
 
 
 def _ranges(node: Any, prefix: str) -> Iterator[Range]:

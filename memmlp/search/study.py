@@ -63,8 +63,8 @@ class Study:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", ExperimentalWarning)
                 study.set_metric_names([objective.text for objective in search.objectives])
-        if not study.get_trials(deepcopy=False) and search.first():
-            study.enqueue_trial(search.first())
+        for values in search.given():
+            study.enqueue_trial(values, skip_if_exists=True)
         return cls(search, study)
 
     @classmethod
@@ -229,7 +229,7 @@ def sampler(search: Search, number: int) -> optuna.samplers.BaseSampler:
     So a search that is resumed does not draw the random numbers of its earlier trials again.
     """
     seed = int(np.random.SeedSequence([search.seed, number]).generate_state(1)[0])
-    if search.sampler == "random":
+    if search.sampler != "tpe":  # a grid's trials have their values already
         return optuna.samplers.RandomSampler(seed=seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ExperimentalWarning)

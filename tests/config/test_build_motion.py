@@ -56,6 +56,15 @@ def test_a_list_of_folders_names_sources_after_them():
         build_motion(composed(["data=mocap", "data.root=[a,x/a]"]))
 
 
+def test_named_sources_have_fractions_of_their_own():
+    split = build_motion(mix(with_source(test=0.35), "data.split.val=0.05")).source.split
+    assert isinstance(split, MixedSplit)
+    held_out = {name: (own.test, own.val) for name, own in split.splits.items()}
+    assert held_out == {"cmu": (0.35, 0.05), "bandai": (0.1, 0.05)}
+    with pytest.raises(InputError, match=r"data\.sources\.cmu: .* add up to 1 or more"):
+        build_motion(mix(with_source(val=0.95)))
+
+
 def test_named_sources_have_groups_of_their_own():
     split = build_motion(mix(None, "data.split.val=0.2")).source.split
     assert split.splits["cmu"].groups[0] == "salsa/(?:01|16)$"
@@ -81,6 +90,7 @@ def test_named_sources_have_groups_of_their_own():
         ({"sources": {**MIX["sources"], "other": {"root": "a"}}}, [], "a weight for each source or for none"),
         (with_source(root="nowhere"), [], "data.sources.cmu.root=nowhere"),
         (with_source(weight=0), [], "data.sources.cmu.weight=0"),
+        (with_source(test=2), [], "data.sources.cmu.test=2"),
         (with_source(groups_file="none.csv"), [], "data.sources.cmu.groups_file=none.csv"),
         ({}, ["data.split.groups_file=conf/data/my_mix.yaml"], "data.sources.NAME.groups_file"),
         ({}, ["data.sources.cmu.weight=-1"], "data.sources.cmu.weight=-1"),

@@ -31,6 +31,7 @@ def needed(tmp_path: Path) -> dict[str, list[str]]:
     root, lists = f"data.root={tmp_path}", f"data.split.folder={tmp_path}"
     return {
         "data=mocap": [root],
+        "data=cmu_bandai": [f"data.sources.{source}.root={tmp_path}" for source in ("cmu", "bandai")],
         "data=amass_s1": [root, lists],
         "data=amass_s2": [root],
         "data=amass_s3": [root],

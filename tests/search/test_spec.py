@@ -41,7 +41,7 @@ def test_a_tree_of_keys_becomes_ranges():
         Range("loss.hand", 0.1, 1.0),
         Range("hand", choices=("off", "fk"), first="fk"),
     )
-    assert found.first() == {"hand": "fk"}
+    assert found.given() == [{"hand": "fk"}]
     assert found.space[1].corners() == ("off", "fk")
 
 
@@ -105,7 +105,16 @@ def test_an_objective_that_is_not_validated_is_named():
         ),
         ({"startup": 1.5}, "search.startup=1.5"),
         ({"seed": -1}, "search.seed=-1"),
-        ({"sampler": "grid"}, "search.sampler=grid: allowed is tpe or random"),
+        ({"sampler": "gp"}, "search.sampler=gp: allowed is tpe or random or grid"),
+        ({"sampler": "grid"}, "search.space.loss.rotation: with search.sampler=grid allowed are choices alone"),
+        (
+            {"sampler": "grid", "space": space(choices=[1, 2], first=1)},
+            "optim.lr: with search.sampler=grid allowed are choices alone",
+        ),
+        (
+            {"sampler": "grid", "space": space(choices=[1, 2, 3]), "n_trials": 2},
+            "search.n_trials=2: allowed with search.sampler=grid is 3, all",
+        ),
         ({"pruner": "hyperband"}, "search.pruner=hyperband: allowed is median or none"),
         ({"prune_after": 0}, "search.prune_after=0"),
         ({"name": "a/b"}, "search.name=a/b"),

@@ -42,6 +42,18 @@ def test_the_seed_changes_what_is_proposed_and_the_sampler_too(tmp_path: Path):
     assert proposed[0] != proposed[2]
 
 
+def test_a_grid_has_each_combination_once_in_order_however_often_it_is_stopped(tmp_path: Path):
+    space = {"loss": {"rotation": {"choices": [1.0, 2.0]}, "hand": {"choices": [0.1, 0.2, 0.3]}}}
+    grid = {"sampler": "grid", "space": space, "n_trials": 6}
+    for _ in range(3):
+        one = director(open_study(tmp_path, **grid), tmp_path)
+        finish(one.look(1))
+    study = open_study(tmp_path, **grid)
+    to_the_end(study, tmp_path, capacity=1)
+    every = [{"loss.rotation": one, "loss.hand": other} for one in (1.0, 2.0) for other in (0.1, 0.2, 0.3)]
+    assert [trial.params for trial in study.trials] == every
+
+
 def test_a_torn_line_and_a_dead_owners_lock_are_mended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """At once: Optuna alone sleeps until the lock is half a minute old."""
 

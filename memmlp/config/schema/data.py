@@ -97,6 +97,8 @@ class SourceConfig:
     groups: list[str] = field(default_factory=list, metadata={"rule": EachOf(empty=True)})
     groups_file: Optional[str] = optional(Existing("file"))
     weight: Optional[float] = optional(Within(0, strict=True))
+    test: Optional[float] = optional(Within(0, 1))
+    val: Optional[float] = optional(Within(0, 1))
 
 
 @dataclass
