@@ -43,7 +43,7 @@ RECIPES: dict[str, int] = {
     "predictor.rotation_only": 1,
     "predictor.rotation_only_memory": 1,
     "refiner.sage": 1,
-    "upstream.sage": 2,
+    "upstream.sage": 3,
     "vqvae": 1,
     "codebook.ema": 1,
     "codebook.gradient": 1,

@@ -84,7 +84,7 @@ class Optim:
     def build(self, groups: list[dict]) -> torch.optim.Optimizer:
         """Make the optimiser over parameter groups; a group's own `lr` and `weight_decay` take precedence."""
         kind = torch.optim.AdamW if self.decoupled else torch.optim.Adam
-        return kind(groups, lr=self.lr, weight_decay=self.weight_decay, betas=self.betas)
+        return kind(groups, lr=self.lr, weight_decay=self.weight_decay, betas=self.betas, fused=True)
 
     def average(self, module: nn.Module, optimiser: torch.optim.Optimizer) -> Average:
         """Make what says which weights of the module count."""
@@ -124,7 +124,9 @@ class Muon(Optim):
             )
         if rest:
             lr = self.rest_lr or self.lr
-            parts.append(torch.optim.AdamW(rest, lr, weight_decay=self.weight_decay, betas=self.betas))
+            parts.append(
+                torch.optim.AdamW(rest, lr, weight_decay=self.weight_decay, betas=self.betas, fused=True)
+            )
         return ComposedOptimiser(parts)
 
 
