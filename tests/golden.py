@@ -14,7 +14,7 @@ from pathlib import Path
 
 import tiny
 import torch
-from golden_deployed import deployed, fp16, int8
+from golden_deployed import deployed, lowered
 from golden_numbers import Numbers, changed, summary, tolerance
 from golden_trained import frames, optimised, parts, refiner, training, vqvae
 from torch import Tensor
@@ -212,9 +212,9 @@ CASES: dict[str, Callable[[], Numbers]] = {
         for name in tiny.BASELINES
     },
     "model.recurrent_poser": lambda: {
-        f"{cell} {name}": value
-        for cell in CELLS
-        for name, value in network(tiny.recurrent_poser(cell=cell)).items()
+        f"{cell}{' ' + output if output == 'global' else ''} {name}": value
+        for cell, output in [*((cell, "local") for cell in CELLS), ("gru", "global")]
+        for name, value in network(tiny.recurrent_poser(cell=cell, output=output)).items()
     },
     **{
         f"memory.{name}": partial(lambda kind: network(tiny.model(kind)), kind)
@@ -277,8 +277,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "ik.lbfgs": ik,
     "graph.streaming": partial(deployed, "graph.streaming"),
     "graph.naive": partial(deployed, "graph.naive"),
-    "int8": int8,
-    "fp16": fp16,
+    **{precision: partial(lowered, precision) for precision in ("int8", "int8_blocks", "fp16")},
 }  # fmt: skip
 UNSEEN = ("export", "latency")
 """Components without numbers of their own: a file's form, and times."""

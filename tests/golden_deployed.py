@@ -11,10 +11,9 @@ import tiny
 from golden_numbers import Numbers, summary
 
 from memmlp.deploy import latency
+from memmlp.deploy.deployment import lower
 from memmlp.deploy.export import export
-from memmlp.deploy.half import halve
 from memmlp.deploy.parity import streamed
-from memmlp.deploy.quantization import quantise
 from memmlp.deploy.session import OnnxStream
 from memmlp.networks.streaming import streaming
 
@@ -39,20 +38,10 @@ def exported(graph: str) -> bytes:
         return path.read_bytes()
 
 
-def int8() -> Numbers:
-    """An exported stream in int8."""
-    stream = streaming(tiny.model())
+def lowered(precision: str) -> Numbers:
+    """An exported stream in less precision."""
     with tempfile.TemporaryDirectory() as folder:
-        exact, quantised = (Path(folder) / f"{name}.onnx" for name in ("exact", "quantised"))
+        exact, other = (Path(folder) / f"{name}.onnx" for name in ("exact", "other"))
         exact.write_bytes(exported("graph.streaming"))
-        quantise(exact, quantised, stream.ends, [tiny.clip(40)])
-        return summary("motion", streamed(OnnxStream(quantised), tiny.clip(25)))
-
-
-def fp16() -> Numbers:
-    """An exported stream in fp16."""
-    with tempfile.TemporaryDirectory() as folder:
-        exact, half = (Path(folder) / f"{name}.onnx" for name in ("exact", "half"))
-        exact.write_bytes(exported("graph.streaming"))
-        halve(exact, half, streaming(tiny.model()).ends)
-        return summary("motion", streamed(OnnxStream(half), tiny.clip(25)))
+        lower(precision, exact, other, streaming(tiny.model()), [tiny.clip(40)])
+        return summary("motion", streamed(OnnxStream(other), tiny.clip(25)))

@@ -34,4 +34,4 @@ def changed(now: Mapping[str, float], before: Mapping[str, float], tolerance: fl
 
 def tolerance(case: str) -> float:
     """How far processors' numbers may differ: where few bits are left, they round by one more or less."""
-    return 2e-2 if case in ("int8", "fp16", "optim.muon") else 2e-4
+    return 2e-2 if case in ("int8", "int8_blocks", "fp16", "optim.muon") else 2e-4

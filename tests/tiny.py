@@ -165,7 +165,7 @@ def baseline(name: str, coordinates: World | None = None, seed: int = 0, **chang
 def recurrent_poser(coordinates: World | None = None, seed: int = 0, **changes) -> RecurrentPoser:
     """Make a tiny RecurrentPoser with random weights, in evaluation mode."""
     torch.manual_seed(seed)
-    settings = {"frames": 7, "width": 16, "depth": 2, "cell": "gru", "expansion": 2}
+    settings = {"frames": 7, "width": 16, "depth": 2, "cell": "gru", "expansion": 2, "output": "local"}
     return RecurrentPoser(normalizer(coordinates), **settings | changes).eval()
 
 

@@ -24,7 +24,7 @@ class Form(NamedTuple):
 
     Attributes:
         graph: "auto", "streaming" or "naive".
-        precision: "fp32", "fp16" or "int8".
+        precision: "fp32", "fp16", "int8" or "int8_blocks".
         opset: the file's ONNX opset.
         full: the frame of reference and the format of the joints' rotations, for a file that covers the whole
             way from trackers to joints; None for the network alone.
@@ -51,15 +51,15 @@ class Form(NamedTuple):
     "--precision",
     default="fp32",
     show_default=True,
-    type=click.Choice(["fp32", "fp16", "int8"]),
-    help="Precision of the inner layers' weights; fp16 and int8 are measured on test clips, and int8 is "
+    type=click.Choice(["fp32", "fp16", "int8", "int8_blocks"]),
+    help="Precision of the inner layers' weights; all but fp32 are measured on test clips, and int8 is "
     "calibrated on training clips.",
 )
 @click.option(
     "--max-growth",
     default=1.0,
     show_default=True,
-    help="How much MPJPE may grow in fp16 or int8, percent; no file is written where it grows more.",
+    help="How much MPJPE may grow in less precision, percent; no file is written where it grows more.",
 )
 @click.option(
     "--opset",
@@ -167,14 +167,18 @@ def write(run: str, out: Path, outputs: Path, form: Form, clips: int, max_growth
     if form.precision == "fp32":
         tell(f"export: write {out}, and compare it with torch on {len(test[: clips or None])} test clips")
         write_exact(model, network, out, found.id, test[: clips or None], form)
-    elif isinstance(network, StreamingGraph) and not (form.precision == "int8" and form.full):
+    elif isinstance(network, StreamingGraph) and not (form.precision.startswith("int8") and form.full):
         tell(
             f"export: write {out} in {form.precision}, and measure what that costs on {len(test)} test clips"
         )
         train = data.open("train").clips() if form.precision == "int8" else []
         write_less_precise(network, out, found.id, train, test, form, max_growth)
     else:
-        allowed = "--scope network and a streaming graph" if form.precision == "int8" else "a streaming graph"
+        allowed = (
+            "--scope network and a streaming graph"
+            if form.precision.startswith("int8")
+            else "a streaming graph"
+        )
         raise InputError(f"--precision {form.precision}: allowed with {allowed}")
 
 
@@ -241,7 +245,7 @@ def write_less_precise(
     form: Form,
     max_growth: float,
 ) -> None:
-    """Write the fp16 or int8 ONNX file, provided that it is accurate enough, and say what it costs.
+    """Write the ONNX file of less precision, provided that it is accurate enough, and say what it costs.
 
     What it costs is measured of the network, for a file of the whole way too: its layers are the same.
 
@@ -266,7 +270,7 @@ def write_less_precise(
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         exact, other = Path(folder) / "fp32.onnx", Path(folder) / "other.onnx"
         write_graph(network, exact, run_id, form._replace(full=None))
-        lower(precision, exact, other, network.ends, train)
+        lower(precision, exact, other, network, train)
         cost = compared(exact, other, precision, network.normalizer, test)
         said = ", ".join(
             f"{name} {cost['fp32'][name]:.2f} -> {cost[precision][name]:.2f}" for name in ("MPJPE", "Jitter")
@@ -275,7 +279,7 @@ def write_less_precise(
             raise click.ClickException(f"{said}: more than --max-growth {100 * max_growth:g} %, not written")
         if form.full:
             write_graph(network, exact, run_id, form)
-            lower(precision, exact, other, network.ends, train)
+            lower(precision, exact, other, network, train)
         other.replace(out)
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, on test clips {said}")
 

@@ -79,7 +79,7 @@ def _clips(data: DictConfig) -> _Clips:
 
 
 def _own_split(split: SeededSplit, name: str, source: DictConfig) -> SeededSplit:
-    """Return the split of one source, with what ties its own clips and the fractions that it has of its own."""
+    """Return the split of one source, with what ties its clips and the fractions that it has of its own."""
     own = {part: source.get(part) for part in ("test", "val") if source.get(part) is not None}
     groups = [*split.groups, *(source.get("groups") or ())]
     try:

@@ -10,6 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from memmlp.deploy import latency
+from memmlp.deploy.block_quantization import quantise_blocks
 from memmlp.deploy.export import export
 from memmlp.deploy.half import halve
 from memmlp.deploy.opsets import NATIVE
@@ -37,7 +38,7 @@ class Deployment:
     Attributes:
         latency_steps: number of timed steps, after a warm-up.
         graph: "auto", "streaming" or "naive" (see GRAPHS).
-        precision: "fp32", or "int8" or "fp16" for such a file beside the float32 one.
+        precision: "fp32", or "int8", "int8_blocks" or "fp16" for such a file beside the float32 one.
         opset: the files' ONNX opset, one of memmlp.deploy.opsets.OPSETS.
     """
 
@@ -97,23 +98,26 @@ class Deployment:
     ) -> dict[str, Any]:
         """Write the file of less precision beside the other; return its accuracy, times and size."""
         path = deployed.file(self.precision)
-        lower(self.precision, deployed.onnx, path, network.ends, train)
+        lower(self.precision, deployed.onnx, path, network, train)
         cost = compared(deployed.onnx, path, self.precision, network.normalizer, test)
         measured = latency.measure_step(path, self.latency_steps)
         return {**cost, **measured, "onnx_bytes": path.stat().st_size}
 
 
-def lower(precision: str, source: Path, path: Path, ends: Sequence[str], train: Sequence[Tensor]) -> None:
+def lower(precision: str, source: Path, path: Path, network: StreamingGraph, train: Sequence[Tensor]) -> None:
     """Write a file of less precision.
 
     Args:
-        precision: "int8" or "fp16".
+        precision: "int8", "int8_blocks" or "fp16".
         source: the float32 ONNX file of a streaming graph.
         path: the file to write.
-        ends: names of the graph's modules that stay in float32.
+        network: the graph, which says what of it stays in float32.
         train: training clips (N, 252), to calibrate int8.
     """
+    with_delicate = (*network.ends, *network.delicate)
     if precision == "int8":
-        quantise(source, path, ends, train)
+        quantise(source, path, with_delicate, train)
+    elif precision == "int8_blocks":
+        quantise_blocks(source, path, network.ends)
     else:
-        halve(source, path, ends)
+        halve(source, path, with_delicate)

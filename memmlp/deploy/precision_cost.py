@@ -42,7 +42,7 @@ def compared(
     Args:
         exact: the float32 file.
         other: the same network in less precision.
-        precision: its name, "int8" or "fp16".
+        precision: its name, such as "int8".
         normalizer: the network's.
         clips: frames (N, 252) of each clip.
 

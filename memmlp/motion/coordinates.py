@@ -42,6 +42,10 @@ class World:
         """Convert local motion (..., 198) to the world."""
         return torch.cat([motion[..., ROTATION], motion[..., POSITION] + _tile(origin, N_JOINTS)], -1)
 
+    def rotations_out(self, rotations: Tensor, origin: Tensor) -> Tensor:
+        """Convert joints' global rotations (..., 6 n), 6D, from local coordinates to the world."""
+        return rotations
+
 
 class HeadRelative(World):
     """Coordinates whose horizontal origin is the head of the same frame; heights stay (reading 20)."""
@@ -62,11 +66,11 @@ class Heading(HeadRelative):
 
     def origin(self, sparse: Tensor) -> Tensor:
         """Return the head's position on the floor, metres, and its heading's cosine and sine (..., 5)."""
-        first, second = sparse[..., 0:3], sparse[..., 3:6]  # columns of the head's rotation, body frame
-        up = torch.linalg.cross(first, second, dim=-1)  # the rest pose has Y up and faces Z
-        # A = R Rx(-90 deg) is the rotation from upright; its twist is atan2(a10 - a01, a00 + a11).
-        cosine, sine = first[..., 0] - up[..., 1], first[..., 1] + up[..., 0]
-        heading = F.normalize(torch.stack([cosine, sine], -1), dim=-1)
+        # The rest pose has Y up and faces Z. Of the head's rotation R, whose first columns are a and b,
+        # A = R Rx(-90 deg) is the rotation from upright. Its twist is atan2(A10 - A01, A00 + A11): both are
+        # the level part of a, plus that of a x b turned by a right angle.
+        a, a_up, b, b_up = sparse[..., :6].split([2, 1, 2, 1], -1)
+        heading = F.normalize(a + (a * b_up - a_up * b), dim=-1)
         return torch.cat([super().origin(sparse), heading], -1)
 
     def sparse_in(self, sparse: Tensor, origin: Tensor) -> Tensor:
@@ -87,6 +91,10 @@ class Heading(HeadRelative):
     def motion_out(self, motion: Tensor, origin: Tensor) -> Tensor:
         """Convert local motion (..., 198) to the world."""
         return super().motion_out(self._turned(motion, origin, 1), origin[..., :3])
+
+    def rotations_out(self, rotations: Tensor, origin: Tensor) -> Tensor:
+        """Convert joints' global rotations (..., 6 n), 6D, from local coordinates to the world."""
+        return _turn(rotations, origin, 1)
 
     def _turned(self, motion: Tensor, origin: Tensor, way: int) -> Tensor:
         """Turn the root's rotation and the positions; the other rotations are local anyway."""

@@ -83,6 +83,10 @@ class Normalizer(nn.Module):
         """Convert motion (..., 198) in network space with the given origin to the world (..., 198)."""
         return self.coordinates.motion_out(motion * self.std[SPARSE_DIM:] + self.mean[SPARSE_DIM:], origin)
 
+    def rotations_out(self, rotations: Tensor, origin: Tensor) -> Tensor:
+        """Convert joints' global rotations (..., 6 n), 6D, from the coordinates of an origin to the world."""
+        return self.coordinates.rotations_out(rotations, origin)
+
     def pose(self, motion: Tensor, sparse: Tensor) -> Tensor:
         """Return joint positions (..., 22, 3), metres, world, from the rotations of world motion (..., 198).
 

@@ -8,7 +8,8 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from memmlp.motion.body import ROTATION, SPARSE_DIM
+from memmlp.motion.body import HEAD, N_JOINTS, PARENTS, ROTATION, SPARSE_DIM, SPARSE_POSITION
+from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.cells import CELLS, Cell
 from memmlp.networks.layers import in_float32
@@ -50,6 +51,84 @@ class RecurrentBlock(nn.Module):
         return h + self.mlp(self.norm(h))
 
 
+class RotationHead(nn.Linear):
+    """From the hidden state to the motion; the interface of what fills the slot `output`.
+
+    Args:
+        normalizer: converts between the world and network space.
+        width: d, the width of the hidden state.
+    """
+
+    def __init__(self, normalizer: Normalizer, width: int):
+        super().__init__(width, ROTATION.stop)
+
+    def posed(self, h: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+        """Map the hidden state (..., d) to world motion (..., 198) at inputs (..., 54)."""
+        raise NotImplementedError
+
+
+class LocalRotations(RotationHead):
+    """A head that makes each joint's rotation in its parent's frame."""
+
+    def posed(self, h: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+        """Map the hidden state (..., d) to world motion (..., 198) at inputs (..., 54)."""
+        return normalizer.posed(self(h), sparse)
+
+
+class GlobalRotations(RotationHead):
+    """A head that makes each joint's rotation in the frame of the network's space.
+
+    No joint inherits its ancestors' errors, and the positions are linear in the rotations.
+    """
+
+    levers: Tensor
+
+    def __init__(self, normalizer: Normalizer, width: int):
+        super().__init__(normalizer, width)
+        self.register_buffer("levers", levers(normalizer.rest), persistent=False)
+        with torch.no_grad():  # begin at the mean pose: from a turned one legs don't find home
+            self.weight *= 0.3
+            self.bias.copy_(mean_pose(normalizer))
+
+    def posed(self, h: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+        """Map the hidden state (..., d) to world motion (..., 198) at inputs (..., 54)."""
+        made = self(h)
+        with in_float32(h.device):
+            sixd = normalizer.rotations_out(made.to(sparse.dtype), normalizer.origin(sparse))
+            rotations = sixd_to_matrix(sixd.unflatten(-1, (N_JOINTS, 6)))
+            local = rotations[..., list(PARENTS[1:]), :, :].transpose(-1, -2) @ rotations[..., 1:, :, :]
+            head = sparse[..., SPARSE_POSITION][..., :3]
+            positions = rotations.detach().flatten(-3) @ self.levers + torch.cat([head] * N_JOINTS, -1)
+            return torch.cat([sixd[..., :6], matrix_to_sixd(local).flatten(-2), positions], -1)
+
+
+def mean_pose(normalizer: Normalizer) -> Tensor:
+    """Return the global rotations (132,), 6D, of the mean pose in the network's space."""
+    mean = normalizer.mean[SPARSE_DIM:][ROTATION]
+    local = sixd_to_matrix(mean.unflatten(-1, (N_JOINTS, 6)))
+    return matrix_to_sixd(forward_kinematics(local, mean[:3], normalizer.rest)[0]).flatten()
+
+
+def levers(rest: Tensor) -> Tensor:
+    """Return the map (198, 66) from global rotations to joints relative to the head.
+
+    Args:
+        rest: rest positions (22, 3), metres.
+    """
+    offsets = rest - rest[list(PARENTS)]
+    made = rest.new_zeros(N_JOINTS, 3, 3, N_JOINTS, 3)  # from a rotation's row and column to a joint's axis
+    for joint in range(1, N_JOINTS):
+        parent = PARENTS[joint]
+        made[..., joint, :] = made[..., parent, :]
+        made[parent, :, :, joint, :] += torch.einsum("rk,c->rck", torch.eye(3).to(rest), offsets[joint])
+    made = made - made[..., HEAD : HEAD + 1, :]
+    return made.reshape(9 * N_JOINTS, 3 * N_JOINTS)
+
+
+OUTPUTS: dict[str, type[RotationHead]] = {"local": LocalRotations, "global": GlobalRotations}
+"""The heads by the names that the config knows."""
+
+
 class RecurrentPoser(StreamModel):
     """A linear stem, residual blocks of a recurrent cell and an MLP, and a linear head for the rotations.
 
@@ -64,10 +143,19 @@ class RecurrentPoser(StreamModel):
         depth: number of blocks.
         cell: the recurrent cell, by its name in CELLS.
         expansion: the hidden width of the blocks' MLPs, in d.
+        output: the head, by its name in OUTPUTS.
     """
 
     def __init__(
-        self, normalizer: Normalizer, *, frames: int, width: int, depth: int, cell: str, expansion: int
+        self,
+        normalizer: Normalizer,
+        *,
+        frames: int,
+        width: int,
+        depth: int,
+        cell: str,
+        expansion: int,
+        output: str,
     ):
         super().__init__(normalizer, frames)
         self.stem = nn.Linear(SPARSE_DIM, width)
@@ -75,7 +163,7 @@ class RecurrentPoser(StreamModel):
             {f"block{i}": RecurrentBlock(CELLS[cell](width), width, expansion) for i in range(1, depth + 1)}
         )
         self.norm = nn.LayerNorm(width)
-        self.head = nn.Linear(width, ROTATION.stop)
+        self.head = OUTPUTS[output](normalizer, width)
 
     def initial_state(self, batch: int = 1) -> State:
         """Return the state of a fresh start: zeros (B, size) of each block's cell, by the block's name."""
@@ -92,7 +180,7 @@ class RecurrentPoser(StreamModel):
 
     def posed(self, h: Tensor, sparse: Tensor) -> Tensor:
         """Map the hidden state (..., d) after the blocks to world motion (..., 198) at inputs (..., 54)."""
-        return self.normalizer.posed(self.head(self.norm(h)), sparse)
+        return self.head.posed(self.norm(h), sparse, self.normalizer)
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Take in the newest frames; see WindowModel."""

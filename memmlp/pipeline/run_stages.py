@@ -277,9 +277,8 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared, name: str) -> N
         deployment = experiment.deployments[name]
         record = deployment.deploy(model, deployed, run.id, *clips)
         record |= measure_pose(deployed.onnx, deployment.latency_steps)
-        for precision, path in (("int8", deployed.int8), ("fp16", deployed.half)):
-            if precision in record:
-                record[precision] |= measure_pose(path, deployment.latency_steps)
+        if (precision := deployment.precision) in record:
+            record[precision] |= measure_pose(deployed.file(precision), deployment.latency_steps)
         deployed.finish(
             {"run": run.manifest["id"], "settings": deployment_settings(experiment.config), **record}
         )

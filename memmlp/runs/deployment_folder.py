@@ -11,8 +11,15 @@ from memmlp.common.files import file_digest, now, read_json, write_json
 from memmlp.runs.environment import environment
 from memmlp.runs.identity import belongs, deployment_name
 
-ONNX_FILES = {"fp32": "step.onnx", "int8": "step.int8.onnx", "fp16": "step.fp16.onnx"}
+ONNX_FILES = {
+    "fp32": "step.onnx",
+    "int8": "step.int8.onnx",
+    "int8_blocks": "step.int8_blocks.onnx",
+    "fp16": "step.fp16.onnx",
+}
 """The name of the ONNX file of each precision (`export.precision`)."""
+IN_INTEGERS = ("int8", "int8_blocks")
+"""The precisions that are used live where they are accurate enough, for they are quicker than float32."""
 
 LATENCY = "latency.json"
 FILES = (LATENCY, *ONNX_FILES.values())
@@ -26,7 +33,6 @@ class DeploymentFolder:
         folder: the folder.
         onnx: the float32 ONNX file.
         int8: the int8 ONNX file, where there is one.
-        half: the fp16 ONNX file, where there is one.
         latency: the record of what was measured; it is written last.
     """
 
@@ -34,7 +40,6 @@ class DeploymentFolder:
         self.folder = folder
         self.onnx = self.file("fp32")
         self.int8 = self.file("int8")
-        self.half = self.file("fp16")
         self.latency = folder / LATENCY
 
     def file(self, precision: str) -> Path:
@@ -76,9 +81,11 @@ class DeploymentFolder:
         return dict(self.record.get("settings", {}))
 
     @property
-    def prefers_int8(self) -> bool:
-        """Whether the int8 file is accurate enough to be used instead of the float32 one."""
-        return self.int8.exists() and bool(self.record.get("int8", {}).get("default"))
+    def integers(self) -> Path | None:
+        """The ONNX file in integers, where there is one that is accurate enough for float32's place."""
+        record = self.record
+        accurate = [name for name in IN_INTEGERS if record.get(name, {}).get("default")]
+        return next((self.file(name) for name in accurate if self.file(name).exists()), None)
 
 
 def _current(record: Mapping[str, Any]) -> dict[str, Any]:

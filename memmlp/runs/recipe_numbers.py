@@ -28,7 +28,7 @@ RECIPES: dict[str, int] = {
     "model.vae_hmd": 1,
     "model.rpm": 1,
     "model.avatar_jlm": 1,
-    "model.recurrent_poser": 1,
+    "model.recurrent_poser": 2,
     "model.sage": 1,
     "model.manikin_s": 1,
     "model.manikin_l": 1,
@@ -81,6 +81,7 @@ RECIPES: dict[str, int] = {
     "graph.streaming": 1,
     "graph.naive": 1,
     "int8": 1,
+    "int8_blocks": 1,
     "fp16": 1,
     "latency": 1,
 }

@@ -122,7 +122,7 @@ class Search:
             keys = [one.key for one in self.space]
             every = itertools.product(*(one.choices for one in self.space))
             return [dict(zip(keys, values, strict=True)) for values in every]
-        first = {one.key: one.first for one in self.space if one.first is not None}
+        first: dict[str, Value] = {one.key: one.first for one in self.space if one.first is not None}
         return [first] if first else []
 
     def overrides(self, values: Mapping[str, Value]) -> tuple[str, ...]:
@@ -182,13 +182,15 @@ def parse_search(content: Mapping[str, Any]) -> Search:
 
 
 def _check_grid(space: Sequence[Range], n_trials: Any) -> None:
-    """Raise InputError unless every key has choices, none a first value, and there are as many combinations."""
+    """Raise InputError unless every key has choices alone, and there are as many trials as combinations."""
     for one in space:
         if not one.choices or one.first is not None:
             raise InputError(f"search.space.{one.key}: with search.sampler=grid allowed are choices alone")
     combinations = math.prod(len(one.choices) for one in space)
     if n_trials != combinations:
-        raise InputError(f"search.n_trials={n_trials}: allowed with search.sampler=grid is {combinations}, all")
+        raise InputError(
+            f"search.n_trials={n_trials}: allowed with search.sampler=grid is {combinations}, all"
+        )
 
 
 def _ranges(node: Any, prefix: str) -> Iterator[Range]:

@@ -115,9 +115,9 @@ class Writer:
         """Write a stream in less precision; of int8 there is no full graph."""
         path, key, whole = made / "less.onnx", f"{network.key}-{precision}", None
         if precision == "fp16":
-            lower(precision, _whole(made, "streaming"), path, stream.ends, self.calibration)
+            lower(precision, _whole(made, "streaming"), path, stream, self.calibration)
             whole = self.skeleton(f"{key}-whole", onnx.load(path))
-        lower(precision, made / "streaming.onnx", path, stream.ends, self.calibration)
+        lower(precision, made / "streaming.onnx", path, stream, self.calibration)
         step = self.skeleton(key, onnx.load(path))
         return {"graph": "streaming", "precision": precision, "step": step, "whole": whole}
 

@@ -15,17 +15,18 @@ from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.coordinates import Heading
 from memmlp.networks.cells import CELLS
+from memmlp.networks.recurrent_poser import OUTPUTS
 from memmlp.networks.streaming import streaming
 
 CLIP = tiny.clip(40)
 SPARSE = CLIP[None, :, :SPARSE_DIM]
 
 
-@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize(("cell", "output"), [*((cell, "local") for cell in CELLS), ("gru", "global")])
 @torch.no_grad()
-def test_training_evaluation_and_the_live_graph_are_one_stream(cell):
+def test_training_evaluation_and_the_live_graph_are_one_stream(cell, output):
     """The unrolled call of training, calls of any size, both modes, and the graph of one frame."""
-    model = tiny.recurrent_poser(Heading(), cell=cell).double()
+    model = tiny.recurrent_poser(Heading(), cell=cell, output=output).double()
     sparse = SPARSE.double()
     unrolled = model.learn(sparse, model.initial_state(), CLIP[None].double())[0][0]
     state, made = model.initial_state(), []
@@ -51,12 +52,24 @@ def test_the_past_counts_without_end_and_the_future_does_not():
     assert (found[:, 5:] - other[:, 5:]).abs().amax(-1).min() > 1e-9
 
 
+@pytest.mark.parametrize("output", OUTPUTS)
 @torch.no_grad()
-def test_positions_are_forward_kinematics_of_the_rotations():
-    model = tiny.recurrent_poser(Heading())
+def test_positions_are_forward_kinematics_of_the_rotations(output):
+    model = tiny.recurrent_poser(Heading(), output=output)
     motion = evaluation.stream(model, [CLIP])[0]
     expected = model.normalizer.pose(motion, CLIP[:, :SPARSE_DIM]).flatten(1)
     torch.testing.assert_close(motion[:, ROTATION.stop :], expected, atol=1e-5, rtol=0)
+
+
+@torch.no_grad()
+def test_a_global_head_begins_at_the_mean_pose():
+    """With no hidden state its rotations are those of the normalizer's mean, seen along the heading."""
+    model = tiny.recurrent_poser(Heading(), output="global")
+    model.head.weight.zero_()
+    mean = model.normalizer.posed(torch.zeros(1, ROTATION.stop), SPARSE[0, :1])
+    made = model.posed(torch.zeros(1, 16), SPARSE[0, :1])
+    found, expected = (evaluation.local_rotations(motion) for motion in (made, mean))
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
 
 
 @torch.no_grad()
@@ -69,7 +82,7 @@ def test_side_by_side_is_one_by_one():
 @pytest.mark.parametrize("cell", CELLS)
 @torch.no_grad()
 def test_cells_stay_exact_where_layers_are_rounded(cell):
-    model, calls = tiny.recurrent_poser(cell=cell), []
+    model, calls = tiny.recurrent_poser(cell=cell, output="global"), []
     block = model.blocks["block2"]
     block.cell.register_forward_hook(lambda of, given, made: calls.append((given, made)))
     with torch.autocast("cpu", torch.bfloat16):
@@ -88,6 +101,7 @@ CHANGES = [
     {"cell": "lstm"},
     {"cell": "mingru"},
     {"cell": "lru"},
+    {"output": "global"},
 ]
 
 
@@ -118,7 +132,7 @@ def test_the_file_is_the_network_and_its_cells_become_int8(tmp_path):
     stream = streaming(model)
     export(stream, exact, "0" * 16)
     assert parity(model, exact, CLIP) <= TOLERANCE
-    quantise(exact, int8, stream.ends, [CLIP])
+    quantise(exact, int8, (*stream.ends, *stream.delicate), [CLIP])
     graph = onnx.load(int8).graph
     types = {tensor.name: tensor.data_type for tensor in graph.initializer}
     given = {node.output[0]: node.input[0] for node in graph.node if node.op_type == "DequantizeLinear"}

@@ -106,7 +106,10 @@ def test_an_objective_that_is_not_validated_is_named():
         ({"startup": 1.5}, "search.startup=1.5"),
         ({"seed": -1}, "search.seed=-1"),
         ({"sampler": "gp"}, "search.sampler=gp: allowed is tpe or random or grid"),
-        ({"sampler": "grid"}, "search.space.loss.rotation: with search.sampler=grid allowed are choices alone"),
+        (
+            {"sampler": "grid"},
+            "search.space.loss.rotation: with search.sampler=grid allowed are choices alone",
+        ),
         (
             {"sampler": "grid", "space": space(choices=[1, 2], first=1)},
             "optim.lr: with search.sampler=grid allowed are choices alone",

@@ -42,7 +42,8 @@ MODELS: dict[str, tuple[str, ...]] = {
 }
 SLOW = ("bodiffusion", "avatar_jlm", "manikin_l", "sage")
 """Seconds a step, or gigabytes of files: timed where they are asked for."""
-DEPLOYED = ("naive", "streaming", "fp16", "int8")
+LOWER = ("fp16", "int8", "int8_blocks")
+DEPLOYED = ("naive", "streaming", *LOWER)
 VARIANTS = ("network", *DEPLOYED)
 
 
@@ -119,10 +120,9 @@ def exported(models: list[str], overrides: tuple[str, ...], folder: Path) -> Ite
     """Export each model in all variants, with a progress bar, and yield (model, variant) with the file."""
     from memmlp.common.progress import progress_bar
     from memmlp.config.build import untrained
+    from memmlp.deploy.deployment import lower
     from memmlp.deploy.export import export
-    from memmlp.deploy.half import halve
     from memmlp.deploy.network_alone import network_alone
-    from memmlp.deploy.quantization import quantise
     from memmlp.networks.streaming import streaming
 
     clips = calibration_clips()
@@ -133,8 +133,8 @@ def exported(models: list[str], overrides: tuple[str, ...], folder: Path) -> Ite
         export(network_alone(model), paths["network"], "random")
         export(model, paths["naive"], "random")
         export(stream, paths["streaming"], "random")
-        halve(paths["streaming"], paths["fp16"], stream.ends)
-        quantise(paths["streaming"], paths["int8"], stream.ends, clips)
+        for precision in LOWER:
+            lower(precision, paths["streaming"], paths[precision], stream, clips)
         for variant, path in paths.items():
             yield (name, variant), path
         if name == CHECK[0]:

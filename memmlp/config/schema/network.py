@@ -9,6 +9,7 @@ from omegaconf import MISSING
 
 from memmlp.config.schema.rules import (
     EachOf,
+    OneOf,
     OneOfOrPath,
     Text,
     Within,
@@ -18,6 +19,7 @@ from memmlp.config.schema.rules import (
     key,
     one_of,
     positive,
+    standing,
     target,
 )
 
@@ -135,6 +137,7 @@ class RecurrentPoserConfig(BaselineConfig):
     name: str = called("recurrent_poser")
     _target_: str = target("memmlp.networks.recurrent_poser.RecurrentPoser")
     cell: str = one_of("gru", "lstm", "mingru", "lru")
+    output: str = standing("local", OneOf(("local", "global")))
     expansion: int = at_least(1)
 
 

@@ -7,14 +7,15 @@ from torch import Tensor
 from memmlp.networks.memory import State
 from memmlp.networks.recurrent_poser import RecurrentPoser
 from memmlp.networks.streaming.baselines import FrameStream
+from memmlp.networks.streaming.live_normalizer import LiveNormalizer
 from memmlp.networks.window_model import WindowModel
 
 
 class RecurrentPoserStream(FrameStream):
     """The network as it is, its cells as plain layers for one frame.
 
-    Quantised, the cells alone are int8: a state averages what rounding adds to each frame, whereas the MLPs
-    hand it on to the motion, where it is seen as jitter.
+    Quantised with one scale for all frames, the cells alone are int8: a state averages what rounding adds to
+    each frame, whereas the MLPs hand it on to the motion, where it is seen as jitter.
     """
 
     model: RecurrentPoser
@@ -23,7 +24,9 @@ class RecurrentPoserStream(FrameStream):
         """Make the graph's parts from a copy of the network."""
         assert isinstance(model, RecurrentPoser)
         self.model = model
-        self.ends = ("model.stem", "model.head", *(f"model.blocks.{name}.mlp" for name in model.blocks))
+        self.model.normalizer = LiveNormalizer(model.normalizer)
+        self.ends = ("model.normalizer", "model.stem", "model.head")
+        self.delicate = tuple(f"model.blocks.{name}.mlp" for name in model.blocks)
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""

@@ -1,0 +1,100 @@
+"""The normalizer of a live graph, which converts one frame in few operations."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from memmlp.motion.body import MOTION_DIM, POSITION, ROTATION, SPARSE_DIM
+from memmlp.motion.normalizer import Normalizer
+
+Way = Callable[[Tensor, Tensor], Tensor]
+
+
+class LiveNormalizer(Normalizer):
+    """A normalizer of single frames, whose conversions are matrices.
+
+    For a given turn of the coordinates the conversions are linear, and their matrices are linear in the
+    turn's numbers, the cosine and sine of the heading. So the matrices are found by converting a basis.
+
+    Args:
+        normalizer: the normalizer whose conversions these are.
+    """
+
+    def __init__(self, normalizer: Normalizer):
+        super().__init__(normalizer.coordinates, normalizer.rest, normalizer.mean, normalizer.std)
+        exact = copy.deepcopy(normalizer).double()
+        turns = exact.origin(torch.zeros(1, SPARSE_DIM)).shape[-1] - 3
+
+        def encode(x: Tensor, turn: Tensor) -> Tensor:
+            return exact.encode_sparse(x, torch.cat([exact.origin(x)[..., :3], turn.expand(len(x), -1)], -1))
+
+        def decode(x: Tensor, turn: Tensor) -> Tensor:
+            return exact.decode_motion(
+                x[:, :MOTION_DIM], torch.cat([x[:, MOTION_DIM:], turn.expand(len(x), -1)], -1)
+            )
+
+        def decode_rotations(x: Tensor, turn: Tensor) -> Tensor:
+            padded = F.pad(x, (0, MOTION_DIM + 3 - ROTATION.stop))
+            return decode(padded, turn)[:, ROTATION]
+
+        def turn_rotations(x: Tensor, turn: Tensor) -> Tensor:
+            return exact.rotations_out(x, F.pad(turn.expand(len(x), -1), (3, 0)))
+
+        self.encoder = OneFrame(encode, SPARSE_DIM, turns)
+        self.decoder = OneFrame(decode, MOTION_DIM + 3, turns)
+        self.rotation_decoder = OneFrame(decode_rotations, ROTATION.stop, turns)
+        self.rotation_turner = OneFrame(turn_rotations, ROTATION.stop, turns)
+        self.to(normalizer.mean)
+
+    def encode_sparse(self, sparse: Tensor, origin: Tensor) -> Tensor:
+        """Convert world inputs (1, 54) to network space (1, 54)."""
+        return self.encoder(sparse, origin)
+
+    def decode_motion(self, motion: Tensor, origin: Tensor) -> Tensor:
+        """Convert motion (1, 198) in network space to the world (1, 198)."""
+        return self.decoder(torch.cat([motion, origin[:, :3]], -1), origin)
+
+    def rotations_out(self, rotations: Tensor, origin: Tensor) -> Tensor:
+        """Convert joints' global rotations (1, 132), 6D, from the coordinates of an origin to the world."""
+        return self.rotation_turner(rotations, origin)
+
+    def posed(self, rotation: Tensor, sparse: Tensor) -> Tensor:
+        """Make world motion (1, 198) from rotations (1, 132) in network space at world inputs (1, 54)."""
+        world = self.rotation_decoder(rotation, self.origin(sparse))
+        motion = F.pad(world, (0, POSITION.stop - ROTATION.stop))
+        return torch.cat([world, self.pose(motion, sparse).flatten(-2)], -1)
+
+
+class OneFrame(nn.Module):
+    """A conversion of one frame that is linear for any given turn of the coordinates.
+
+    Args:
+        way: the conversion, of vectors (n, in) and a turn (turns,) to vectors (n, out), in float64.
+        size: in.
+        turns: how many numbers a turn has.
+    """
+
+    def __init__(self, way: Way, size: int, turns: int):
+        super().__init__()
+        tried = [torch.zeros(turns).double(), *torch.eye(turns).double()]
+        offsets = torch.stack([way(torch.zeros(1, size).double(), turn) for turn in tried])
+        basis = torch.eye(size).double()
+        matrices = torch.stack(
+            [way(basis, turn) - offset for turn, offset in zip(tried, offsets, strict=True)]
+        )
+        offsets[1:] -= offsets[:1]  # what each of the turn's numbers adds
+        matrices[1:] -= matrices[:1]
+        self.parts, self.out = len(matrices), matrices.shape[-1]
+        self.weight = nn.Parameter(matrices.transpose(1, 2).reshape(self.parts * self.out, size))
+        self.bias = nn.Parameter(offsets.reshape(-1))
+
+    def forward(self, x: Tensor, origin: Tensor) -> Tensor:
+        """Map x (1, in) at an origin (1, 3 or 5): the sum of all products, each times its number."""
+        products = F.linear(x, self.weight, self.bias).view(self.parts, self.out)
+        turn = torch.cat([torch.ones_like(origin[:, :1]), origin[:, 3:]], -1)
+        return turn @ products
