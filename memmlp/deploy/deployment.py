@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from memmlp.deploy import latency
 from memmlp.deploy.block_quantization import quantise_blocks
 from memmlp.deploy.export import export
 from memmlp.deploy.half import halve
+from memmlp.deploy.network_alone import network_alone
 from memmlp.deploy.opsets import NATIVE
 from memmlp.deploy.parity import TOLERANCE, parity
 from memmlp.deploy.precision_cost import compared
@@ -40,12 +42,14 @@ class Deployment:
         graph: "auto", "streaming" or "naive" (see GRAPHS).
         precision: "fp32", or "int8", "int8_blocks" or "fp16" for such a file beside the float32 one.
         opset: the files' ONNX opset, one of memmlp.deploy.opsets.OPSETS.
+        alone: whether the network alone is timed, too, without conversions and forward kinematics.
     """
 
     latency_steps: int
     graph: str = "auto"
     precision: str = "fp32"
     opset: int = NATIVE
+    alone: bool = False
 
     def deploy(
         self,
@@ -85,9 +89,19 @@ class Deployment:
             "graph": "streaming" if isinstance(network, StreamingGraph) else "naive",
             "onnx_parity": worst,
         }
+        if self.alone:
+            record |= self._alone(model)
         if self.precision != "fp32" and isinstance(network, StreamingGraph):
             record[self.precision] = self._less_precise(network, deployed, train, test)
         return record
+
+    def _alone(self, model: WindowModel) -> dict[str, float]:
+        """Return the times of the network alone, from features to its own outputs; no file is kept."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "alone.onnx"
+            export(network_alone(model), path, "", self.opset)
+            times = latency.measure_step(path, self.latency_steps)
+        return {f"alone_{name}": value for name, value in times.items()}
 
     def _less_precise(
         self,

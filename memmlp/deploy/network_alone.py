@@ -33,6 +33,10 @@ class NoConversion(Normalizer):
         """Return the motion (..., 198)."""
         return motion
 
+    def rotations_out(self, rotations: Tensor, origin: Tensor) -> Tensor:
+        """Return the rotations (..., 6 n)."""
+        return rotations
+
     def posed(self, rotation: Tensor, sparse: Tensor) -> Tensor:
         """Return the rotations (..., 132) as motion (..., 198) whose positions are zeros."""
         return F.pad(rotation, (0, MOTION_DIM - ROTATION.stop))

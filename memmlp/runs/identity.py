@@ -64,8 +64,8 @@ SLOTS = ("model", "memory", "predictor", "rollout", "loss", "hand", "term", "ref
 UNNAMED = {"optim": "adamw"}
 """The options of slots that runs have from before these were slots; their names do not count."""
 
-UNNAMED_OPSET = ("opset", 18)
-"""The opset of deployments from before it was a key; it does not count."""
+UNNAMED_EXPORT = (("opset", 18), ("alone", False))
+"""Settings of deployments from before they were keys; they do not count."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,8 @@ def deployment_name(settings: Mapping[str, Any]) -> str:
 def deployment_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings that a deployment's result follows from, beside the run and its data."""
     own = {key: _canonical(value) for key, value in config.get("export", {}).items()}
-    return {key: value for key, value in own.items() if (key, value) != UNNAMED_OPSET} | inference(config)
+    counting = {key: value for key, value in own.items() if (key, value) not in UNNAMED_EXPORT}
+    return counting | inference(config)
 
 
 def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:

@@ -12,7 +12,7 @@ from memmlp.evaluation.units import SMALLEST
 
 MODES = ("stream", "window")
 BRANCHES = ("rotation", "position", "combined")
-COSTS = ("FLOPs", "MACs", "parameters", "size", "ms", "pose ms", "ratio", "FPS")
+COSTS = ("FLOPs", "MACs", "parameters", "size", "ms", "network ms", "pose ms", "ratio", "FPS")
 """Metrics that are costs and no errors.
 
 Their units: GFLOP, GMAC, millions, MB, ms, multiples of the yardstick's time, and frames a second.

@@ -215,6 +215,7 @@ def _costs(latency: Mapping[str, float]) -> dict[str, float]:
         "parameters": of("parameters") / 1e6,
         "size": of("onnx_bytes") / 1e6,
         "ms": of("median_ms"),
+        "network ms": of("alone_median_ms"),
         "pose ms": of("pose_median_ms"),
         "ratio": of("ratio_to_yardstick"),
         "FPS": 1000 / of("median_ms"),

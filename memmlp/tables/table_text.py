@@ -17,6 +17,7 @@ COST_UNITS = {
     "parameters": "M",
     "size": "MB",
     "ms": "",
+    "network ms": "",
     "pose ms": "",
     "ratio": "",
     "FPS": "",
@@ -262,7 +263,7 @@ def paper_words(cell: Cell, metric: str) -> str:
     """Return the paper's value, its difference from the control, and whether it holds here."""
     if cell.paper is None:
         return MISSING
-    digits = 1 if metric in ("ms", "pose ms", "FPS") else 2
+    digits = 1 if metric in ("ms", "network ms", "pose ms", "FPS") else 2
     value = f"{cell.paper:.{digits}f}"
     if cell.paper_effect is None:
         return value

@@ -99,6 +99,7 @@ def test_a_run_in_int8_records_what_it_costs(home, memmlp, monkeypatch):
     written = deployed.latency.read_text()
     record = json.loads(written)
     assert record["graph"] == "streaming"
+    assert not any(name.startswith("alone") for name in record)
     assert 0 < record["step_macs"] != record["macs"]  # of so small a network the graph's may be more
     cost = record["int8"]
     assert cost["growth"] == pytest.approx(cost["int8"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
@@ -147,8 +148,9 @@ def test_the_naive_graph_by_switch(tmp_path):
 
 def test_a_deployment_in_fp16_and_an_older_opset(tmp_path):
     place, model = DeploymentFolder(tmp_path), exported.NETWORKS["no_memory"]()
-    deployment = build_experiment(composed(["export.precision=fp16", "export.opset=15"])).deployment
-    assert (deployment.precision, deployment.opset) == ("fp16", 15)
+    words = ["export.precision=fp16", "export.opset=15", "export.alone=true"]
+    deployment = build_experiment(composed(words)).deployment
+    assert (deployment.precision, deployment.opset, deployment.alone) == ("fp16", 15, True)
     record = deployment.deploy(model, place, "0" * 16, CLIPS, CLIPS)
     cost = record["fp16"]
     assert cost["growth"] == pytest.approx(cost["fp16"]["MPJPE"] / cost["fp32"]["MPJPE"] - 1)
@@ -158,5 +160,6 @@ def test_a_deployment_in_fp16_and_an_older_opset(tmp_path):
     for path in (place.onnx, place.file("fp16")):
         assert [one.version for one in onnx.load(path).opset_import] == [15]
     place.finish({"run": "0" * 16, "settings": {}, **record})
+    assert 0 < record["alone_median_ms"] <= record["alone_p95_ms"]
     assert set(place.record["artifacts"]) == {"step.onnx", "step.fp16.onnx"}
     assert place.integers is None

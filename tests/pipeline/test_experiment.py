@@ -58,6 +58,7 @@ CHANGES: dict[str, str] = {
     "evaluation.modes": "[stream]", "evaluation.batch": "1", "evaluation.ik": "off",
     "evaluation.ik_iterations": "3",
     "export.graph": "naive", "export.precision": "int8", "export.opset": "15", "export.latency_steps": "250",
+    "export.alone": "true",
     "tracking.mlflow.uri": "sqlite:///other.db", "tracking.wandb.project": "other",
 }  # fmt: skip
 
@@ -165,6 +166,7 @@ def deployed(experiment: Experiment, model: Any, clip: MotionDataset) -> list[An
         type(network).__name__,
         settings.precision,
         settings.opset,
+        settings.alone,
         max(settings.latency_steps, 200),
         motions,
     ]

@@ -200,6 +200,7 @@ class ExportConfig:
     latency_steps: int = at_least(1)
     graph: str = one_of("auto", "streaming", "naive", "off")
     precision: str = one_of(*ONNX_FILES)
+    alone: bool = standing(False)
     opset: int = standing(18, Within(15, 26))  # memmlp.deploy.opsets.OPSETS, without importing onnx
 
 
