@@ -1,4 +1,4 @@
-"""What libraries would work out anew at every call is kept for all tests of a process."""
+"""What libraries would work out anew at every call is kept for all tests of a process, or of all."""
 
 from __future__ import annotations
 
@@ -14,6 +14,22 @@ def remember() -> None:
     for name, patch in PATCHES.items():
         if name in sys.modules:
             patch(sys.modules[name])
+
+
+def keep_exports(folder: Path) -> None:
+    """Keep what torch's exporter makes in a folder from now on (kept_exports.py)."""
+    import torch.onnx
+
+    export = torch.onnx.export
+
+    @functools.wraps(export)
+    def kept(*arguments: Any, **options: Any) -> Any:
+        # Imported here, since it takes half a second that most test processes need not spend.
+        from kept_exports import kept
+
+        return kept(export, folder)(*arguments, **options)
+
+    torch.onnx.export = kept
 
 
 def _remember_exporter(module: Any) -> None:
