@@ -32,7 +32,7 @@ def mark() -> None:
 
 
 OLDER: set[tuple[str, int]] = set()
-"""The processes that were there before the mark, which they cannot have. A number given anew has a new inode."""
+"""The processes from before the mark, which they cannot have. A number given anew has a new inode."""
 
 
 def _entries() -> set[tuple[str, int]]:

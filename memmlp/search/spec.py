@@ -188,7 +188,9 @@ def _check_grid(space: Sequence[Range], n_trials: Any) -> None:
             raise InputError(f"search.space.{one.key}: with search.sampler=grid allowed are choices alone")
     combinations = math.prod(len(one.choices) for one in space)
     if n_trials != combinations:
-        raise InputError(f"search.n_trials={n_trials}: allowed with search.sampler=grid is {combinations}, all")
+        raise InputError(
+            f"search.n_trials={n_trials}: allowed with search.sampler=grid is {combinations}, all"
+        )
 
 
 def _ranges(node: Any, prefix: str) -> Iterator[Range]:
