@@ -79,6 +79,13 @@ def started(line: Sequence[str], **options: Any) -> Iterator[subprocess.Popen]:
             process.kill()
 
 
+PRELOADED = [
+    "memmlp.config.build", "memmlp.pipeline.run_stages", "memmlp.deploy.export", "memmlp.motion.synthetic",
+    "memmlp.render.figure", "torch.onnx", "torch._dynamo",
+]  # fmt: skip
+"""What a training imports, its optimiser, its export and its picture included."""
+
+
 class Forked:
     """A process that calls a function, with what tests need of `subprocess.Popen`.
 
@@ -90,7 +97,7 @@ class Forked:
         self, work: Callable[..., object], *arguments: Any, said: str = os.devnull, **environment: str
     ):
         context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["memmlp.config.build", "memmlp.pipeline.run_stages", "torch.onnx"])
+        context.set_forkserver_preload(PRELOADED)
         self._process = context.Process(target=_saying, args=(said, environment, work, arguments))
         self._process.start()
 

@@ -10,7 +10,6 @@ from typing import Any
 from torch import Tensor
 
 from memmlp.deploy import latency
-from memmlp.deploy.export import export
 from memmlp.deploy.half import halve
 from memmlp.deploy.opsets import NATIVE
 from memmlp.deploy.parity import TOLERANCE, parity
@@ -69,6 +68,8 @@ class Deployment:
         Raises:
             RuntimeError: if ONNX Runtime's numbers differ from torch's by more than the tolerance.
         """
+        from memmlp.deploy.export import export  # torch's exporter is slow to import, and few processes export
+
         deployed.folder.mkdir(parents=True, exist_ok=True)
         network = GRAPHS[self.graph](model)
         export(network, deployed.onnx, run_id, self.opset)
