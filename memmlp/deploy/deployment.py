@@ -68,7 +68,7 @@ class Deployment:
         Raises:
             RuntimeError: if ONNX Runtime's numbers differ from torch's by more than the tolerance.
         """
-        from memmlp.deploy.export import export  # torch's exporter is slow to import, and few processes export
+        from memmlp.deploy.export import export  # slow to import, and few processes export
 
         deployed.folder.mkdir(parents=True, exist_ok=True)
         network = GRAPHS[self.graph](model)
