@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import atexit
 import base64
+import functools
 import io
 import json
 import os
 import shutil
 import subprocess
 import tempfile
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
-from processes import until
+from processes import MARK, until
 
 SETPRIV = shutil.which("setpriv")
 MODEST = [SETPRIV, "--bounding-set=-sys_nice"] if SETPRIV and os.geteuid() == 0 else []
@@ -28,29 +29,84 @@ DRAWN = """{
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
-class Browser:
-    """One page, drawn by software, with nothing but this machine to reach."""
+class Chromium:
+    """A browser without a window, drawn by software, with nothing but this machine to reach.
 
-    def __init__(self, profile: Path, width: int = 1100, height: int = 720, dark: bool = False):
+    It lives as long as the test process, whose end closes the pipe that it is driven by. So it lacks the mark
+    of what ends with a test.
+    """
+
+    def __init__(self) -> None:
         if CHROMIUM is None:
             pytest.skip("Chromium is not installed (apt-get install chromium)")
+        self.litter = tempfile.TemporaryDirectory(prefix="chromium-", ignore_cleanup_errors=True)
         command = [
             CHROMIUM, "--headless", "--no-sandbox", "--disable-dev-shm-usage", "--no-first-run",
             "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
             "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
-            "--remote-debugging-pipe", f"--user-data-dir={profile}", "about:blank",
+            "--remote-debugging-pipe", f"--user-data-dir={self.litter.name}/profile", "about:blank",
         ]  # fmt: skip
         (theirs_in, self.write), (self.read, theirs_out) = os.pipe(), os.pipe()
         line = [*MODEST, "bash", "-c", f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}', "bash", *command]
-        self.litter = tempfile.TemporaryDirectory(prefix="chromium-", ignore_cleanup_errors=True)
+        unmarked = {name: value for name, value in os.environ.items() if name != MARK}
         self.process = subprocess.Popen(
             line, pass_fds=(theirs_in, theirs_out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            env={**os.environ, "TMPDIR": self.litter.name},
+            env={**unmarked, "TMPDIR": self.litter.name},
         )  # fmt: skip
         os.close(theirs_in), os.close(theirs_out)
-        self.buffer, self.count, self.session, self.errors = b"", 0, None, []
-        target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        self.session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        self.buffer, self.count = b"", 0
+        atexit.register(self.end)
+
+    def call(
+        self, method: str, session: str | None, errors: list[str], parameters: dict[str, Any]
+    ) -> dict[str, Any]:
+        """The result of a method; what goes wrong in the session meanwhile is added to `errors`."""
+        self.count += 1
+        message = {"id": self.count, "method": method, "params": parameters}
+        if session:
+            message["sessionId"] = session
+        os.write(self.write, json.dumps(message).encode() + b"\0")
+        while True:
+            answer = self._next()
+            wrong = answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded")
+            if wrong and answer.get("sessionId") == session:
+                errors.append(json.dumps(answer["params"])[:500])
+            if answer.get("id") == self.count:
+                assert "error" not in answer, answer
+                return answer["result"]
+
+    def _next(self) -> dict[str, Any]:
+        while b"\0" not in self.buffer:
+            part = os.read(self.read, 1 << 16)
+            assert part, "the browser is gone"
+            self.buffer += part
+        line, self.buffer = self.buffer.split(b"\0", 1)
+        return json.loads(line)
+
+    def end(self) -> None:
+        """Kill it."""
+        self.process.kill()
+        self.process.wait()
+        os.close(self.write), os.close(self.read)
+        self.litter.cleanup()
+
+
+@functools.cache
+def chromium() -> Chromium:
+    """The browser of this process, whose start takes seconds of CPU time."""
+    return Chromium()
+
+
+class Browser:
+    """One page in a profile of its own, which knows nothing of others."""
+
+    def __init__(self, width: int = 1100, height: int = 720, dark: bool = False):
+        self.chromium, self.session, self.errors = chromium(), None, []
+        self.process = self.chromium.process
+        self.profile = self.call("Target.createBrowserContext")["browserContextId"]
+        target = self.call("Target.createTarget", url="about:blank", browserContextId=self.profile)
+        attached = self.call("Target.attachToTarget", targetId=target["targetId"], flatten=True)
+        self.session = attached["sessionId"]
         for domain in ("Page", "Runtime", "Log"):
             self.call(f"{domain}.enable")
         self.size(width, height)
@@ -65,26 +121,7 @@ class Browser:
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
         """The result of a method."""
-        self.count += 1
-        message = {"id": self.count, "method": method, "params": parameters}
-        if self.session:
-            message["sessionId"] = self.session
-        os.write(self.write, json.dumps(message).encode() + b"\0")
-        while True:
-            answer = self._next()
-            if answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
-                self.errors.append(json.dumps(answer["params"])[:500])
-            if answer.get("id") == self.count:
-                assert "error" not in answer, answer
-                return answer["result"]
-
-    def _next(self) -> dict[str, Any]:
-        while b"\0" not in self.buffer:
-            part = os.read(self.read, 1 << 16)
-            assert part, "the browser is gone"
-            self.buffer += part
-        line, self.buffer = self.buffer.split(b"\0", 1)
-        return json.loads(line)
+        return self.chromium.call(method, self.session, self.errors, parameters)
 
     def value(self, expression: str) -> Any:
         """What an expression is on the page."""
@@ -127,7 +164,5 @@ class Browser:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.process.kill()
-        self.process.wait()
-        os.close(self.write), os.close(self.read)
-        self.litter.cleanup()
+        self.session = None
+        self.call("Target.disposeBrowserContext", browserContextId=self.profile)

@@ -17,7 +17,7 @@ import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 from own_package import on_path  # noqa: F401
-from remembered import remember
+from remembered import keep_exports, remember
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -115,6 +115,11 @@ def shared(factory: pytest.TempPathFactory, name: str) -> Path:
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
     folder.mkdir(exist_ok=True)
     return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _exports_are_kept(tmp_path_factory: pytest.TempPathFactory) -> None:
+    keep_exports(shared(tmp_path_factory, "exports"))
 
 
 @pytest.fixture(scope="session")

@@ -28,6 +28,18 @@ def mark() -> None:
     a test process begins with that of the one that distributes the tests, which so finds all.
     """
     os.environ[MARK] = f"{os.environ.get(MARK, '')}/{uuid.uuid4().hex}"
+    OLDER.update(_entries())
+
+
+OLDER: set[tuple[str, int]] = set()
+"""The processes from before the mark, which they cannot have. A number given anew has a new inode."""
+
+
+def _entries() -> set[tuple[str, int]]:
+    """The numbers and inodes of all processes. None where there is no /proc."""
+    with contextlib.suppress(FileNotFoundError):
+        return {(entry.name, entry.inode()) for entry in os.scandir(PROC) if entry.name.isdigit()}
+    return set()
 
 
 def marked() -> list[int]:
@@ -37,7 +49,7 @@ def marked() -> list[int]:
     """
     wanted = f"{MARK}={os.environ[MARK]}".encode()
     found = []
-    for folder in PROC.glob("[0-9]*"):
+    for folder in (PROC / number for number, _ in _entries() - OLDER):
         with contextlib.suppress(OSError):  # it has ended, or is somebody else's
             begins = any(entry.startswith(wanted) for entry in (folder / "environ").read_bytes().split(b"\0"))
             command = (folder / "cmdline").read_bytes()
@@ -67,6 +79,13 @@ def started(line: Sequence[str], **options: Any) -> Iterator[subprocess.Popen]:
             process.kill()
 
 
+PRELOADED = [
+    "memmlp.config.build", "memmlp.pipeline.run_stages", "memmlp.deploy.export", "memmlp.motion.synthetic",
+    "memmlp.render.figure", "torch.onnx", "torch._dynamo",
+]  # fmt: skip
+"""What a training imports, its optimiser, its export and its picture included."""
+
+
 class Forked:
     """A process that calls a function, with what tests need of `subprocess.Popen`.
 
@@ -78,7 +97,7 @@ class Forked:
         self, work: Callable[..., object], *arguments: Any, said: str = os.devnull, **environment: str
     ):
         context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["memmlp.config.build", "memmlp.pipeline.run_stages", "torch.onnx"])
+        context.set_forkserver_preload(PRELOADED)
         self._process = context.Process(target=_saying, args=(said, environment, work, arguments))
         self._process.start()
 

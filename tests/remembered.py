@@ -1,10 +1,13 @@
-"""What libraries would work out anew at every call is kept for all tests of a process."""
+"""What libraries would work out anew at every call is kept for all tests of a process, or of all."""
 
 from __future__ import annotations
 
+import copy
 import functools
+import hashlib
 import pickle
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,22 @@ def remember() -> None:
     for name, patch in PATCHES.items():
         if name in sys.modules:
             patch(sys.modules[name])
+
+
+def keep_exports(folder: Path) -> None:
+    """Keep what torch's exporter makes in a folder from now on (kept_exports.py)."""
+    import torch.onnx
+
+    export = torch.onnx.export
+
+    @functools.wraps(export)
+    def kept(*arguments: Any, **options: Any) -> Any:
+        # Imported here, since it takes half a second that most test processes need not spend.
+        from kept_exports import kept
+
+        return kept(export, folder)(*arguments, **options)
+
+    torch.onnx.export = kept
 
 
 def _remember_exporter(module: Any) -> None:
@@ -38,7 +57,8 @@ def _remember_configs(module: Any) -> None:
     @functools.wraps(repository.load_config)
     def load_config(self: Any, config_path: str) -> Any:
         places = tuple((type(source), source.path) for source in self.sources)
-        key = (config_path, places, *(_stamp(place, config_path) for _, place in places))
+        files = [Path(place) / f"{config_path.removesuffix('.yaml')}.yaml" for _, place in places]
+        key = (config_path, places, *(_stamp(file) for file in files if file.is_file()))
         if key not in known:
             known[key] = pickle.dumps(load_config.__wrapped__(self, config_path))
         return pickle.loads(known[key])  # a copy, since a composition changes what it loaded
@@ -46,14 +66,103 @@ def _remember_configs(module: Any) -> None:
     repository.load_config = load_config
 
 
-def _stamp(folder: str, name: str) -> tuple[int, int] | None:
-    """When a config's file was written, and its size; None of what is no file."""
-    file = Path(folder) / f"{name.removesuffix('.yaml')}.yaml"
-    return (file.stat().st_mtime_ns, file.stat().st_size) if file.is_file() else None
+def _remember_compositions(module: Any) -> None:
+    """Of Hydra: the defaults list of the same options, each config in its package, and all of a list merged.
+
+    A command composes three times, and what overrides then set is set anew each time.
+    """
+    loader, lists = module.ConfigLoaderImpl, sys.modules["hydra._internal.defaults_list"]
+    if hasattr(loader._load_single_config, "__wrapped__"):
+        return
+    load, compose = loader._load_single_config, loader._compose_config_from_defaults_list
+    choose, interpolate = lists._create_defaults_list, lists._create_interpolation_map
+    stores = _counted_stores()
+
+    @functools.wraps(choose)
+    def chosen(repo: Any, config_name: Any, overrides: Any, prepend_hydra: bool, skip_missing: bool) -> Any:
+        values, overrides.config_overrides = overrides.config_overrides, []  # these choose nothing
+        key = ("list", overrides, config_name, prepend_hydra, skip_missing, _folders(repo), stores)
+        result, state = _kept(
+            key,
+            lambda: (choose(repo, config_name, overrides, prepend_hydra, skip_missing), vars(overrides)),
+        )
+        vars(overrides).update({**state, "config_overrides": values})
+        return result
+
+    @functools.wraps(interpolate)
+    def interpolated(overrides: Any, defaults_list: list[Any], self_added: bool) -> Any:
+        if any(default.is_interpolation() for default in defaults_list):
+            return interpolate(overrides, defaults_list, self_added)
+        return None  # nobody looks at it
+
+    @functools.wraps(compose)
+    def composed(self: Any, defaults: list[Any], repo: Any) -> Any:
+        repo.folders = _folders(repo), stores
+        return _kept(("merged", defaults, repo.folders), lambda: compose(self, defaults, repo))
+
+    @functools.wraps(load)
+    def loaded(self: Any, default: Any, repo: Any) -> Any:
+        return _kept(("one", default, repo.folders), lambda: load(self, default, repo))
+
+    loader._load_single_config, loader._compose_config_from_defaults_list = loaded, composed
+    lists._create_defaults_list, lists._create_interpolation_map = chosen, interpolated
+    copied = sys.modules["hydra._internal.config_repository"].CachingConfigRepository
+
+    def __init__(self: Any, delegate: Any) -> None:
+        self.delegate, self.cache = (
+            copy.copy(delegate),
+            {},
+        )  # it is given other sources, and never changes one
+
+    copied.__init__ = __init__
+
+
+def _kept(key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+    """A copy of what was made for the same key."""
+    words = repr(key)
+    if words not in KEPT:
+        KEPT[words] = pickle.dumps(make())
+    return pickle.loads(KEPT[words])
+
+
+KEPT: dict[str, bytes] = {}
+
+
+def _counted_stores() -> list[int]:
+    """A number, from now on one more with each config that code makes known to Hydra."""
+    from hydra.core.config_store import ConfigStore
+
+    store, count = ConfigStore.store, [0]
+
+    @functools.wraps(store)
+    def counted(*arguments: Any, **options: Any) -> None:
+        count[0] += 1
+        store(*arguments, **options)
+
+    ConfigStore.store = counted
+    return count
+
+
+def _folders(repo: Any) -> str:
+    """A digest of where configs are looked for, with the stamp of each file that is there."""
+    found = []
+    for source in repo.get_sources():
+        files = sorted(Path(source.path).rglob("*.yaml")) if source.scheme() == "file" else []
+        found.append(
+            (source.provider, source.scheme(), source.path, [(file, _stamp(file)) for file in files])
+        )
+    return hashlib.sha256(repr(found).encode()).hexdigest()
+
+
+def _stamp(file: Path) -> tuple[int, int, int]:
+    """When a file was written, its size, and its number on the disk."""
+    status = file.stat()
+    return status.st_mtime_ns, status.st_size, status.st_ino
 
 
 PATCHES = {
     "torch.onnx._internal.exporter._registration": _remember_exporter,
     "omegaconf.base": _remember_interpolations,
     "hydra._internal.config_repository": _remember_configs,
+    "hydra._internal.config_loader_impl": _remember_compositions,
 }

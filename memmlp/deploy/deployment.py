@@ -12,7 +12,6 @@ from torch import Tensor
 
 from memmlp.deploy import latency
 from memmlp.deploy.block_quantization import quantise_blocks
-from memmlp.deploy.export import export
 from memmlp.deploy.half import halve
 from memmlp.deploy.network_alone import network_alone
 from memmlp.deploy.opsets import NATIVE
@@ -74,6 +73,8 @@ class Deployment:
         Raises:
             RuntimeError: if ONNX Runtime's numbers differ from torch's by more than the tolerance.
         """
+        from memmlp.deploy.export import export  # slow to import, and few processes export
+
         deployed.folder.mkdir(parents=True, exist_ok=True)
         network = GRAPHS[self.graph](model)
         export(network, deployed.onnx, run_id, self.opset)
@@ -97,6 +98,8 @@ class Deployment:
 
     def _alone(self, model: WindowModel) -> dict[str, float]:
         """Return the times of the network alone, from features to its own outputs; no file is kept."""
+        from memmlp.deploy.export import export
+
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "alone.onnx"
             export(network_alone(model), path, "", self.opset)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -17,6 +17,22 @@ from memmlp.tables.measured_run import Measured
 from memmlp.tables.table import Effect, Key
 
 Runs = Mapping[int, Measured]  # an arm's finished runs by seed
+
+
+class Shared(NamedTuple):
+    """What an arm's runs share with those of its control.
+
+    Attributes:
+        seeds: those that both have (S).
+        clips: the names of the clips that all runs have (C).
+        names: the names of their groups (C).
+        groups: the groups' numbers (C,).
+    """
+
+    seeds: list[int]
+    clips: list[str]
+    names: list[str]
+    groups: np.ndarray
 
 
 class Paired(NamedTuple):
@@ -49,10 +65,14 @@ def paper_effect(sweep: Sweep, arm: Arm, metric: str) -> float | None:
     return None if ours is None or theirs is None else round(ours - theirs, 6)
 
 
-def paired(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dict[Key, Paired]:
-    """Return the differences of all arms in all error metrics, where there are any."""
+def paired(
+    sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str], labels: Container[str] | None = None
+) -> dict[Key, Paired]:
+    """Return the differences of all arms, or of those with these labels, in all known error metrics."""
     found = {}
     for arm, other in _compared(sweep):
+        if labels is not None and arm.label not in labels:
+            continue
         ours, theirs = runs[arm.label], runs[other.label]
         if one_and_the_same(arm, other, ours, theirs):
             continue
@@ -95,30 +115,30 @@ def _compared(sweep: Sweep) -> Iterator[tuple[Arm, Arm]]:
 def _paired(
     ours: Runs,
     theirs: Runs,
-    shared: tuple[list[int], list[str]],
+    shared: Shared,
     branches: tuple[str, str],
     mode: str,
     metric: str,
 ) -> Paired:
     """Return ours less theirs, over the shared seeds and those clips that all runs have a number for."""
-    seeds, clips = shared
+    seeds, clips, names, groups = shared
     sides = [
         np.array([runs[seed].by_clip(clips, mode, branch, metric) for seed in seeds])
         for runs, branch in zip((ours, theirs), branches, strict=True)
     ]
     matrix = (sides[0] - sides[1]).reshape(len(seeds), len(clips))
     known = np.isfinite(matrix).all(0)
-    names = [ours[seeds[0]].group(clip) for clip in clips] if seeds else []
-    groups = np.unique(np.array(names, dtype=str), return_inverse=True)[1]
     left = [(clip, name) for clip, name, is_known in zip(clips, names, known, strict=False) if is_known]
     return Paired(matrix[:, known], groups[known], *map(tuple, zip(*left, strict=True)))
 
 
-def _shared(ours: Runs, theirs: Runs) -> tuple[list[int], list[str]]:
-    """Return the seeds that both arms have, and the clips that all their runs have."""
+def _shared(ours: Runs, theirs: Runs) -> Shared:
+    """Return what an arm and its control share."""
     seeds = [seed for seed in ours if seed in theirs]
-    names = [runs[seed].clips for runs in (ours, theirs) for seed in seeds]
-    return seeds, [name for name in names[0] if all(name in other for other in names)] if names else []
+    known = [runs[seed].clips for runs in (ours, theirs) for seed in seeds]
+    clips = [name for name in known[0] if all(name in other for other in known)] if known else []
+    names = [ours[seeds[0]].group(clip) for clip in clips]
+    return Shared(seeds, clips, names, np.unique(np.array(names, dtype=str), return_inverse=True)[1])
 
 
 def alike(pairs: Mapping[Key, Paired]) -> Iterator[tuple[list[Key], np.ndarray, np.ndarray]]:

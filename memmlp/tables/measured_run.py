@@ -99,8 +99,8 @@ class Measured:
 
     def by_clip(self, names: Sequence[str], mode: str, branch: str, metric: str) -> np.ndarray:
         """Return a metric for each of these clips (C,); NaN where the run has none."""
-        numbers = [_number(self.clips[name], mode, branch, metric) for name in names]
-        return np.array([np.nan if number is None else number for number in numbers])
+        found = [self.clips[name].get(mode, {}).get(branch, {}).get(metric) for name in names]
+        return np.array([np.nan if value is None else float(value) for value in found])
 
     def group(self, clip: str) -> str:
         """Return the group of a clip."""

@@ -336,8 +336,7 @@ def _seen(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], look: Look) ->
     """Return all comparisons of a look's arms, over exactly the look's seeds."""
     seeds = rounds.seeds[: look.seeds]
     cut = {label: {s: found[s] for s in seeds if s in found} for label, found in runs.items()}
-    pairs = paired(with_existing_branches(sweep, cut), cut, MODES)
-    return tested({key: pair for key, pair in pairs.items() if key.label in look.runs}, sweep.smallest)
+    return tested(paired(with_existing_branches(sweep, cut), cut, MODES, look.runs), sweep.smallest)
 
 
 def _corrected(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -226,6 +227,12 @@ def test_the_table_shows_rounds(tmp_path):
     assert "'unsure' seed 6; fill with" in markdown(collect(rounds.spent(SWEEP), world.runs, rounds=rounds))
 
 
+@functools.cache
+def normal(number: int, seed: int, label: str, metric: str) -> float:
+    """Return the number that a run's error is made of, the same for every truth and noise."""
+    return np.random.default_rng([number, seed, *label.encode(), *metric.encode()]).normal()
+
+
 def false_claims(truth: float, noise: float, spend: Callable[[Rounds], Rounds], times: int = 200) -> float:
     """Return the share of sweeps with a false claim.
 
@@ -239,8 +246,8 @@ def false_claims(truth: float, noise: float, spend: Callable[[Rounds], Rounds], 
     for number in range(times):
 
         def draw(label: str, seed: int, metric: str, number: int = number) -> np.ndarray:
-            rng = np.random.default_rng([number, seed, *label.encode(), *metric.encode()])
-            return (label != "full") * (noise * rng.normal() + truth) + np.zeros(len(CLIPS))
+            difference = noise * normal(number, seed, label, metric) + truth if label != "full" else 0.0
+            return np.full(len(CLIPS), difference)
 
         rounds = World(sweep, draw).to_the_end(spend(begin(sweep)))
         counts.append(any(finding.verdict in false for finding, _ in rounds.latest().values()))

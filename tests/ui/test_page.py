@@ -60,8 +60,8 @@ def server(home: Path) -> Iterator[Server]:
 
 
 @pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Browser]:
-    with Browser(tmp_path / "profile") as running:
+def browser() -> Iterator[Browser]:
+    with Browser() as running:
         yield running
         assert not running.errors
 

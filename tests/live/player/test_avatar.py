@@ -77,8 +77,8 @@ def own() -> bytes:
 
 
 @pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Browser]:
-    with Browser(tmp_path / "profile", 700, 500) as browser:
+def browser() -> Iterator[Browser]:
+    with Browser(700, 500) as browser:
         yield browser
 
 

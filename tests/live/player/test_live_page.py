@@ -37,8 +37,8 @@ def url(network: Path, clip: TrackedClip) -> Iterator[str]:
 
 
 @pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Browser]:
-    with Browser(tmp_path / "profile") as browser:
+def browser() -> Iterator[Browser]:
+    with Browser() as browser:
         yield browser
 
 
@@ -142,8 +142,8 @@ def test_the_printed_address_opens_the_page_for_others(browser: Browser, clip: T
     assert browser.errors == []
 
 
-def test_it_fits_a_phone_in_the_dark(tmp_path: Path, url: str):
-    with Browser(tmp_path / "profile", 390, 780, dark=True) as browser:
+def test_it_fits_a_phone_in_the_dark(url: str):
+    with Browser(390, 780, dark=True) as browser:
         browser.open(url)
         browser.wait(f"{SHOWN} > 5")
         outside = (

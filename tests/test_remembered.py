@@ -1,0 +1,61 @@
+"""What is remembered of Hydra's work is what Hydra makes anew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hydra._internal import defaults_list
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.global_hydra import GlobalHydra
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from memmlp.config import compose
+
+REMEMBERED = [
+    (ConfigLoaderImpl, "_load_single_config"),
+    (ConfigLoaderImpl, "_compose_config_from_defaults_list"),
+    (defaults_list, "_create_defaults_list"),
+    (defaults_list, "_create_interpolation_map"),
+]
+
+
+def composed(overrides: list[str]) -> str:
+    """What Hydra composes, its own settings included, or its complaint."""
+    args, _ = compose.parse(overrides)
+    compose.register()
+    with compose._hydra(args):
+        loader = GlobalHydra.instance().config_loader()
+        try:
+            cfg = loader.load_configuration(compose.CONFIG, args.overrides, RunMode.RUN)
+        except Exception as error:
+            return str(error)
+        assert isinstance(cfg, DictConfig)
+        return OmegaConf.to_yaml(cfg)
+
+
+CASES = [
+    ["memory=none", "optim.steps=3"],
+    ["memory=none", "optim.steps=4", "hydra.job.name=other"],
+    ["model=avatar_poser", "loss=avatar_poser"],
+    ["memory=nothing"],
+    ["memory=lstm", "memory=gru"],
+    ["~refiner"],
+]
+
+
+def test_the_same_is_composed_anew(monkeypatch: pytest.MonkeyPatch):
+    twice = [[composed(overrides) for overrides in CASES] for _ in range(2)]
+    for owner, name in REMEMBERED:
+        monkeypatch.setattr(owner, name, getattr(owner, name).__wrapped__)
+    assert [composed(overrides) for overrides in CASES] == twice[0] == twice[1]
+
+
+def test_a_file_that_changes_is_read_again(tmp_path: Path):
+    (tmp_path / "memory").mkdir()
+    found = []
+    for layers in ("[2]", "[4]"):
+        (tmp_path / "memory" / "own.yaml").write_text(f"defaults: [vq]\nlayers: {layers}\n")
+        found.append(composed(["--config-dir", str(tmp_path), "memory=own"]))
+    assert [OmegaConf.create(text).memory.layers for text in found] == [[2], [4]]
