@@ -215,6 +215,9 @@ BAD = [
     (["paths.outputs="], ["paths.outputs=", "not empty"]),
     (["memory._target_=os.system"], ["memory._target_=os.system", "memmlp.networks.memory.CodeMemory"]),
     # impossible combinations
+    (["~memory"], ["memory", "memory=none for none"]),
+    (["~hand"], ["hand", "hand=off for none"]),
+    (["~predictor"], ["predictor", "one of its options"]),
     (["memory.layers=[2,9]"], ["memory.layers=[2, 9]", "model.depth=8"]),
     (["model.depth=3"], ["memory.layers", "model.depth=3"]),
     (["optim.final_lr=1"], ["optim.final_lr=1", "optim.lr"]),

@@ -231,7 +231,11 @@ def _check_foreign_loss(cfg: DictConfig, predictor: str) -> None:
 
 
 def _check_slots(cfg: DictConfig) -> None:
-    """Check that the options in Mem-MLP's slots go together."""
+    """Check that Mem-MLP's slots are filled, and that the options in them go together."""
+    for slot, none in (("memory", "memory=none"), ("predictor", None), ("hand", "hand=off")):
+        if cfg[slot] is None:
+            allowed = f"{none} for none" if none else "one of its options"
+            raise InputError(f"{slot}: nothing is in this slot of model=mem_mlp; allowed is {allowed}")
     layers = list(cfg.memory.get("layers", []))
     if layers and max(layers) > cfg.model.depth:
         raise InputError(f"memory.layers={layers}: allowed is up to model.depth={cfg.model.depth}")
