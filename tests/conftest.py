@@ -24,6 +24,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest files first, the others as they were; what needs a trained run is slow."""
     here = Path(__file__).parent
     ranks = {here / f"{name}.py": rank for rank, name in enumerate(LONGEST)}
+    if gone := [path for path in ranks if not path.is_file()]:
+        raise pytest.UsageError(f"LONGEST names files that are not there: {', '.join(map(str, gone))}")
     items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
     for item in items:
         if "home" in item.fixturenames or "tiny_home" in item.fixturenames:

@@ -43,7 +43,8 @@ TEXT, NUMBER_ABOVE_0, OR_NULL, COUNT = "text", "a number above 0", "a number abo
 CHECKS: dict[str, Check] = {TEXT: _text, NUMBER_ABOVE_0: _positive, OR_NULL: _maybe, COUNT: _count}
 FILE = {"device": TEXT, "browser": TEXT, "onnxruntime_web": TEXT, "date": TEXT, "clock_ms": NUMBER_ABOVE_0}
 ROW = {
-    "network": TEXT, "graph": TEXT, "precision": TEXT, "backend": TEXT, "threads": COUNT, "steps": COUNT,
+    "network": TEXT, "parameters": COUNT, "graph": TEXT, "precision": TEXT, "backend": TEXT,
+    "threads": COUNT, "steps": COUNT,
     "median_ms": NUMBER_ABOVE_0, "p95_ms": NUMBER_ABOVE_0, "ratio_to_avatar_poser": OR_NULL,
     "ratio_to_yardstick": OR_NULL, "whole_median_ms": OR_NULL, "whole_p95_ms": OR_NULL,
 }  # fmt: skip
@@ -126,8 +127,10 @@ def _kind(row: Mapping[str, Any]) -> tuple[str, str, str]:
 
 
 def _label(measured: BrowserBench, row: Mapping[str, Any]) -> str:
-    graph = GRAPHS.get(row["graph"], row["graph"])
-    return f"{row['network']}, {graph}, {row['precision']}, {row['backend']}: {measured.name}"
+    """Name a row, its network's size too: a site's networks need not have the sizes of the table's own."""
+    graph, size = GRAPHS.get(row["graph"], row["graph"]), row["parameters"] / 1e6
+    how = f"{graph}, {row['precision']}, {row['backend']}"
+    return f"{row['network']} of {size:.3g} M parameters, {how}: {measured.name}"
 
 
 def _row(table: Table, measured: BrowserBench, row: Mapping[str, Any], base: Mapping[str, Any] | None) -> Row:

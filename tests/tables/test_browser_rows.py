@@ -15,7 +15,8 @@ from memmlp.tables.build_table import without_runs
 from memmlp.tables.formats import FORMATS
 
 ROW = {
-    "network": "AvatarPoser", "run": "random", "graph": "naive", "precision": "fp32", "backend": "wasm",
+    "network": "AvatarPoser", "run": "random", "parameters": 4_120_000, "graph": "naive",
+    "precision": "fp32", "backend": "wasm",
     "threads": 1, "steps": 500, "median_ms": 20.0, "p95_ms": 25.0, "ratio_to_avatar_poser": 1.0,
     "ratio_to_yardstick": 0.8, "whole_median_ms": 21.0, "whole_p95_ms": 26.0,
 }  # fmt: skip
@@ -40,7 +41,9 @@ def test_they_stand_below_the_table_s_own_with_device_and_browser(tmp_path: Path
     table = without_runs(find_sweep("17", ()), ("stream",), "nothing measured")
     shown = with_rows(table, read(written(tmp_path, FILE)))
     base, ours = shown.rows[len(table.rows) :]
-    assert base.label == "AvatarPoser, as published, fp32, wasm: Quest 9, OculusBrowser 1"
+    assert (
+        base.label == "AvatarPoser of 4.12 M parameters, as published, fp32, wasm: Quest 9, OculusBrowser 1"
+    )
     assert base.against is None
     cells = ours.cells["stream"]
     means = {metric: cell.mean for metric, cell in cells.items()}
