@@ -1,10 +1,10 @@
 """int8 of an exported stream in blocks: weights of eight bits with a scale for every 32 of an output.
 
 The inputs of a product are rounded to eight bits while it is computed, with a scale for every 32 of them
-(`MatMulNBits` of ONNX Runtime's own operators). So nothing is calibrated, and a layer whose inputs now and
-then are large keeps its resolution at all other times: a network without a window can have all its inner
-layers in int8, where one scale for all frames (`memmlp.deploy.quantization`) would be seen as jitter. It is
-quick for products of one row. Those of a window's rows are slower than in float32.
+(`MatMulNBits` of ONNX Runtime's own operators). So nothing is calibrated, and a layer is one operation in
+place of four: it is for networks without a window, whose products have one row. Those of a window's rows are
+slower than in float32. What rounding adds to a frame is seen as jitter, finer scales or not, so that the
+graph says here, too, which modules stay in float32.
 """
 
 from __future__ import annotations

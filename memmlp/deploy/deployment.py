@@ -131,10 +131,9 @@ def lower(precision: str, source: Path, path: Path, network: StreamingGraph, tra
         network: the graph, which says what of it stays in float32.
         train: training clips (N, 252), to calibrate int8.
     """
-    with_delicate = (*network.ends, *network.delicate)
     if precision == "int8":
-        quantise(source, path, with_delicate, train)
+        quantise(source, path, network.ends, train)
     elif precision == "int8_blocks":
         quantise_blocks(source, path, network.ends)
     else:
-        halve(source, path, with_delicate)
+        halve(source, path, network.ends)

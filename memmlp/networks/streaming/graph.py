@@ -50,12 +50,9 @@ class StreamingGraph(nn.Module):
     Attributes:
         ends: names of the modules at the network's two ends: from the inputs to the hidden state, and from it
             to the motion. They stay in float32 when the graph is quantised.
-        delicate: names of the modules that stay in float32, too, where a layer's inputs are rounded with one
-            scale for all frames.
     """
 
     ends: tuple[str, ...]
-    delicate: tuple[str, ...] = ()
 
     def __init__(self, model: WindowModel):
         super().__init__()

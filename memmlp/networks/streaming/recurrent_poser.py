@@ -14,8 +14,8 @@ from memmlp.networks.window_model import WindowModel
 class RecurrentPoserStream(FrameStream):
     """The network as it is, its cells as plain layers for one frame.
 
-    Quantised with one scale for all frames, the cells alone are int8: a state averages what rounding adds to
-    each frame, whereas the MLPs hand it on to the motion, where it is seen as jitter.
+    Quantised, the cells alone are int8: a state averages what rounding adds to each frame, whereas the MLPs
+    hand it on to the motion, where it is seen as jitter.
     """
 
     model: RecurrentPoser
@@ -25,8 +25,8 @@ class RecurrentPoserStream(FrameStream):
         assert isinstance(model, RecurrentPoser)
         self.model = model
         self.model.normalizer = LiveNormalizer(model.normalizer)
-        self.ends = ("model.normalizer", "model.stem", "model.head")
-        self.delicate = tuple(f"model.blocks.{name}.mlp" for name in model.blocks)
+        mlps = (f"model.blocks.{name}.mlp" for name in model.blocks)
+        self.ends = ("model.normalizer", "model.stem", *mlps, "model.head")
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""

@@ -25,7 +25,6 @@ class RefinedStream(StreamingGraph):
         super().__init__(model)
         self.graph = graph
         self.ends = (*(f"graph.{name}" for name in graph.ends), "model.layers", "model.head")
-        self.delicate = tuple(f"graph.{name}" for name in graph.delicate)
 
     def build(self, model: WindowModel) -> None:
         """Keep a copy of the refiner; of the network the graph has one."""
