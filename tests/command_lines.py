@@ -163,7 +163,7 @@ def make_placeholders(words: list[str]) -> None:
         elif key == "data.body" and value != "builtin":
             Path(value).parent.mkdir(parents=True, exist_ok=True)
             Path(value).touch()
-        elif word in ("mix", "scaling"):
+        elif word in ("mix", "scaling", "networks", "data=cmu_bandai"):
             make_placeholders(["data.root=outputs/data/cmu,outputs/data/bandai"])
         elif word == "myconf":
             Path("myconf/hand").mkdir(parents=True, exist_ok=True)
