@@ -78,14 +78,14 @@ class LocalRotations(RotationHead):
 class GlobalRotations(RotationHead):
     """A head that makes each joint's rotation in the frame of the network's space.
 
-    No joint inherits its ancestors' errors, and the positions are linear in the rotations.
+    No joint inherits its ancestors' errors, and the positions are sums of turned bones.
     """
 
-    levers: Tensor
+    chains: Tensor
 
     def __init__(self, normalizer: Normalizer, width: int):
         super().__init__(normalizer, width)
-        self.register_buffer("levers", levers(normalizer.rest), persistent=False)
+        self.register_buffer("chains", chains(), persistent=False)
         with torch.no_grad():  # begin at the mean pose: from a turned one legs don't find home
             self.weight *= 0.3
             self.bias.copy_(mean_pose(normalizer))
@@ -96,10 +96,12 @@ class GlobalRotations(RotationHead):
         with in_float32(h.device):
             sixd = normalizer.rotations_out(made.to(sparse.dtype), normalizer.origin(sparse))
             rotations = sixd_to_matrix(sixd.unflatten(-1, (N_JOINTS, 6)))
-            local = rotations[..., list(PARENTS[1:]), :, :].transpose(-1, -2) @ rotations[..., 1:, :, :]
-            head = sparse[..., SPARSE_POSITION][..., :3]
-            positions = rotations.detach().flatten(-3) @ self.levers + torch.cat([head] * N_JOINTS, -1)
-            return torch.cat([sixd[..., :6], matrix_to_sixd(local).flatten(-2), positions], -1)
+            above = rotations[..., list(PARENTS[1:]), :, :]
+            local = above.transpose(-1, -2) @ rotations[..., 1:, :, :]
+            offsets = normalizer.rest[1:] - normalizer.rest[list(PARENTS[1:])]
+            bones = (above.detach() @ offsets[..., None])[..., 0]
+            positions = self.chains @ bones + sparse[..., SPARSE_POSITION][..., None, :3]
+            return torch.cat([sixd[..., :6], matrix_to_sixd(local).flatten(-2), positions.flatten(-2)], -1)
 
 
 def mean_pose(normalizer: Normalizer) -> Tensor:
@@ -109,20 +111,13 @@ def mean_pose(normalizer: Normalizer) -> Tensor:
     return matrix_to_sixd(forward_kinematics(local, mean[:3], normalizer.rest)[0]).flatten()
 
 
-def levers(rest: Tensor) -> Tensor:
-    """Return the map (198, 66) from global rotations to joints relative to the head.
-
-    Args:
-        rest: rest positions (22, 3), metres.
-    """
-    offsets = rest - rest[list(PARENTS)]
-    made = rest.new_zeros(N_JOINTS, 3, 3, N_JOINTS, 3)  # from a rotation's row and column to a joint's axis
+def chains() -> Tensor:
+    """Return the map (22, 21) from bones, of each joint but the root, to the joints seen from the head."""
+    made = torch.zeros(N_JOINTS, N_JOINTS - 1)
     for joint in range(1, N_JOINTS):
-        parent = PARENTS[joint]
-        made[..., joint, :] = made[..., parent, :]
-        made[parent, :, :, joint, :] += torch.einsum("rk,c->rck", torch.eye(3).to(rest), offsets[joint])
-    made = made - made[..., HEAD : HEAD + 1, :]
-    return made.reshape(9 * N_JOINTS, 3 * N_JOINTS)
+        made[joint] = made[PARENTS[joint]]
+        made[joint, joint - 1] = 1
+    return made - made[HEAD]
 
 
 OUTPUTS: dict[str, type[RotationHead]] = {"local": LocalRotations, "global": GlobalRotations}

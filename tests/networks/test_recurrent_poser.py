@@ -14,6 +14,7 @@ from memmlp.deploy.quantization import quantise
 from memmlp.evaluation import modes as evaluation
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.coordinates import Heading
+from memmlp.networks import checkpoint
 from memmlp.networks.cells import CELLS
 from memmlp.networks.recurrent_poser import OUTPUTS
 from memmlp.networks.streaming import streaming
@@ -59,6 +60,19 @@ def test_positions_are_forward_kinematics_of_the_rotations(output):
     motion = evaluation.stream(model, [CLIP])[0]
     expected = model.normalizer.pose(motion, CLIP[:, :SPARSE_DIM]).flatten(1)
     torch.testing.assert_close(motion[:, ROTATION.stop :], expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("output", OUTPUTS)
+@torch.no_grad()
+def test_a_network_that_is_loaded_makes_the_same_motion(output, tmp_path):
+    """It is built before its body is known, which comes with the weights."""
+    architecture = build_experiment(
+        composed(["model=recurrent_poser", "profile=tiny", f"model.output={output}"])
+    ).architecture
+    model = architecture.build(tiny.normalizer(Heading()), None).eval()
+    checkpoint.write(tmp_path / "weights", checkpoint.module_tensors("model", model), {})
+    found = evaluation.stream(architecture.load(tmp_path / "weights"), [CLIP])[0]
+    torch.testing.assert_close(found, evaluation.stream(model, [CLIP])[0], atol=1e-6, rtol=0)
 
 
 @torch.no_grad()
