@@ -140,7 +140,7 @@ def _search(parsed: dict[str, Any]) -> None:
     own = [word for word in words if word.lstrip("+~").startswith("search")]
     search = parse_search(composed_plain("tune", own)["search"])
     rest = [word for word in words if word not in own]
-    composes([*search.base, *rest, *search.overrides(next(iter(search.given()), {}))])
+    composes([*search.base, *rest, *search.overrides(next(iter(search.first_trials()), {}))])
 
 
 def _overrides(parsed: dict[str, Any]) -> None:

@@ -152,7 +152,7 @@ def _check_space(setup: Setup) -> str:
         counts = any(trained_with(one.key, config) for config in configs)  # some do at other values than 0
         if not isinstance(configs[0].get(one.key), Mapping) and not counts:
             raise InputError(f"search.space: {one.key}: changes no training; allowed are keys that do")
-    first = _tasks(setup, next(iter(setup.search.given()), {}))[0][-1]
+    first = _tasks(setup, next(iter(setup.search.first_trials()), {}))[0][-1]
     often = f"validated every {first.config['optim']['validate_every']} steps"  # when trials may be pruned
     return f"{first.id}, {often}, used with {inference(first.config)}"
 

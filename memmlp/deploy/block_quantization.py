@@ -23,28 +23,28 @@ from memmlp.deploy.quantization import inner_layers
 BLOCK = 32  # inputs of a product that share a scale; the least that all of ONNX Runtime's kernels know
 LEVELS, ZERO = 127, 128  # a weight w is stored as the byte 128 + 127 w / (largest of its block)
 DOMAIN = "com.microsoft"
-IN_INTEGERS = 4  # the operator's accuracy level at which it multiplies integers
+INTEGER_ACCURACY = 4  # the operator's accuracy level at which it multiplies integers
 
 
-def quantise_blocks(source: Path, path: Path, ends: Sequence[str]) -> None:
+def quantise_blocks(source: Path, path: Path, kept: Sequence[str]) -> None:
     """Write the block-quantised form of an exported stream.
 
     Args:
         source: the float32 ONNX file of a streaming graph.
         path: the file to write.
-        ends: names of the graph's modules that stay in float32.
+        kept: names of the graph's modules that stay in float32.
     """
     unfinished = temporary(path)
     try:
-        onnx.save(in_blocks(onnx.load(source), ends), unfinished)
+        onnx.save(in_blocks(onnx.load(source), kept), unfinished)
         publish(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
 
 
-def in_blocks(model: ModelProto, ends: Sequence[str]) -> ModelProto:
+def in_blocks(model: ModelProto, kept: Sequence[str]) -> ModelProto:
     """Return the graph with the weights of its inner layers in blocks; see `quantise_blocks`."""
-    inner, graph = set(inner_layers(model, ends)), model.graph
+    inner, graph = set(inner_layers(model, kept)), model.graph
     constants = Constants(graph)
     nodes = [_product(node, constants) if node.name in inner else node for node in graph.node]
     del graph.node[:]
@@ -74,7 +74,7 @@ def _product(node: NodeProto, constants: Constants) -> NodeProto:
         K=inputs,
         bits=8,
         block_size=BLOCK,
-        accuracy_level=IN_INTEGERS,
+        accuracy_level=INTEGER_ACCURACY,
     )
 
 

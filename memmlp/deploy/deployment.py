@@ -132,8 +132,8 @@ def lower(precision: str, source: Path, path: Path, network: StreamingGraph, tra
         train: training clips (N, 252), to calibrate int8.
     """
     if precision == "int8":
-        quantise(source, path, network.ends, train)
+        quantise(source, path, network.float32_modules, train)
     elif precision == "int8_blocks":
-        quantise_blocks(source, path, network.ends)
+        quantise_blocks(source, path, network.float32_modules)
     else:
-        halve(source, path, network.ends)
+        halve(source, path, network.float32_modules)

@@ -1,10 +1,10 @@
 """fp16 of an exported stream: the weights of its inner layers in sixteen bits, which halves the file.
 
 As under autocast, the products of these layers take and give sixteen bits, and everything between them stays
-float32: sums, normalisations, the modules at the network's ends (`StreamingGraph.ends`), inputs, outputs and
-states. A world position of 4 m has a resolution of 4 mm in sixteen bits, and a state that adds up small steps
-stops where they fall below its own. ONNX Runtime's converter is not used since it rounds every value between
-two nodes that are to stay float32.
+float32: sums, normalisations, the modules at the network's ends (`StreamingGraph.float32_modules`), inputs,
+outputs and states. A world position of 4 m has a resolution of 4 mm in sixteen bits, and a state that adds
+up small steps stops where they fall below its own. ONNX Runtime's converter is not used since it rounds every
+value between two nodes that are to stay float32.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from memmlp.deploy.quantization import inner_layers
 LARGEST = float(np.finfo(np.float16).max)
 
 
-def halve(source: Path, path: Path, ends: Sequence[str]) -> None:
+def halve(source: Path, path: Path, kept: Sequence[str]) -> None:
     """Write the fp16 form of an exported stream.
 
     Args:
         source: the float32 ONNX file of a streaming graph.
         path: the file to write.
-        ends: names of the graph's modules that stay in float32.
+        kept: names of the graph's modules that stay in float32.
 
     Raises:
         InputError: for a weight that sixteen bits cannot hold.
     """
     unfinished = temporary(path)
     try:
-        onnx.save(halved(onnx.load(source), ends), unfinished)
+        onnx.save(halved(onnx.load(source), kept), unfinished)
         publish(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
 
 
-def halved(model: ModelProto, ends: Sequence[str]) -> ModelProto:
+def halved(model: ModelProto, kept: Sequence[str]) -> ModelProto:
     """Return the graph with its inner layers' products in fp16; see `halve`."""
-    inner, graph = set(inner_layers(model, ends)), model.graph
+    inner, graph = set(inner_layers(model, kept)), model.graph
     constants, nodes, cast = Constants(graph), list[NodeProto](), dict[str, str]()
     for node in graph.node:
         if node.name not in inner:

@@ -2,8 +2,9 @@
 
 Weights get one scale for each output and seven bits: CPUs without VNNI add products of eight-bit numbers in
 sixteen bits, and overflow. Activations get eight bits and one scale, found by streaming training clips
-through the network. The modules at the network's ends stay in float32 (`StreamingGraph.ends`): the stem's
-input has outliers, and rounding in the heads would be seen as jitter.
+through the network. The modules at the network's ends stay in float32, as the graph says
+(`StreamingGraph.float32_modules`): the stem's input has outliers, and rounding in the heads would be seen as
+jitter.
 """
 
 from __future__ import annotations
@@ -48,13 +49,13 @@ def _samples(stream: OnnxStream, clips: Sequence[Tensor]) -> Iterator[dict[str, 
             stream.step(sparse)
 
 
-def quantise(source: Path, path: Path, ends: Sequence[str], clips: Sequence[Tensor]) -> None:
+def quantise(source: Path, path: Path, kept: Sequence[str], clips: Sequence[Tensor]) -> None:
     """Write the int8 form of an exported stream.
 
     Args:
         source: the float32 ONNX file of a streaming graph.
         path: the file to write.
-        ends: names of the graph's modules that stay in float32.
+        kept: names of the graph's modules that stay in float32.
         clips: training clips (N, 252), from which the activations' ranges are found.
     """
     unfinished, quiet = temporary(path), logging.getLogger()
@@ -66,7 +67,7 @@ def quantise(source: Path, path: Path, ends: Sequence[str], clips: Sequence[Tens
             unfinished,
             Calibration(source, clips),
             quant_format=QuantFormat.QDQ,
-            nodes_to_quantize=inner_layers(onnx.load(source), ends),
+            nodes_to_quantize=inner_layers(onnx.load(source), kept),
             op_types_to_quantize=["Gemm", "MatMul"],
             per_channel=True,
             reduce_range=True,  # seven bits
@@ -80,15 +81,15 @@ def quantise(source: Path, path: Path, ends: Sequence[str], clips: Sequence[Tens
         unfinished.unlink(missing_ok=True)
 
 
-def inner_layers(graph: onnx.ModelProto, ends: Sequence[str]) -> list[str]:
-    """Return the names of the nodes that multiply by a layer's weight, except those at the ends."""
+def inner_layers(graph: onnx.ModelProto, kept: Sequence[str]) -> list[str]:
+    """Return the names of the nodes that multiply by a layer's weight, except those of the kept modules."""
     weights = {tensor.name for tensor in graph.graph.initializer}
-    kept = tuple(f"model.{end}." for end in ends)
+    beginnings = tuple(f"model.{name}." for name in kept)
     return [
         node.name
         for node in graph.graph.node
         if node.op_type in ("Gemm", "MatMul")
         and node.input[1] in weights
         and node.input[1].startswith("model.")
-        and not node.input[1].startswith(kept)
+        and not node.input[1].startswith(beginnings)
     ]

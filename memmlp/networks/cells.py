@@ -68,7 +68,7 @@ def gru_step(weights: Sequence[Tensor], x: Tensor, state: Tensor) -> Tensor:
     return new + keep * (state - new)
 
 
-class GRU(Cell):
+class GRUCell(Cell):
     """A gated recurrent unit (Cho et al. 2014)."""
 
     def __init__(self, width: int):
@@ -86,7 +86,7 @@ class GRU(Cell):
         return state, state
 
 
-class LSTM(Cell):
+class LSTMCell(Cell):
     """A long short-term memory (Hochreiter & Schmidhuber 1997); its state: hidden, then cell."""
 
     carried = 2
@@ -183,5 +183,5 @@ class LRU(LinearCell):
         return keep, room * torch.sigmoid(enter) * new
 
 
-CELLS: dict[str, type[Cell]] = {"gru": GRU, "lstm": LSTM, "mingru": MinGRU, "lru": LRU}
+CELLS: dict[str, type[Cell]] = {"gru": GRUCell, "lstm": LSTMCell, "mingru": MinGRU, "lru": LRU}
 """The cells by the names that the config knows."""

@@ -67,7 +67,7 @@ class RotationHead(nn.Linear):
         raise NotImplementedError
 
 
-class LocalRotations(RotationHead):
+class LocalRotationHead(RotationHead):
     """A head that makes each joint's rotation in its parent's frame."""
 
     def posed(self, h: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
@@ -75,7 +75,7 @@ class LocalRotations(RotationHead):
         return normalizer.posed(self(h), sparse)
 
 
-class GlobalRotations(RotationHead):
+class GlobalRotationHead(RotationHead):
     """A head that makes each joint's rotation in the frame of the network's space.
 
     No joint inherits its ancestors' errors, and the positions are sums of turned bones.
@@ -120,7 +120,7 @@ def chains() -> Tensor:
     return made - made[HEAD]
 
 
-OUTPUTS: dict[str, type[RotationHead]] = {"local": LocalRotations, "global": GlobalRotations}
+OUTPUTS: dict[str, type[RotationHead]] = {"local": LocalRotationHead, "global": GlobalRotationHead}
 """The heads by the names that the config knows."""
 
 

@@ -18,7 +18,7 @@ ONNX_FILES = {
     "fp16": "step.fp16.onnx",
 }
 """The name of the ONNX file of each precision (`export.precision`)."""
-IN_INTEGERS = ("int8", "int8_blocks")
+INT8_PRECISIONS = ("int8", "int8_blocks")
 """The precisions that are used live where they are accurate enough, for they are quicker than float32."""
 
 LATENCY = "latency.json"
@@ -81,10 +81,10 @@ class DeploymentFolder:
         return dict(self.record.get("settings", {}))
 
     @property
-    def integers(self) -> Path | None:
+    def accurate_int8(self) -> Path | None:
         """The ONNX file in integers, where there is one that is accurate enough for float32's place."""
         record = self.record
-        accurate = [name for name in IN_INTEGERS if record.get(name, {}).get("default")]
+        accurate = [name for name in INT8_PRECISIONS if record.get(name, {}).get("default")]
         return next((self.file(name) for name in accurate if self.file(name).exists()), None)
 
 

@@ -114,7 +114,7 @@ class Run:
         """Return the preferred deployment, given the run's config as it was read already."""
         made = [DeploymentFolder(path.parent) for path in self.deployments.glob("*/latency.json")]
         own = [one for one in made if one.done and used_as_configured(one.settings, config)]
-        best = max(own, key=lambda one: (one.current, bool(one.integers), one.made), default=None)
+        best = max(own, key=lambda one: (one.current, bool(one.accurate_int8), one.made), default=None)
         return best or DeploymentFolder(self.deployments / "none")
 
     @property
@@ -128,7 +128,7 @@ class Run:
         if self.done and not self.deployments.is_dir():
             make = f"memmlp eval {self.folder} export.graph=auto"
             raise InputError(f"{self.folder}: has no step.onnx; make one with {make}")
-        return deployment.integers or deployment.onnx
+        return deployment.accurate_int8 or deployment.onnx
 
     @property
     def onnx(self) -> Path:

@@ -113,7 +113,7 @@ class Search:
     prune_after: int
     storage: str | None
 
-    def given(self) -> list[dict[str, Value]]:
+    def first_trials(self) -> list[dict[str, Value]]:
         """Return the values by key that the first trials are given; the sampler chooses the others.
 
         They are those of `first`, or of a grid all combinations, in order.

@@ -63,7 +63,7 @@ class Study:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", ExperimentalWarning)
                 study.set_metric_names([objective.text for objective in search.objectives])
-        for values in search.given():
+        for values in search.first_trials():
             study.enqueue_trial(values, skip_if_exists=True)
         return cls(search, study)
 

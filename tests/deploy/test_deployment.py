@@ -34,7 +34,7 @@ CLIPS = [tiny.clip(60, seed=seed) for seed in range(3)]
 def pair(step_files, tmp_path_factory) -> tuple[Path, Path]:
     """The first tiny network's stream in float32 and in int8."""
     exact, quantised = step_files("mem_mlp"), tmp_path_factory.mktemp("pair") / "int8.onnx"
-    quantise(exact, quantised, streaming(exported.NETWORKS["mem_mlp"]()).ends, CLIPS)
+    quantise(exact, quantised, streaming(exported.NETWORKS["mem_mlp"]()).float32_modules, CLIPS)
     return exact, quantised
 
 
@@ -62,7 +62,7 @@ def weights(graph: onnx.ModelProto) -> dict[str, int]:
 @pytest.mark.parametrize("network", ["mem_mlp", *tiny.BASELINES])
 def test_inner_layers_are_int8_and_the_ends_are_not(step_files, tmp_path, network):
     quantised, stream = tmp_path / "int8.onnx", streaming(exported.NETWORKS[network]())
-    quantise(step_files(network), quantised, stream.ends, CLIPS)
+    quantise(step_files(network), quantised, stream.float32_modules, CLIPS)
     kinds = weights(onnx.load(quantised))
     inner = [kind for name, kind in kinds.items() if ".blocks." in name or ".layers." in name]
     assert inner
@@ -162,4 +162,4 @@ def test_a_deployment_in_fp16_and_an_older_opset(tmp_path):
     place.finish({"run": "0" * 16, "settings": {}, **record})
     assert 0 < record["alone_median_ms"] <= record["alone_p95_ms"]
     assert set(place.record["artifacts"]) == {"step.onnx", "step.fp16.onnx"}
-    assert place.integers is None
+    assert place.accurate_int8 is None

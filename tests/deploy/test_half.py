@@ -27,7 +27,7 @@ CLIP = tiny.clip(40)
 @pytest.mark.parametrize("network", ["mem_mlp", "refined", "avatar_poser", "hmd_poser"])
 def test_the_products_of_inner_layers_are_fp16(step_files, tmp_path: Path, network: str):
     source, path = step_files(network), tmp_path / "half.onnx"
-    ends = streaming(exported.NETWORKS[network]()).ends
+    ends = streaming(exported.NETWORKS[network]()).float32_modules
     halve(source, path, ends)
     made, inner = onnx.load(path), set(inner_layers(onnx.load(source), ends))
     onnx.checker.check_model(made, full_check=True)
@@ -46,7 +46,7 @@ def test_states_stay_float32(tmp_path: Path):
     """What a recurrent cell adds up is below the resolution of sixteen bits."""
     graph = streaming(tiny.recurrent_poser(cell="lru"))
     export(graph, tmp_path / "step.onnx", "0" * 16)
-    halve(tmp_path / "step.onnx", tmp_path / "half.onnx", graph.ends)
+    halve(tmp_path / "step.onnx", tmp_path / "half.onnx", graph.float32_modules)
     made = onnx.shape_inference.infer_shapes(onnx.load(tmp_path / "half.onnx")).graph
     types = {value.name: value.type.tensor_type.elem_type for value in made.value_info}
     types |= {tensor.name: tensor.data_type for tensor in made.initializer}
@@ -56,7 +56,7 @@ def test_states_stay_float32(tmp_path: Path):
 
 
 def test_weights_that_do_not_fit_are_refused(step_files):
-    model, ends = onnx.load(step_files("mem_mlp")), streaming(exported.NETWORKS["mem_mlp"]()).ends
+    model, ends = onnx.load(step_files("mem_mlp")), streaming(exported.NETWORKS["mem_mlp"]()).float32_modules
     (weight,) = (t for t in model.graph.initializer if t.name == "model.blocks.0.linear.weight")
     values = numpy_helper.to_array(weight).copy()
     values[0, 0] = 1e5

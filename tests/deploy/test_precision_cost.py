@@ -23,7 +23,7 @@ CLIPS = [tiny.clip(60, seed=seed) for seed in range(3)]
 def pair(step_files, tmp_path_factory) -> tuple[Path, Path]:
     """The first tiny network's stream in float32 and in fp16."""
     exact, half = step_files("mem_mlp"), tmp_path_factory.mktemp("pair") / "half.onnx"
-    halve(exact, half, streaming(exported.NETWORKS["mem_mlp"]()).ends)
+    halve(exact, half, streaming(exported.NETWORKS["mem_mlp"]()).float32_modules)
     return exact, half
 
 

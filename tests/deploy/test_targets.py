@@ -140,7 +140,7 @@ def test_a_step_of_opset_15_is_within_what_engines_publish(step_files, network: 
 
 @pytest.mark.slow
 def test_int8_is_outside_of_what_unity_publishes(step_files, tmp_path: Path):
-    ends = streaming(exported.NETWORKS["mem_mlp"]()).ends
+    ends = streaming(exported.NETWORKS["mem_mlp"]()).float32_modules
     quantise(step_files("mem_mlp"), tmp_path / "int8.onnx", ends, [tiny.clip(60)])
     model = load_graph(tmp_path / "int8.onnx")
     lacking = {finding.what.split()[0] for finding in findings(model, published("unity"))}

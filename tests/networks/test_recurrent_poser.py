@@ -146,7 +146,7 @@ def test_the_file_is_the_network_and_its_cells_become_int8(tmp_path):
     stream = streaming(model)
     export(stream, exact, "0" * 16)
     assert parity(model, exact, CLIP) <= TOLERANCE
-    quantise(exact, int8, stream.ends, [CLIP])
+    quantise(exact, int8, stream.float32_modules, [CLIP])
     graph = onnx.load(int8).graph
     types = {tensor.name: tensor.data_type for tensor in graph.initializer}
     given = {node.output[0]: node.input[0] for node in graph.node if node.op_type == "DequantizeLinear"}

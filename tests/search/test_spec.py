@@ -41,7 +41,7 @@ def test_a_tree_of_keys_becomes_ranges():
         Range("loss.hand", 0.1, 1.0),
         Range("hand", choices=("off", "fk"), first="fk"),
     )
-    assert found.given() == [{"hand": "fk"}]
+    assert found.first_trials() == [{"hand": "fk"}]
     assert found.space[1].corners() == ("off", "fk")
 
 

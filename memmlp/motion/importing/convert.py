@@ -61,7 +61,7 @@ def convert(
         floor: `auto`, found from the feet; `none`, left as it is; or its height in the file, metres.
 
     Raises:
-        InputError: as `retarget.fit` and `recording.perform` do.
+        InputError: as `recording.pick_joints` and `retarget.fit` do.
     """
     settled = settle(recording, skeleton)
     performance = pick_joints(recording, settled)

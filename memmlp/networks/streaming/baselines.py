@@ -32,7 +32,7 @@ from memmlp.networks.window_model import WindowModel
 class AvatarPoserStream(StreamingGraph):
     """AvatarPoser's streaming graph."""
 
-    ends: tuple[str, ...] = ("model.embedding", "model.orientation", "model.rotation")
+    float32_modules: tuple[str, ...] = ("model.embedding", "model.orientation", "model.rotation")
     model: AvatarPoser
     layers: list[EncoderLayer]
 
@@ -72,7 +72,7 @@ class AvatarPoserStream(StreamingGraph):
 class ManikinSStream(AvatarPoserStream):
     """MANIKIN-S' streaming graph: AvatarPoser's, and the limbs of the newest frame."""
 
-    ends = (*AvatarPoserStream.ends, "model.swivel", "model.places")
+    float32_modules = (*AvatarPoserStream.float32_modules, "model.swivel", "model.places")
     model: ManikinS
 
     def rotation(self, newest: Tensor, encoded: Tensor) -> Tensor:
@@ -98,7 +98,7 @@ class EgoPoserStream(StreamingGraph):
     movement since the window's first frame is linear, so the first frame's share of it is taken off the sum.
     """
 
-    ends = ("model.embedding", "model.orientation", "model.rotation")
+    float32_modules = ("model.embedding", "model.orientation", "model.rotation")
     model: EgoPoser
 
     def build(self, model: WindowModel) -> None:
@@ -129,7 +129,7 @@ class EgoPoserStream(StreamingGraph):
 class AGRoLStream(StreamingGraph):
     """The base of the streaming graphs of AGRoL's networks; it carries the stem's outputs."""
 
-    ends: tuple[str, ...] = ("model.stem", "model.head")
+    float32_modules: tuple[str, ...] = ("model.stem", "model.head")
     width: int
 
     def windows(self) -> State:
@@ -239,7 +239,7 @@ class FrameStream(StreamingGraph):
 class HMDPoserStream(FrameStream):
     """HMD-Poser's streaming graph."""
 
-    ends = ("model.trackers", "model.hands", "model.others", "model.pose")
+    float32_modules = ("model.trackers", "model.hands", "model.others", "model.pose")
     model: HMDPoser
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
@@ -251,7 +251,7 @@ class HMDPoserStream(FrameStream):
 class VAEHMDStream(FrameStream):
     """VAE-HMD's streaming graph."""
 
-    ends = ("model.encoder.stem", "model.decoder.head")
+    float32_modules = ("model.encoder.stem", "model.decoder.head")
     model: VAEHMD
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
@@ -263,7 +263,7 @@ class VAEHMDStream(FrameStream):
 class RPMStream(FrameStream):
     """RPM's streaming graph."""
 
-    ends = ("model.motion", "model.sparse", "model.head")
+    float32_modules = ("model.motion", "model.sparse", "model.head")
     model: RPM
 
 
@@ -274,7 +274,7 @@ class AvatarJLMStream(StreamingGraph):
     one, over time, for the newest frame alone.
     """
 
-    ends = ("model.embedding", "model.coarse", "model.regressor")
+    float32_modules = ("model.embedding", "model.coarse", "model.regressor")
     model: AvatarJLM
     layers: list[EncoderLayer]
 

@@ -23,7 +23,7 @@ class BoDiffusionStream(AGRoLStream):
     frame alone is made.
     """
 
-    ends = ("sparse", "motion", "made")
+    float32_modules = ("sparse", "motion", "made")
     model: BoDiffusion
     blocks: list[DiTBlock]
     modulations: Tensor

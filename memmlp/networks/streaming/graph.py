@@ -48,11 +48,12 @@ class StreamingGraph(nn.Module):
         model: the trained network; the graph is made from a copy.
 
     Attributes:
-        ends: names of the modules at the network's two ends: from the inputs to the hidden state, and from it
-            to the motion. They stay in float32 when the graph is quantised.
+        float32_modules: names of the modules that stay in float32 when the graph is quantised: those at the
+            network's two ends, from the inputs to the hidden state and from it to the motion, and others
+            whose rounding would be seen.
     """
 
-    ends: tuple[str, ...]
+    float32_modules: tuple[str, ...]
 
     def __init__(self, model: WindowModel):
         super().__init__()

@@ -16,7 +16,7 @@ from memmlp.networks.memory import State
 from memmlp.networks.predictor import Branch
 from memmlp.networks.streaming.blocks import Converter
 from memmlp.networks.streaming.graph import StreamingGraph, filled, slid
-from memmlp.networks.streaming.live_normalizer import LiveNormalizer
+from memmlp.networks.streaming.one_frame_normalizer import OneFrameNormalizer
 from memmlp.networks.streaming.recall import recall
 from memmlp.networks.window_model import WindowModel
 
@@ -24,8 +24,8 @@ from memmlp.networks.window_model import WindowModel
 class MemMLPStream(StreamingGraph):
     """Mem-MLP's streaming graph."""
 
-    ends = (
-        "live",
+    float32_modules = (
+        "conversions",
         "stem",
         "recall.memory.recurrences",
         "predictor.rotation.linear",
@@ -40,7 +40,7 @@ class MemMLPStream(StreamingGraph):
     def build(self, model: WindowModel) -> None:
         """Make the graph's parts from a copy of the network."""
         assert isinstance(model, MemMLP)
-        self.live = LiveNormalizer(model.normalizer)
+        self.conversions = OneFrameNormalizer(model.normalizer)
         self.stem = model.stem
         converter = Converter()
         self.blocks = nn.ModuleList(converter.block(block) for block in model.blocks)
@@ -64,7 +64,7 @@ class MemMLPStream(StreamingGraph):
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""
         memory = self.recall.memory
         origin = self.normalizer.origin(sparse)
-        encoded = self.live.encode_sparse(sparse, origin)
+        encoded = self.conversions.encode_sparse(sparse, origin)
         queue = torch.cat([filled(state["sparse"], encoded, fresh), encoded[None]], 1)
         past = memory.recall(queue, state, 1)
         stem = self.stem(encoded)
@@ -76,4 +76,4 @@ class MemMLPStream(StreamingGraph):
             h = block(h, shares)
         motion = self.predictor(h, shares, sparse, self.normalizer, 1)
         kept |= memory.remember(motion[None], past, state, 1) | {"sparse": queue[:, 1:]}
-        return self.live.decode_motion(motion, origin), kept
+        return self.conversions.decode_motion(motion, origin), kept

@@ -7,7 +7,7 @@ from torch import Tensor
 from memmlp.networks.memory import State
 from memmlp.networks.recurrent_poser import RecurrentPoser
 from memmlp.networks.streaming.baselines import FrameStream
-from memmlp.networks.streaming.live_normalizer import LiveNormalizer
+from memmlp.networks.streaming.one_frame_normalizer import OneFrameNormalizer
 from memmlp.networks.window_model import WindowModel
 
 
@@ -24,9 +24,9 @@ class RecurrentPoserStream(FrameStream):
         """Make the graph's parts from a copy of the network."""
         assert isinstance(model, RecurrentPoser)
         self.model = model
-        self.model.normalizer = LiveNormalizer(model.normalizer)
+        self.model.normalizer = OneFrameNormalizer(model.normalizer)
         mlps = (f"model.blocks.{name}.mlp" for name in model.blocks)
-        self.ends = ("model.normalizer", "model.stem", *mlps, "model.head")
+        self.float32_modules = ("model.normalizer", "model.stem", *mlps, "model.head")
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""

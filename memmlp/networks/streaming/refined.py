@@ -24,7 +24,11 @@ class RefinedStream(StreamingGraph):
     def __init__(self, model: Refined, graph: StreamingGraph):
         super().__init__(model)
         self.graph = graph
-        self.ends = (*(f"graph.{name}" for name in graph.ends), "model.layers", "model.head")
+        self.float32_modules = (
+            *(f"graph.{name}" for name in graph.float32_modules),
+            "model.layers",
+            "model.head",
+        )
 
     def build(self, model: WindowModel) -> None:
         """Keep a copy of the refiner; of the network the graph has one."""

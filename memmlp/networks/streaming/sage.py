@@ -26,7 +26,7 @@ class SAGENetStream(StreamingGraph):
     The decoder makes the newest frame alone.
     """
 
-    ends: tuple[str, ...] = ("sparse", "decoder.heads")
+    float32_modules: tuple[str, ...] = ("sparse", "decoder.heads")
     places: Tensor
 
     def build(self, model: WindowModel) -> None:

@@ -15,7 +15,7 @@ from memmlp.motion.normalizer import Normalizer
 Way = Callable[[Tensor, Tensor], Tensor]
 
 
-class LiveNormalizer(Normalizer):
+class OneFrameNormalizer(Normalizer):
     """A normalizer of single frames, whose conversions are matrices.
 
     For a given turn of the coordinates the conversions are linear, and their matrices are linear in the
