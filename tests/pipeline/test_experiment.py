@@ -38,7 +38,7 @@ CHANGES: dict[str, str] = {
     "seed": "1", "device": "cpu", "threads": "2", "force": "true", "save_predictions": "elsewhere",
     "data.name": "other", "data.min_frames": "43", "data.strict": "true", "data.weighting": "clips",
     "data.mirror": "true", "data.split.test": "0.3", "data.split.val": "0.3",
-    "data.split.train_fraction": "0.5",
+    "data.split.train_fraction": "0.5", "data.split.per_group": "1",
     "data.split.seed": "1", "data.split.groups": "['[a-d]1']", "data.split.groups_file": "groups.csv",
     "frame.coordinates": "world", "frame.normalize": "false",
     "model.frames": "6", "model.width": "12", "model.depth": "3",

@@ -37,6 +37,7 @@ class SeededSplitConfig:
     groups: list[str] = key(EachOf(empty=True))
     groups_file: Optional[str] = optional(Existing("file"))
     train_fraction: float = standing(1.0, Within(0, 1))
+    per_group: Optional[int] = optional(Within(1))
 
 
 @dataclass

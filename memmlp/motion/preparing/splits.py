@@ -109,6 +109,8 @@ class SeededSplit(_Grouped):
         groups: patterns of clips that stay together.
         groups_file: column file that says which clips stay together; None for none.
         train_fraction: fraction of the groups left to train that are used; the others are left out.
+        per_group: the most clips of a group in test, and in validation; the others are left out. None for
+            all. Repetitions of one motion tell little more than one of them.
     """
 
     test: float = 0.1
@@ -117,6 +119,7 @@ class SeededSplit(_Grouped):
     groups: Sequence[str] = ()
     groups_file: Path | str | None = field(default=None, repr=False)
     train_fraction: float = 1.0
+    per_group: int | None = None
 
     def __post_init__(self) -> None:
         _check_fractions(self.train_fraction, test=self.test, val=self.val)
@@ -124,6 +127,11 @@ class SeededSplit(_Grouped):
     def assign(self, names: Sequence[str]) -> Assignment:
         seen = {name: name for name in names}
         parts = _divide(seen, {"test": self.test, "val": self.val}, self)
+        if self.per_group:
+            for group in self.grouping.tied(seen):
+                held_out = [name for name in group if parts[name] in ("test", "val")]
+                held_out.sort(key=lambda name: _rank(name, self.seed))
+                parts.update(dict.fromkeys(held_out[self.per_group :], None))
         return Assignment(parts, self.grouping.names(seen))
 
     def missing(self, names: Collection[str]) -> tuple[str, ...]:
@@ -134,7 +142,8 @@ class SeededSplit(_Grouped):
         return {}
 
     def describe(self) -> dict[str, Any]:
-        return {"kind": "seeded", "test": self.test, **_carving(self)}
+        most = {"per_group": self.per_group} if self.per_group else {}
+        return {"kind": "seeded", "test": self.test, **_carving(self), **most}
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,7 @@
 """Splits: seeded, by group, by published lists, by subset."""
 
+from collections import Counter
+
 import pytest
 
 from memmlp.common.errors import InputError
@@ -49,6 +51,26 @@ def test_a_fraction_of_the_training_groups():
     groups = {(int(name[-2:]) - 1) % 15 if "salsa" in name else name for name in used}
     assert len(groups) == round(0.25 * 15)
     assert part(SeededSplit(0.2, 0.2, 1, train_fraction=1e-9).assign(NAMES).parts, "train")
+
+
+def test_no_more_than_some_clips_of_a_group_are_held_out():
+    """Nothing else changes, fewer are part of more, and clips that nothing ties are groups of one."""
+    whole = SeededSplit(0.3, 0.3, 1, TWINS).assign(NAMES)
+    before = whole.parts
+    for most in (2, 1):
+        found = SeededSplit(0.3, 0.3, 1, TWINS, per_group=most).assign(NAMES)
+        assert found.groups == whole.groups
+        assert part(found.parts, "train") == part(whole.parts, "train")
+        for name in ("val", "test"):
+            held_out = part(found.parts, name)
+            assert held_out <= part(before, name)
+            assert max(Counter(found.groups[clip] for clip in held_out).values()) == most
+            assert {found.groups[clip] for clip in held_out} == {
+                whole.groups[clip] for clip in part(whole.parts, name)
+            }
+        before = found.parts
+    assert "per_group" not in SeededSplit().describe()
+    assert SeededSplit(per_group=2).describe()["per_group"] == 2
 
 
 def test_a_fraction_says_so_of_itself():
