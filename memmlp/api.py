@@ -381,7 +381,7 @@ def _numbers(errors: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _frame(rows: Iterable[dict[str, Any]]) -> pd.DataFrame:
-    """Rows as a frame with the units of its metrics. Raises InputError where pandas is not installed."""
+    """Make a pandas DataFrame of rows, with its metrics' units. Raises InputError without pandas."""
     try:
         import pandas as pd
     except ImportError:

@@ -27,7 +27,7 @@ class Form(NamedTuple):
         precision: "fp32", "fp16", "int8" or "int8_blocks".
         opset: the file's ONNX opset.
         full: the frame of reference and the format of the joints' rotations, for a file that covers the whole
-            way from trackers to joints; None for the network alone.
+            way from trackers to joints; None for the network's step.
     """
 
     graph: str
@@ -73,7 +73,7 @@ class Form(NamedTuple):
     default="network",
     show_default=True,
     type=click.Choice(["network", "full"]),
-    help="What the file computes: the network alone, from its 54 inputs, or all of the way from the "
+    help="What the file computes: the network's step, from its 54 inputs, or all of the way from the "
     "trackers' poses to the joints.",
 )
 @click.option(

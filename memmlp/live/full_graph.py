@@ -90,7 +90,7 @@ class FullStep(nn.Module):
     Args:
         model: the network, as it was trained or as its streaming graph.
         space: the frame of reference of what goes in and comes out.
-        rotated: makes what comes out of rotation matrices; one of FORMATS.
+        rotated: converts the rotation matrices to the format that comes out; one of FORMATS.
     """
 
     world: Tensor

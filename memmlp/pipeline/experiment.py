@@ -21,7 +21,7 @@ from memmlp.training.refiner import RefinerTraining
 
 
 class UpstreamTraining(Protocol):
-    """How a run is trained that others build upon, such as a VQ-VAE's; its result is a file of weights."""
+    """How to train a run whose weights a later training starts from, such as a VQ-VAE's."""
 
     @property
     def kind(self) -> str:

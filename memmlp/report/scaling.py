@@ -40,7 +40,7 @@ def picture_name(found: Trends) -> str:
 
 
 def amount(name: str, value: float) -> str:
-    """Return a value of what effects are shown against in words."""
+    """Return a value on the axis of effects against scale as text, FLOPs with their unit."""
     return f"{power(value)} FLOP" if name == COMPUTE else f"{value:g}"
 
 

@@ -124,9 +124,9 @@ class Rounds:
         }
 
     def counts(self, sweep: Sweep) -> dict[str, int]:
-        """Return how many seeds each arm has spent or needs for a next look.
+        """Return how many seeds each arm is to be trained with.
 
-        The look may be its own or that of an arm that it is the control of.
+        They are the most that a look asks for, taken or next: its own, or that of an arm compared with it.
         """
         ahead = self.next_looks(sweep)
         found = {arm.label: self.looks[0] for arm in sweep.runnable()}

@@ -46,7 +46,7 @@ class Tracker(Protocol):
         """Return whether the tracker shows a run of that id."""
 
     def begin(self, facts: Facts, points: Sequence[Point]) -> Shown:
-        """Show a run: afterwards there is exactly this of it, whatever was there of it before."""
+        """Show a run with these facts and points alone, in place of whatever the tracker had of it."""
 
     def sweep(self, facts: SweepFacts) -> None:
         """Show a sweep as the parent of its runs; a second call changes nothing."""

@@ -105,7 +105,7 @@ class Hub:
                 self.watchers.discard(watcher)
 
     def close(self) -> None:
-        """Send everybody away."""
+        """End every watcher's stream, and accept no more."""
         with self.lock:
             self.closed = True
             for watcher in self.watchers:

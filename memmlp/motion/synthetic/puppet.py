@@ -216,9 +216,10 @@ def _near(flags: Array, frames: int) -> Array:
 
 
 def _within(span: Array, full: float, free: Array | float) -> Array:
-    """Return the distance (N, 1) itself up to about STRETCH of the full length, then at most 99.9 % of it.
+    """Limit a limb's reach (N, 1) so that the limb never quite straightens.
 
-    The transition is smooth, and begins earlier the larger `free` is.
+    Up to about STRETCH of the full length the reach stays as it is; beyond, it comes smoothly near 99.9 % of
+    it. The limit begins earlier the larger `free` is.
     """
     start = (STRETCH - 0.05 * np.reshape(free, (-1, 1))) * full
     room = 0.999 * full - start

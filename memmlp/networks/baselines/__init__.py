@@ -1,1 +1,1 @@
-"""The networks that the paper compares Mem-MLP with: AGRoL and AvatarPoser."""
+"""The baselines: networks that the paper compares Mem-MLP with, made from their papers."""

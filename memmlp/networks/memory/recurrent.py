@@ -60,8 +60,8 @@ class Recurrence(nn.Module):
 def lstm_flops(x: Sequence[int], to_gates: Sequence[int], again: Sequence[int], *shapes, **rest) -> int:
     """Count the FLOPs of a CPU's LSTM, an operation that torch's counter does not know.
 
-    The arguments are the shapes of the operation's: the inputs are (n, B, inputs), the weights (4 k, inputs)
-    and (4 k, k).
+    The arguments are the shapes of what the operation takes: the inputs (n, B, inputs), and the weights of
+    the inputs (4 k, inputs) and of the hidden state (4 k, k).
     """
     return 2 * x[0] * x[1] * (to_gates[0] * to_gates[1] + again[0] * again[1])
 

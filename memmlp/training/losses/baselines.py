@@ -1,4 +1,4 @@
-"""The losses of AGRoL and AvatarPoser, which their authors train them with, and none but a network's own."""
+"""The losses of AGRoL and AvatarPoser, as published, and OwnLoss, a network's own losses alone."""
 
 from __future__ import annotations
 
