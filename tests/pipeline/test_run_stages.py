@@ -153,7 +153,7 @@ def test_the_live_stream_of_a_run(home, memmlp, monkeypatch):
     assert "all finite: yes" in out
     first, last = re.search(r"MPJPE (\S+) cm in the first tenth, (\S+) cm in the last", out).groups()
     assert float(last) == pytest.approx(float(first), rel=0.05)
-    assert "ratio" in memmlp("bench", "avatar", "--run", run.id, "--frames", "5", "--rounds", "1").out
+    assert "ratio" in memmlp("bench", "live-frame", "--run", run.id, "--frames", "5", "--rounds", "1").out
     assert one_line(memmlp("bench", "soak"), "neither RUN nor --onnx")
 
 

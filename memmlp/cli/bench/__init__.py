@@ -6,7 +6,7 @@ import click
 
 from memmlp.cli.bench.chaos import chaos, chaos_tune
 from memmlp.cli.bench.latency import latency
-from memmlp.cli.bench.live_frame import avatar
+from memmlp.cli.bench.live_frame import live_frame
 from memmlp.cli.bench.prepare_data import prepare
 from memmlp.cli.bench.soak import soak
 from memmlp.cli.bench.stream_evaluation import stream
@@ -22,6 +22,6 @@ def bench() -> None:
 
 
 for command in (
-    prepare, stream, train, latency, avatar, soak, tracking, chaos, chaos_tune, calibration, ui,
+    prepare, stream, train, latency, live_frame, soak, tracking, chaos, chaos_tune, calibration, ui,
 ):  # fmt: skip
     bench.add_command(command)

@@ -1,4 +1,4 @@
-"""`memmlp bench avatar`: the time of a live frame, from trackers to the avatar's pose."""
+"""`memmlp bench live-frame`: the time of a live frame, from trackers to the avatar's pose."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from memmlp.live.stream import RotationFormat
 
 
-@click.command("avatar")
+@click.command("live-frame")
 @click.option("--run", help="Finished run to time.  [default: a network with random weights]")
 @click.option("--onnx", type=click.Path(path_type=Path), help="ONNX file to time, in place of a run.")
 @click.option("--frames", default=300, show_default=True, help="How many frames a round has.")
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 )
 @outputs_option
 @click.argument("overrides", nargs=-1)
-def avatar(
+def live_frame(
     run: str | None,
     onnx: Path | None,
     frames: int,
