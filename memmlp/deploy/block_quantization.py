@@ -16,7 +16,7 @@ import numpy as np
 import onnx
 from onnx import ModelProto, NodeProto, helper
 
-from memmlp.common.fences import publish, temporary
+from memmlp.common.files import atomic_write
 from memmlp.deploy.graph_constants import Constants
 from memmlp.deploy.quantization import inner_layers
 
@@ -34,12 +34,7 @@ def quantise_blocks(source: Path, path: Path, kept: Sequence[str]) -> None:
         path: the file to write.
         kept: names of the graph's modules that stay in float32.
     """
-    unfinished = temporary(path)
-    try:
-        onnx.save(in_blocks(onnx.load(source), kept), unfinished)
-        publish(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    atomic_write(path, in_blocks(onnx.load(source), kept).SerializeToString())
 
 
 def in_blocks(model: ModelProto, kept: Sequence[str]) -> ModelProto:

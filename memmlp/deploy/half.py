@@ -17,7 +17,7 @@ import onnx
 from onnx import ModelProto, NodeProto, TensorProto, helper
 
 from memmlp.common.errors import InputError
-from memmlp.common.fences import publish, temporary
+from memmlp.common.files import atomic_write
 from memmlp.deploy.graph_constants import Constants
 from memmlp.deploy.quantization import inner_layers
 
@@ -35,12 +35,7 @@ def halve(source: Path, path: Path, kept: Sequence[str]) -> None:
     Raises:
         InputError: for a weight that sixteen bits cannot hold.
     """
-    unfinished = temporary(path)
-    try:
-        onnx.save(halved(onnx.load(source), kept), unfinished)
-        publish(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    atomic_write(path, halved(onnx.load(source), kept).SerializeToString())
 
 
 def halved(model: ModelProto, kept: Sequence[str]) -> ModelProto:
