@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from memmlp.evaluation.ik import LBFGS
     from memmlp.live.spaces import SpaceName
     from memmlp.live.stream import RotationFormat
-    from memmlp.networks.window_model import WindowModel
+    from memmlp.networks.motion_model import MotionModel
     from memmlp.render.take import Take
 
 StrPath = str | os.PathLike[str]
@@ -168,7 +168,7 @@ class TrainedRun(os.PathLike[str]):
         return list(self._opened.test.names)
 
     @cached_property
-    def model(self) -> WindowModel:
+    def model(self) -> MotionModel:
         """The trained network, a torch module in evaluation mode on the processor.
 
         Raises InputError where it has code of a package that is not here, or that nobody named.

@@ -11,14 +11,14 @@ import tiny
 
 from memmlp.motion.coordinates import Heading
 from memmlp.networks.memory import CodeMemory, LSTMMemory, NoMemory
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.predictor import RotationOnly
-from memmlp.networks.window_model import WindowModel
 
 if TYPE_CHECKING:
     from onnx import GraphProto
 
 LARGEST = ("manikin_s", "manikin_l", "hmd_poser", "avatar_jlm")
-NETWORKS: dict[str, Callable[[], WindowModel]] = {
+NETWORKS: dict[str, Callable[[], MotionModel]] = {
     "mem_mlp": partial(tiny.model, CodeMemory, coordinates=Heading()),
     "lstm": partial(tiny.model, LSTMMemory, coordinates=Heading()),
     "no_memory": partial(tiny.model, NoMemory),

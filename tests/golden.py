@@ -36,8 +36,8 @@ from memmlp.networks.memory import (
     NoCodesMemory,
     NoMemory,
 )
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
-from memmlp.networks.window_model import WindowModel
 from memmlp.runs.recipe_numbers import RECIPES
 from memmlp.training.loop import seed_step
 from memmlp.training.losses import (
@@ -82,7 +82,7 @@ def coordinates(kind: type[World]) -> Numbers:
     return summary("encoded", encoded) | summary("decoded", normalizer.decode_motion(motion, origin))
 
 
-def network(model: WindowModel) -> Numbers:
+def network(model: MotionModel) -> Numbers:
     """A training call with its gradients, then two windows and three frames as live."""
     clip = torch.stack([tiny.clip(80, seed) for seed in range(2)])
     torch.manual_seed(7)
@@ -98,7 +98,7 @@ def network(model: WindowModel) -> Numbers:
 
 
 @torch.no_grad()
-def _used(model: WindowModel, clip: Tensor) -> Numbers:
+def _used(model: MotionModel, clip: Tensor) -> Numbers:
     state, size, found = model.initial_state(2), model.frames, {}
     for start, stop in ((0, size), (size, 2 * size), *((2 * size + i, 2 * size + i + 1) for i in range(3))):
         motion, state = model.advance(clip[:, start:stop, :SPARSE_DIM], state)

@@ -14,9 +14,9 @@ from memmlp.motion.coordinates import World
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import State
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.refiner import SAGERefiner
 from memmlp.networks.vqvae import VQVAE
-from memmlp.networks.window_model import WindowModel
 from memmlp.training.loop import seed_step, train_step
 from memmlp.training.losses import Fixed, Loss, Terms
 from memmlp.training.network import MotionTask
@@ -55,7 +55,7 @@ def _trained(task: VQVAETask | MotionTask | RefinerTask | PartTask, optim: Optim
     return found | summary("weights", weights)
 
 
-class Line(WindowModel):
+class Line(MotionModel):
     """A linear map of each frame: a network for the training loop alone."""
 
     branches = frozenset({"rotation", "position"})

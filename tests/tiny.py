@@ -26,11 +26,11 @@ from memmlp.networks.baselines.sage_net import SAGENet
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import CodeMemory, JointCodeMemory, Memory, NoMemory, RecurrentMemory
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.predictor import Predictor, TwoBranch
 from memmlp.networks.recurrent_poser import RecurrentPoser
 from memmlp.networks.refiner import Refined
 from memmlp.networks.vqvae import VQVAE
-from memmlp.networks.window_model import WindowModel
 from memmlp.training.losses import AGRoLLoss, AvatarPoserLoss, Loss, OwnLoss, TermsLoss
 
 SIZES = {"hidden": 16, "frames": 7}
@@ -103,7 +103,7 @@ def model(
     return MemMLP(normalizer(coordinates), slot, head, depth=DEPTH, **SIZES).eval()
 
 
-BASELINES: dict[str, Callable[..., WindowModel]] = {
+BASELINES: dict[str, Callable[..., MotionModel]] = {
     "agrol_mlp": partial(AGRoLMLP, frames=7, width=16, depth=2),
     "agrol_diffusion": partial(
         AGRoLDiffusion, frames=7, width=16, depth=2, diffusion_steps=50, sampling_steps=3, noise_seed=0
@@ -156,7 +156,7 @@ BASELINE_LOSSES: dict[str, Callable[[], Loss]] = {
 }
 
 
-def baseline(name: str, coordinates: World | None = None, seed: int = 0, **changes) -> WindowModel:
+def baseline(name: str, coordinates: World | None = None, seed: int = 0, **changes) -> MotionModel:
     """Make a tiny baseline with random weights, in evaluation mode."""
     torch.manual_seed(seed)
     return BASELINES[name](normalizer(coordinates), **changes).eval()
@@ -169,7 +169,7 @@ def recurrent_poser(coordinates: World | None = None, seed: int = 0, **changes) 
     return RecurrentPoser(normalizer(coordinates), **settings | changes).eval()
 
 
-def refined(network: WindowModel | None = None) -> Refined:
+def refined(network: MotionModel | None = None) -> Refined:
     """Make a network with a tiny refiner of random weights behind it, in evaluation mode."""
     network = network or model(coordinates=Heading())
     torch.manual_seed(1)

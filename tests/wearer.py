@@ -14,10 +14,10 @@ from memmlp.motion.body import TRACKED
 from memmlp.motion.features import motion_frames
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 
 
-def at_ease(network: WindowModel, frames: torch.Tensor) -> WindowModel:
+def at_ease(network: MotionModel, frames: torch.Tensor) -> MotionModel:
     """The network with random weights, but about the mean pose of frames (N, 252), as a person stands."""
     network.normalizer = Normalizer.fit(network.normalizer.coordinates, tiny.REST, frames)
     return network

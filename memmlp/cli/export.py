@@ -12,8 +12,8 @@ from memmlp.cli.options import outputs_option, plugins_option
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from memmlp.networks.motion_model import MotionModel
     from memmlp.networks.streaming import StreamingGraph
-    from memmlp.networks.window_model import WindowModel
 
 TARGETS = ("onnxruntime", "web", "wasm", "webgpu", "webnn", "unity", "tensorrt", "coreml", "qnn")
 """Those of memmlp.deploy.targets, without importing ONNX Runtime for the help."""
@@ -183,8 +183,8 @@ def write(run: str, out: Path, outputs: Path, form: Form, clips: int, max_growth
 
 
 def write_exact(
-    model: WindowModel,
-    network: WindowModel | StreamingGraph,
+    model: MotionModel,
+    network: MotionModel | StreamingGraph,
     out: Path,
     run_id: str,
     clips: list[Tensor],
@@ -225,7 +225,7 @@ def write_exact(
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {said}")
 
 
-def write_graph(network: WindowModel | StreamingGraph, path: Path, run_id: str, form: Form) -> None:
+def write_graph(network: MotionModel | StreamingGraph, path: Path, run_id: str, form: Form) -> None:
     """Write the ONNX file of the network, or of the whole way, in float32 and unchecked."""
     from memmlp.deploy.export import export as export_network
     from memmlp.live.full_graph import export_full

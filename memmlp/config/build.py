@@ -33,14 +33,14 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.architecture import (
     VQVAE_SETTINGS,
     Architecture,
-    BaselineArchitecture,
     MemMLPArchitecture,
     PartedArchitecture,
+    PlainArchitecture,
     RefinedArchitecture,
 )
 from memmlp.networks.memory import Memory
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.vqvae import VQVAE
-from memmlp.networks.window_model import WindowModel
 from memmlp.pipeline.devices import device
 from memmlp.pipeline.experiment import Experiment, UpstreamTraining
 from memmlp.runs.lookup import check_trained
@@ -67,7 +67,7 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
         InputError: where the config's device, or the code of a component of one's own, is not there.
     """
     outputs = Path(cfg.paths.outputs)
-    base = build_experiment(_unrefined(cfg), elsewhere) if cfg.refiner is not None else None
+    refined = build_experiment(_unrefined(cfg), elsewhere) if cfg.refiner is not None else None
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     config["plugins"] = plugins.used(config)
     metrics = build_metrics(cfg.evaluation.metrics)
@@ -91,7 +91,7 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
         predictions=Path(cfg.save_predictions) if cfg.save_predictions else None,
         tracking=build_tracking(cfg),
         called=readable_name,
-        base=base,
+        refined=refined,
     )
 
 
@@ -132,7 +132,7 @@ def build_training(cfg: DictConfig, metrics: dict[str, OwnMetric]) -> NetworkTra
     return NetworkTraining(loss=build_loss(cfg), rollout=built(cfg.rollout), mirror=cfg.data.mirror, **common)
 
 
-def untrained(overrides: Sequence[str]) -> WindowModel:
+def untrained(overrides: Sequence[str]) -> MotionModel:
     """Build the network of a command line's overrides, with random weights, on the built-in body."""
     architecture = build_architecture(composed(list(overrides)))
     torch.manual_seed(0)
@@ -161,7 +161,7 @@ def build_network(cfg: DictConfig) -> Architecture:
     space = {"coordinates": build_coordinates(cfg.frame.coordinates), "normalize": cfg.frame.normalize}
     vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in VQVAE_SETTINGS})
     if "_target_" in cfg.model:
-        family = BaselineArchitecture if cfg.upstream is None else PartedArchitecture
+        family = PlainArchitecture if cfg.upstream is None else PartedArchitecture
         return family(**space, vqvae=vqvae, network=built(cfg.model))
     memory, kind = built(cfg.memory), memory_class(cfg)
     return MemMLPArchitecture(

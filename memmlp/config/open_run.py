@@ -16,7 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment, config_of
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.preparing.source import Prepared
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 from memmlp.pipeline.devices import device
 from memmlp.pipeline.experiment import Experiment
 from memmlp.runs.identity import trained_by
@@ -36,7 +36,7 @@ class OpenedRun(NamedTuple):
         """The test clips, on the experiment's device."""
         return self.data.open("test").to(self.experiment.device)
 
-    def network(self) -> WindowModel:
+    def network(self) -> MotionModel:
         """The trained network, in evaluation mode, on the experiment's device."""
         return trained_network(self.run, self.experiment)
 
@@ -84,7 +84,7 @@ def experiment_of(run: Run, device_name: str = "cpu", overrides: Sequence[str] =
     return experiment
 
 
-def trained_network(run: Run, experiment: Experiment) -> WindowModel:
+def trained_network(run: Run, experiment: Experiment) -> MotionModel:
     """The trained network of a run, in evaluation mode, on the experiment's device."""
     return experiment.architecture.load(run.weights()).to(experiment.device)
 

@@ -155,13 +155,13 @@ def tasks_of(experiment: Experiment, data: str) -> list[RunTask]:
     own = experiment.identity(data)
     upstream = [
         RunTask(one.id, one.kind, experiment.config, one.upstream.id if one.upstream else None)
-        for one in experiment.above(data)
+        for one in experiment.upstream_identities(data)
     ]
-    if experiment.base:  # the network's training is enough of it
-        *upstream, network = tasks_of(experiment.base, data)
+    if experiment.refined:  # the network's training is enough of it
+        *upstream, network = tasks_of(experiment.refined, data)
         upstream = [*upstream, replace(network, stages=())]
-    above = upstream[-1].id if upstream else None
-    return [*upstream, RunTask(own.id, own.kind, experiment.config, above, experiment.stages, own.what)]
+    last = upstream[-1].id if upstream else None
+    return [*upstream, RunTask(own.id, own.kind, experiment.config, last, experiment.stages, own.what)]
 
 
 def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[str, Any]]) -> str | None:

@@ -18,12 +18,12 @@ from memmlp.deploy.opsets import NATIVE
 from memmlp.deploy.parity import TOLERANCE, parity
 from memmlp.deploy.precision_cost import compared
 from memmlp.deploy.quantization import quantise
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming import StreamingGraph, has_stream, streaming
-from memmlp.networks.window_model import WindowModel
 from memmlp.runs.deployment_folder import DeploymentFolder
 
 # What is exported of a network, by the graph's name; "auto" is "streaming" where there is such a graph.
-GRAPHS: dict[str, Callable[[WindowModel], WindowModel | StreamingGraph]] = {
+GRAPHS: dict[str, Callable[[MotionModel], MotionModel | StreamingGraph]] = {
     "naive": lambda model: model,
     "streaming": streaming,
     "auto": lambda model: streaming(model) if has_stream(model) else model,
@@ -52,7 +52,7 @@ class Deployment:
 
     def deploy(
         self,
-        model: WindowModel,
+        model: MotionModel,
         deployed: DeploymentFolder,
         run_id: str,
         train: Sequence[Tensor],
@@ -96,7 +96,7 @@ class Deployment:
             record[self.precision] = self._less_precise(network, deployed, train, test)
         return record
 
-    def _alone(self, model: WindowModel) -> dict[str, float]:
+    def _alone(self, model: MotionModel) -> dict[str, float]:
         """Return the times of the network alone, from features to its own outputs; no file is kept."""
         from memmlp.deploy.export import export
 

@@ -26,14 +26,14 @@ from memmlp.common.fences import publish, temporary
 from memmlp.deploy.opsets import NATIVE, converted
 from memmlp.deploy.parity import deterministic
 from memmlp.motion.body import FEATURES, FPS, JOINTS, N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming import StreamingGraph
-from memmlp.networks.window_model import WindowModel
 
 
 class OneStep(nn.Module):
     """One step of the live stream with flat inputs and outputs, as ONNX wants them."""
 
-    def __init__(self, model: WindowModel | StreamingGraph):
+    def __init__(self, model: MotionModel | StreamingGraph):
         super().__init__()
         self.model = model
         self.names = list(model.initial_state(1))
@@ -47,7 +47,7 @@ class OneStep(nn.Module):
         return rotation, position, *(new[name] for name in self.names)
 
 
-def export(model: WindowModel | StreamingGraph, path: Path, run_id: str, opset: int = NATIVE) -> None:
+def export(model: MotionModel | StreamingGraph, path: Path, run_id: str, opset: int = NATIVE) -> None:
     """Write the model's streaming step, on the CPU in float32, as one ONNX file with its metadata.
 
     Raises:
@@ -150,7 +150,7 @@ def simplify(model: onnx_ir.Model) -> None:
     SIMPLER(model)
 
 
-def metadata(model: WindowModel | StreamingGraph, run_id: str) -> dict[str, str]:
+def metadata(model: MotionModel | StreamingGraph, run_id: str) -> dict[str, str]:
     """Return the metadata that tell a program how to drive the file."""
     return {
         "joints": json.dumps(JOINTS),

@@ -19,8 +19,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from memmlp.deploy.session import OnnxStream
 from memmlp.motion.body import SPARSE_DIM
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming import StreamingGraph
-from memmlp.networks.window_model import WindowModel
 
 WARM_UP = 30  # steps before the timed ones
 SETTLING = 3  # untimed steps of a file at the start of each round
@@ -103,7 +103,7 @@ def profile(path: Path, steps: int = 100) -> list[tuple[str, str, float, float]]
     return sorted(rows, key=lambda row: -row[2] * row[3])
 
 
-def size(model: WindowModel, step: WindowModel | StreamingGraph, path: Path) -> dict[str, Any]:
+def size(model: MotionModel, step: MotionModel | StreamingGraph, path: Path) -> dict[str, Any]:
     """Measure a network: its parameters, MACs and FLOPs, the MACs of its exported step, the file's bytes.
 
     "macs" and "flops" are the network's, which papers count; "step_macs" are those of the exported graph.
@@ -126,7 +126,7 @@ def size(model: WindowModel, step: WindowModel | StreamingGraph, path: Path) -> 
 
 
 @torch.no_grad()
-def macs(model: WindowModel | StreamingGraph) -> int:
+def macs(model: MotionModel | StreamingGraph) -> int:
     """Count the multiply-adds of the matrix products of one streaming step."""
     with FlopCounterMode(display=False) as counter:
         model.advance(torch.zeros(1, 1, SPARSE_DIM), model.initial_state(1), 1)

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from memmlp.motion.body import MOTION_DIM, ROTATION
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 
-Model = TypeVar("Model", bound=WindowModel)
+Model = TypeVar("Model", bound=MotionModel)
 
 
 class NoConversion(Normalizer):

@@ -15,7 +15,7 @@ from memmlp.common.progress import progress_bar
 from memmlp.deploy.session import OnnxStream
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.networks.memory import Blend
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 
 TOLERANCE = 1e-4  # on 6D components and metres
 
@@ -35,7 +35,7 @@ def deterministic(model: nn.Module) -> Iterator[None]:
 
 
 @torch.no_grad()
-def parity(model: WindowModel, path: Path, clip: Tensor) -> float:
+def parity(model: MotionModel, path: Path, clip: Tensor) -> float:
     """Return the largest difference between torch and ONNX Runtime, each on its own history, over a clip.
 
     The positions of a network without a position branch are compared with those that follow, in float64, from
@@ -57,7 +57,7 @@ def parity(model: WindowModel, path: Path, clip: Tensor) -> float:
 
 
 @torch.no_grad()
-def in_torch(model: WindowModel, clip: Tensor) -> Tensor:
+def in_torch(model: MotionModel, clip: Tensor) -> Tensor:
     """Return the world motion (N, 198) that the network streams of a clip's inputs (N, 252 or 54)."""
     state, made = model.initial_state(1), []
     with deterministic(model):

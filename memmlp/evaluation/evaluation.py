@@ -14,7 +14,7 @@ from memmlp.evaluation.ik import IK
 from memmlp.evaluation.metrics import OwnMetrics
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 
 PICTURE_FRAMES = 600  # the picture shows the first 10 s of the first test clip
 
@@ -37,7 +37,7 @@ class Evaluation:
     seed: int
     metrics: OwnMetrics = field(default_factory=dict)
 
-    def report(self, model: WindowModel, test: MotionDataset, mode: str) -> dict[str, Any]:
+    def report(self, model: MotionModel, test: MotionDataset, mode: str) -> dict[str, Any]:
         """Compute the metrics in a mode.
 
         Returns:
@@ -52,7 +52,7 @@ class Evaluation:
         return {"mean": found["mean"][mode], "clips": rows, **label}
 
 
-def picture(model: WindowModel, test: MotionDataset, path: Path) -> None:
+def picture(model: MotionModel, test: MotionDataset, path: Path) -> None:
     """Draw the start of the first test clip, streamed, beside the truth, as a PNG."""
     # Imported here, since it imports matplotlib: half a second that planning a sweep need not spend.
     from memmlp.render.figure import poses_png

@@ -5,7 +5,7 @@
 overlap dropped. A network that recalls the window which ended one frame before is led through each window
 frame by frame, so that it recalls what it was trained on: in one call it would get the window of T frames
 ago. Its result for a window is the last call's output. A network without a window is a stream in both. One
-that makes the windows of a clip together (`WindowModel.joint`) gets the whole clip, and is no stream.
+that makes the windows of a clip together (`MotionModel.joint`) gets the whole clip, and is no stream.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from memmlp.networks.memory import State
 
 
 class Evaluable(Protocol):
-    """What can be evaluated: a WindowModel, or anything else with these attributes and methods."""
+    """What can be evaluated: a MotionModel, or anything else with these attributes and methods."""
 
     frames: int
 

@@ -23,13 +23,13 @@ from memmlp.motion.exporting.folder import ExportPlan, ExportReport, Target, rea
 from memmlp.motion.exporting.write import write_motion
 from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.preparing.cache import frame_blocks
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 
 BRANCHES = {"rotation": "predicted", "combined": "combined", "truth": "true"}
 """Names of what can be made a clip -> the beginnings of its arrays' names (`prediction_arrays`)."""
 
 
-def save_predictions(evaluation: Evaluation, model: WindowModel, test: MotionDataset, folder: Path) -> None:
+def save_predictions(evaluation: Evaluation, model: MotionModel, test: MotionDataset, folder: Path) -> None:
     """Write `<folder>/<mode>/<clip>.npz` for every mode and test clip; see `prediction_arrays`."""
     clips = test.clips()
     for mode in evaluation.modes:
@@ -42,7 +42,7 @@ def save_predictions(evaluation: Evaluation, model: WindowModel, test: MotionDat
             )
 
 
-def predict_clip(model: WindowModel, clip: Tensor, mode: str) -> dict[str, np.ndarray]:
+def predict_clip(model: MotionModel, clip: Tensor, mode: str) -> dict[str, np.ndarray]:
     """What a network makes of a clip's frames (N, 252) in a mode, beside the truth (`prediction_arrays`)."""
     return prediction_arrays(model.normalizer, clip, modes.MODE_FUNCTIONS[mode](model, [clip])[0], NoIK())
 
@@ -92,7 +92,7 @@ class Predictor:
         evaluation: how the network is evaluated: batches, inverse kinematics, seed.
     """
 
-    model: WindowModel
+    model: MotionModel
     mode: str
     branch: str
     evaluation: Evaluation

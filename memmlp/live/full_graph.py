@@ -44,8 +44,8 @@ from memmlp.motion.body import (
 from memmlp.motion.features import sparse_features
 from memmlp.motion.geometry import sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming import StreamingGraph
-from memmlp.networks.window_model import WindowModel
 
 INPUTS = ("tracker_positions", "tracker_rotations")
 OUTPUTS = ("rotations", "positions", "joints")
@@ -99,7 +99,7 @@ class FullStep(nn.Module):
 
     def __init__(
         self,
-        model: WindowModel | StreamingGraph,
+        model: MotionModel | StreamingGraph,
         space: Space,
         rotated: Callable[[Tensor], Tensor] = as_they_are,
     ):
@@ -162,7 +162,7 @@ class FullStep(nn.Module):
 
 
 def export_full(
-    model: WindowModel | StreamingGraph,
+    model: MotionModel | StreamingGraph,
     path: Path,
     run_id: str,
     space: str = "amass",
@@ -203,7 +203,7 @@ def trackers_of(frames: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat([positions[:1] - velocity, positions]), torch.cat([before, rotations])
 
 
-def full_parity(model: WindowModel, path: Path, clip: Tensor, space: str = "amass") -> float:
+def full_parity(model: MotionModel, path: Path, clip: Tensor, space: str = "amass") -> float:
     """Return the largest difference between torch and the file over a clip (N, 252).
 
     Each of them has its own history. Torch goes the way of evaluation: the features of the same trackers, the

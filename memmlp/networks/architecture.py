@@ -16,10 +16,10 @@ from memmlp.motion.preparing.manifest import Manifest
 from memmlp.networks import checkpoint
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import Memory
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.predictor import Predictor
 from memmlp.networks.refiner import Refined, SAGERefiner
 from memmlp.networks.vqvae import VQVAE
-from memmlp.networks.window_model import WindowModel
 
 VQVAE_SETTINGS = ("codes", "width", "encoder_depth", "decoder_depth", "commitment", "decay", "codebook")
 
@@ -48,7 +48,7 @@ class Architecture:
         """Whether the network has a VQ-VAE of its own that is trained with it."""
         return False
 
-    def build(self, normalizer: Normalizer, codes: VQVAE | None) -> WindowModel:
+    def build(self, normalizer: Normalizer, codes: VQVAE | None) -> MotionModel:
         """Build the network with fresh weights.
 
         Args:
@@ -57,17 +57,17 @@ class Architecture:
         """
         raise NotImplementedError
 
-    def begun(self, normalizer: Normalizer, above: Path | None) -> WindowModel:
+    def begun(self, normalizer: Normalizer, upstream: Path | None) -> MotionModel:
         """Build the network as its training begins.
 
         Args:
             normalizer: converts between the world and network space.
-            above: weights of the run that its own builds upon; None for none.
+            upstream: weights of the run that its own builds upon; None for none.
 
         Raises:
             InputError: if their file is damaged.
         """
-        return self.build(normalizer, self.load_vqvae(above) if above else None)
+        return self.build(normalizer, self.load_vqvae(upstream) if upstream else None)
 
     def normalizer(self, manifest: Manifest, frames: Tensor) -> Normalizer:
         """Make the normalizer, with the statistics of the training frames (F, 252) if `normalize` is set."""
@@ -86,7 +86,7 @@ class Architecture:
         checkpoint.load_module("model", model, checkpoint.read(weights)[0])
         return model.eval()
 
-    def load(self, weights: Path) -> WindowModel:
+    def load(self, weights: Path) -> MotionModel:
         """Load a trained network from a file of weights.
 
         Raises:
@@ -138,22 +138,22 @@ class MemMLPArchitecture(Architecture):
 
 
 @dataclass(frozen=True)
-class BaselineArchitecture(Architecture):
+class PlainArchitecture(Architecture):
     """How a network with neither memory nor predictor slot is built, as all baselines are.
 
     Attributes:
         network: makes the network from its normalizer; all other arguments are bound already.
     """
 
-    network: Callable[[Normalizer], WindowModel]
+    network: Callable[[Normalizer], MotionModel]
 
-    def build(self, normalizer: Normalizer, codes: VQVAE | None) -> WindowModel:
+    def build(self, normalizer: Normalizer, codes: VQVAE | None) -> MotionModel:
         """Build the network with fresh weights; `codes` is not used."""
         return self.network(normalizer)
 
 
 @dataclass(frozen=True)
-class PartedArchitecture(BaselineArchitecture):
+class PartedArchitecture(PlainArchitecture):
     """How a network is built whose parts are trained one after the other, before it is as a whole.
 
     Attributes:
@@ -163,10 +163,10 @@ class PartedArchitecture(BaselineArchitecture):
 
     finished: tuple[str, ...] = ()
 
-    def begun(self, normalizer: Normalizer, above: Path | None) -> WindowModel:
+    def begun(self, normalizer: Normalizer, upstream: Path | None) -> MotionModel:
         """Build the network with the weights of its parts; see Architecture."""
-        assert above is not None
-        model, (tensors, _) = self.build(normalizer, None), checkpoint.read(above)
+        assert upstream is not None
+        model, (tensors, _) = self.build(normalizer, None), checkpoint.read(upstream)
         for name in self.finished:
             checkpoint.load_module(f"model.{name}", model.get_submodule(name).requires_grad_(False), tensors)
         if not self.finished:

@@ -7,11 +7,11 @@ from torch import Tensor, nn
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import Memory, State
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.predictor import Predictor
-from memmlp.networks.window_model import WindowModel
 
 
-class MemMLP(WindowModel):
+class MemMLP(MotionModel):
     """The network of Sec. 3.2: a linear stem, a backbone of MLP and memory blocks, and a predictor.
 
     Args:
@@ -71,7 +71,7 @@ class MemMLP(WindowModel):
         return super().true_state(frames) | true
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames; see WindowModel.
+        """Take in the newest frames; see MotionModel.
 
         By default all T frames are returned; frames that are not wanted are not computed in the predictor's
         last blocks.

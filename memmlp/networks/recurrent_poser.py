@@ -96,10 +96,10 @@ class GlobalRotationHead(RotationHead):
         with in_float32(h.device):
             sixd = normalizer.rotations_out(made.to(sparse.dtype), normalizer.origin(sparse))
             rotations = sixd_to_matrix(sixd.unflatten(-1, (N_JOINTS, 6)))
-            above = rotations[..., list(PARENTS[1:]), :, :]
-            local = above.transpose(-1, -2) @ rotations[..., 1:, :, :]
+            parents = rotations[..., list(PARENTS[1:]), :, :]
+            local = parents.transpose(-1, -2) @ rotations[..., 1:, :, :]
             offsets = normalizer.rest[1:] - normalizer.rest[list(PARENTS[1:])]
-            bones = (above.detach() @ offsets[..., None])[..., 0]
+            bones = (parents.detach() @ offsets[..., None])[..., 0]
             positions = self.chains @ bones + sparse[..., SPARSE_POSITION][..., None, :3]
             return torch.cat([sixd[..., :6], matrix_to_sixd(local).flatten(-2), positions.flatten(-2)], -1)
 
@@ -178,7 +178,7 @@ class RecurrentPoser(StreamModel):
         return self.head.posed(self.norm(h), sparse, self.normalizer)
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames; see WindowModel."""
+        """Take in the newest frames; see MotionModel."""
         wanted = sparse.shape[1] if newest is None else newest
         h, kept = self.encoded(sparse), {}
         for name, block in self.named_blocks():

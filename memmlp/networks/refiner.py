@@ -15,7 +15,7 @@ from memmlp.motion.body import POSITION, ROTATION
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import in_float32
 from memmlp.networks.memory import State
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 
 HIDDEN = "refiner"  # the name of the refiner's own state
 
@@ -36,12 +36,12 @@ class SAGERefiner:
     frames: int
     pieces: int
 
-    def around(self, network: WindowModel) -> Refined:
+    def around(self, network: MotionModel) -> Refined:
         """Return a network with a refiner of fresh weights behind it."""
         return Refined(network, self.width, self.depth)
 
 
-class Refined(WindowModel):
+class Refined(MotionModel):
     """A network with recurrent layers behind it that correct its rotations; a stream in both modes.
 
     With 2 layers of width 512 the refiner has 2,635,908 parameters. Rotations are corrected in the world.
@@ -53,7 +53,7 @@ class Refined(WindowModel):
         depth: how many there are.
     """
 
-    def __init__(self, network: WindowModel, width: int, depth: int):
+    def __init__(self, network: MotionModel, width: int, depth: int):
         nn.Module.__init__(self)
         self.network, self.frames, self.branches = network, network.frames, network.branches
         self.layers = nn.GRU(ROTATION.stop, width, depth, batch_first=True)
@@ -98,7 +98,7 @@ class Refined(WindowModel):
         return self.initial_state(len(frames)) | self.network.true_state(frames)
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames, one after the other; see WindowModel.
+        """Take in the newest frames, one after the other; see MotionModel.
 
         By default the n new frames are returned, which are the most that it can make.
         """

@@ -5,10 +5,10 @@ from __future__ import annotations
 from torch import Tensor
 
 from memmlp.networks.memory import State
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 
 
-class StreamModel(WindowModel):
+class StreamModel(MotionModel):
     """A network that carries all it knows of the past in its state; a live step takes the same work for ever.
 
     `frames` is how many frames a training call takes in, from a fresh start. In both evaluation modes the

@@ -18,7 +18,7 @@ def run_distributed(experiment: Experiment) -> Outcome | None:
     Returns:
         None in the processes that trained along.
     """
-    if experiment.base and distributed.size() > 1:
+    if experiment.refined and distributed.size() > 1:
         raise InputError("refiner: several processes can't train it; allowed is one process, or refiner=null")
     distributed.connect(experiment.device.type)
     if not distributed.first():
@@ -34,7 +34,7 @@ def _train_along(experiment: Experiment) -> None:
     """Train the stages that the first process names, until it is at the end."""
     while (stage := distributed.of_first("")) != "end":
         data = experiment.data.prepare()  # the first process has prepared it
-        chain = [*experiment.above(data.digest), experiment.identity(data.digest)]
+        chain = [*experiment.upstream_identities(data.digest), experiment.identity(data.digest)]
         runs = [Run.of(experiment.outputs, identity.id) for identity in chain]
         number = [identity.kind for identity in chain].index(stage)
         training = (*experiment.upstream, experiment.training)[number]

@@ -39,11 +39,11 @@ class UpstreamTraining(Protocol):
         self,
         architecture: Architecture,
         data: Prepared,
-        above: Path | None,
+        upstream: Path | None,
         run: Run,
         device: torch.device,
     ) -> dict[str, float]:
-        """Train upon the weights `above`, from the run's checkpoint if there is one; return its errors."""
+        """Train upon the weights `upstream`, from the run's checkpoint if there is one; return its errors."""
 
 
 def unnamed(kind: str, config: Mapping[str, Any]) -> str:
@@ -69,7 +69,7 @@ class Experiment:
         predictions: folder for predictions of the test clips; None for no such files.
         tracking: shows runs elsewhere.
         called: makes a name that people can read, of the config of a run and the word for its kind.
-        base: the experiment of the network that a refiner stands behind; None without a refiner.
+        refined: the experiment of the network that a refiner stands behind; None without a refiner.
     """
 
     config: dict[str, Any]
@@ -85,7 +85,7 @@ class Experiment:
     predictions: Path | None
     tracking: Tracking
     called: Callable[[str, Mapping[str, Any]], str] = unnamed
-    base: Experiment | None = None
+    refined: Experiment | None = None
 
     @property
     def evaluations(self) -> dict[str, str]:
@@ -102,7 +102,7 @@ class Experiment:
         """The identities of the evaluations and the deployment."""
         return (*self.evaluations.values(), *self.deployments)
 
-    def above(self, data: str) -> list[Identity]:
+    def upstream_identities(self, data: str) -> list[Identity]:
         """Return the identities of the runs upstream, in order, on data of that digest."""
         found: list[Identity] = []
         for training in self.upstream:
@@ -116,5 +116,5 @@ class Experiment:
         own = {key: value for key, value in self.config.items() if key != "vqvae"}
         if self.architecture.trains_codes:
             own["vqvae"] = {key: self.config["vqvae"][key] for key in VQVAE_SETTINGS}
-        above = [self.base.identity(data)] if self.base else self.above(data)
-        return Identity(NETWORK, own, data, above[-1] if above else None)
+        upstream = [self.refined.identity(data)] if self.refined else self.upstream_identities(data)
+        return Identity(NETWORK, own, data, upstream[-1] if upstream else None)

@@ -77,14 +77,14 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     if not run.done:
         experiment.training.optim.check_installed()
-    above = upstream_run(experiment, data)
+    upstream = upstream_run(experiment, data)
     with run.lock():
         if experiment.force:
             run.reset()
         made = []
         with recording_outcome(experiment, run):
             if not run.done:
-                train_run(experiment, run, data, above, watch)
+                train_run(experiment, run, data, upstream, watch)
                 made.append("training")
             made += make_missing_stages(experiment, run, data)
         if experiment.predictions is not None:
@@ -164,10 +164,11 @@ def upstream_run(experiment: Experiment, data: Prepared, last: str | None = None
         data: the prepared motion.
         last: the id of the run upstream that is wanted; by default the last one.
     """
-    if experiment.base:
-        return run_experiment(experiment.base).run
+    if experiment.refined:
+        return run_experiment(experiment.refined).run
     run: Run | None = None
-    for training, identity in zip(experiment.upstream, experiment.above(data.digest), strict=True):
+    identities = experiment.upstream_identities(data.digest)
+    for training, identity in zip(experiment.upstream, identities, strict=True):
         run = made_upstream(experiment, training, identity, data, run)
         if run.id == last:
             break
@@ -175,7 +176,11 @@ def upstream_run(experiment: Experiment, data: Prepared, last: str | None = None
 
 
 def made_upstream(
-    experiment: Experiment, training: UpstreamTraining, identity: Identity, data: Prepared, above: Run | None
+    experiment: Experiment,
+    training: UpstreamTraining,
+    identity: Identity,
+    data: Prepared,
+    upstream: Run | None,
 ) -> Run:
     """Return the finished run upstream of that identity, training it if necessary."""
     run = Run.of(experiment.outputs, identity.id)
@@ -183,7 +188,7 @@ def made_upstream(
         if run.done:
             return run
         with recording_outcome(experiment, run):
-            train_upstream(experiment, training, identity, data, run, above)
+            train_upstream(experiment, training, identity, data, run, upstream)
     return run
 
 
@@ -193,13 +198,13 @@ def train_upstream(
     identity: Identity,
     data: Prepared,
     run: Run,
-    above: Run | None,
+    upstream: Run | None,
 ) -> None:
     """Train a run that others build upon, and mark it as done."""
     begin(experiment, run, identity, training.config)
     run.write_manifest({"partial": partial_words(experiment, data)})
     tell(f"{training.told} (run {run.id})")
-    weights = above.weights() if above else None
+    weights = upstream.weights() if upstream else None
     distributed.of_first(training.kind)
     with timed(run, "train"):
         errors = training.train(experiment.architecture, data, weights, run, experiment.device)
@@ -231,14 +236,14 @@ def recording_outcome(experiment: Experiment, run: Run, again: bool = False) -> 
 
 
 def train_run(
-    experiment: Experiment, run: Run, data: Prepared, above: Run | None, watch: Watch = unwatched
+    experiment: Experiment, run: Run, data: Prepared, upstream: Run | None, watch: Watch = unwatched
 ) -> None:
     """Train the network of a run, and mark the run as done."""
     tell(f"network: train it for {experiment.training.optim.steps} steps (run {run.id})")
     begin(experiment, run, experiment.identity(data.digest), experiment.config)
     run.write_manifest({"body": data.manifest.body, "partial": partial_words(experiment, data)})
     run.clear_stages()
-    weights = above.weights() if above else None
+    weights = upstream.weights() if upstream else None
     distributed.of_first(NETWORK)
     with timed(run, "train"):
         experiment.training.train(experiment.architecture, data, weights, run, experiment.device, watch)
@@ -286,12 +291,12 @@ def deploy_run(experiment: Experiment, run: Run, data: Prepared, name: str) -> N
 
 def begin(experiment: Experiment, run: Run, identity: Identity, config: dict[str, Any]) -> None:
     """Begin a training: write its config, and into its manifest its identity and what it runs on."""
-    above = identity.upstream.id if identity.upstream else None
+    upstream = identity.upstream.id if identity.upstream else None
     facts = {"recipes": identity.recipes, "what": identity.what, **machine(experiment)}
     facts |= {"processes": distributed.size(), **own_code(experiment)}
     counting = {**(identity.upstream.config if identity.upstream else {}), **identity.config}
     facts |= {"name": experiment.called(identity.kind, counting), "user": user()}
-    run.begin(identity.kind, config, data=identity.data, upstream=above, **facts)
+    run.begin(identity.kind, config, data=identity.data, upstream=upstream, **facts)
 
 
 def user() -> str | None:

@@ -248,8 +248,8 @@ def _single(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
 
 
 def _one_vqvae(found: Sequence[Measured]) -> bool:
-    above = {run.origin.vqvae for run in found}
-    return len(found) > 1 and len(above) == 1 and None not in above
+    upstream = {run.origin.vqvae for run in found}
+    return len(found) > 1 and len(upstream) == 1 and None not in upstream
 
 
 def _body(sweep: Sweep, every: Sequence[tuple[str, Measured]]) -> Iterable[str]:

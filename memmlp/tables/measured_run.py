@@ -38,7 +38,7 @@ class Origin:
         precision: the precision of training.
         body: whose rest joints the motion is on: "builtin" or the file of a body model.
         recipes: the recipe number of each component.
-        vqvae: the id of the VQ-VAE's run; None where there is none.
+        vqvae: the id of the run upstream, a VQ-VAE's or a part's; None where there is none.
         partial: which part of its protocol's list the data is, in words; None where it is all of it.
         plugins: version and digest of the code of each package of one's own that it uses.
         offline: whether its frames are made with later ones, so that it is no stream.

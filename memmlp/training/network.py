@@ -19,7 +19,7 @@ from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.preparing.source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architecture import Architecture
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, Watch, train, unwatched
 from memmlp.training.losses import Loss
@@ -58,17 +58,17 @@ class NetworkTraining:
         self,
         architecture: Architecture,
         data: Prepared,
-        above: Path | None,
+        upstream: Path | None,
         run: Run,
         device: torch.device,
         watch: Watch = unwatched,
-    ) -> WindowModel:
+    ) -> MotionModel:
         """Train a network, from the run's checkpoint if there is one, and write its weights.
 
         Args:
             architecture: builds the network.
             data: the prepared motion.
-            above: weights that it builds upon, of a frozen VQ-VAE for one; None for none.
+            upstream: weights that it builds upon, of a frozen VQ-VAE for one; None for none.
             run: the run whose folder takes checkpoints, log and weights.
             device: the device to train on.
             watch: called after each validation; see `memmlp.training.loop.train`.
@@ -76,20 +76,20 @@ class NetworkTraining:
         Returns:
             The trained network in evaluation mode.
         """
-        task = self.task(architecture, data, above, device)
+        task = self.task(architecture, data, upstream, device)
         train(task, self.optim, run, self.seed, "network", watch)
         if distributed.first():
             checkpoint.write(run.model, checkpoint.module_tensors("model", task.model), {})
         return task.model.eval()
 
     def task(
-        self, architecture: Architecture, data: Prepared, above: Path | None, device: torch.device
+        self, architecture: Architecture, data: Prepared, upstream: Path | None, device: torch.device
     ) -> MotionTask:
         """Make the task of training a network that is not yet trained; for the arguments see `train`."""
         dataset = data.open("train").to(device)
         torch.manual_seed(self.seed)
         normalizer = architecture.normalizer(data.manifest, dataset.frames)
-        model = architecture.begun(normalizer, above).to(device)
+        model = architecture.begun(normalizer, upstream).to(device)
         self.rollout.begin(model)
         pieces = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)
         return MotionTask(
@@ -110,13 +110,13 @@ class MotionTask:
 
     def __init__(
         self,
-        model: WindowModel,
+        model: MotionModel,
         loss: Loss,
         rollout: Rollout,
         dataset: MotionDataset,
         optim: Optim,
         seed: int,
-        validate: Callable[[WindowModel], dict[str, float]],
+        validate: Callable[[MotionModel], dict[str, float]],
         weighting: str = "frames",
         shares: Mapping[str, float] | None = None,
     ):

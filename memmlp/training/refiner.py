@@ -16,8 +16,8 @@ from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.preparing.source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architecture import Architecture, RefinedArchitecture
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.refiner import HIDDEN, Refined, SAGERefiner
-from memmlp.networks.window_model import WindowModel
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, Watch, train, unwatched
 from memmlp.training.losses import Loss, TermsLoss
@@ -65,17 +65,17 @@ class RefinerTraining:
         self,
         architecture: Architecture,
         data: Prepared,
-        above: Path | None,
+        upstream: Path | None,
         run: Run,
         device: torch.device,
         watch: Watch = unwatched,
-    ) -> WindowModel:
+    ) -> MotionModel:
         """Train a refiner, from the run's checkpoint if there is one, and write the weights of both.
 
         Args:
             architecture: builds the network with its refiner.
             data: the prepared motion.
-            above: weights of the finished network.
+            upstream: weights of the finished network.
             run: the run whose folder takes checkpoints, log and weights.
             device: the device to train on.
             watch: called after each validation; see `memmlp.training.loop.train`.
@@ -84,9 +84,9 @@ class RefinerTraining:
             The refined network in evaluation mode.
         """
         assert isinstance(architecture, RefinedArchitecture)
-        assert above is not None
+        assert upstream is not None
         dataset = data.open("train").to(device)
-        finished = architecture.network.load(above).to(device).requires_grad_(False)
+        finished = architecture.network.load(upstream).to(device).requires_grad_(False)
         torch.manual_seed(self.seed)
         model = self.refiner.around(finished).to(device)
         validation = modes.chunks(data.open("val").to(device), VALIDATION_PIECE, least=60)
@@ -149,6 +149,6 @@ class RefinerTask:
         return {}
 
 
-def streamed(network: WindowModel, pieces: Tensor) -> list[Tensor]:
+def streamed(network: MotionModel, pieces: Tensor) -> list[Tensor]:
     """Return the motion (n, 198) that a network streams of each piece (P, n, 252)."""
     return modes.predict(network, list(pieces), "stream", TOGETHER)

@@ -15,7 +15,7 @@ from memmlp.common import distributed
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.networks.memory import State
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 
 
 class Call(NamedTuple):
@@ -40,10 +40,10 @@ class Rollout(nn.Module):
     Where several processes share a batch, each draws the call of its own rows (memmlp.common.distributed).
     """
 
-    def begin(self, model: WindowModel) -> None:
+    def begin(self, model: MotionModel) -> None:
         """Make room for what is kept between the training steps of a network; here nothing is kept."""
 
-    def draw(self, model: WindowModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
+    def draw(self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """Draw the call of a training step."""
         raise NotImplementedError
 
@@ -54,7 +54,7 @@ class Rollout(nn.Module):
 class TeacherForcing(Rollout):
     """The true motion as history: the paper's training (Sec. 3.2.1)."""
 
-    def draw(self, model: WindowModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
+    def draw(self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """Draw the call of a training step."""
         clips, end = map(distributed.own, sampler.draw(step))
         past, stride = model.length, model.stride
@@ -73,7 +73,7 @@ class OwnPredictions(Rollout):
         super().__init__()
         self.max_passes = max_passes
 
-    def draw(self, model: WindowModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
+    def draw(self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """Draw the call of a training step, after the calls that make its history."""
         clips, end = map(distributed.own, sampler.draw(step))
         past, stride = model.length, model.stride
@@ -116,12 +116,12 @@ class PersistentStreams(Rollout):
         self.register_buffer("end", torch.zeros(streams, dtype=torch.long))
         self.register_buffer("lives", torch.zeros(streams, dtype=torch.bool))
 
-    def begin(self, model: WindowModel) -> None:
+    def begin(self, model: MotionModel) -> None:
         """Make room for the streams' states."""
         for name, tensor in model.initial_state(1).items():
             self.register_buffer(f"state_{name}", tensor.repeat(self.streams, *[1] * (tensor.dim() - 1)))
 
-    def draw(self, model: WindowModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
+    def draw(self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """Draw the call of a training step: the next streams, each one stride further."""
         # The drawn clips and frames are where streams that have ended, or not begun, start afresh.
         clips, end = sampler.draw(step)

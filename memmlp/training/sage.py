@@ -128,7 +128,7 @@ class PartTraining:
         self,
         architecture: Architecture,
         data: Prepared,
-        above: Path | None,
+        upstream: Path | None,
         run: Run,
         device: torch.device,
     ) -> dict[str, float]:
@@ -137,14 +137,14 @@ class PartTraining:
         Args:
             architecture: builds the whole network.
             data: the prepared motion.
-            above: weights of the parts that were trained before; None for the first one.
+            upstream: weights of the parts that were trained before; None for the first one.
             run: the run whose folder takes checkpoints, log and weights.
             device: the device to train on.
 
         Returns:
             Its errors on windows of the validation split.
         """
-        before, dataset = checkpoint.read(above)[0] if above else {}, data.open("train").to(device)
+        before, dataset = checkpoint.read(upstream)[0] if upstream else {}, data.open("train").to(device)
         torch.manual_seed(self.network.seed)
         net = architecture.build(architecture.normalizer(data.manifest, dataset.frames), None)
         assert isinstance(net, SAGENet)
@@ -171,14 +171,14 @@ class DecoderTraining(PartTraining):
         self,
         architecture: Architecture,
         data: Prepared,
-        above: Path | None,
+        upstream: Path | None,
         run: Run,
         device: torch.device,
     ) -> dict[str, float]:
         """Train the decoder and write it with the diffusion models; see PartTraining."""
         assert isinstance(architecture, PartedArchitecture)
         fixed = replace(architecture, finished=("upper", "lower"))
-        self.network.train(fixed, data, above, run, device)
+        self.network.train(fixed, data, upstream, run, device)
         return last_errors(run)
 
 

@@ -17,7 +17,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from memmlp.motion.body import FRAME_DIM
 from memmlp.motion.dataset import MotionDataset
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 from memmlp.training.losses import Loss
 from memmlp.training.network import MotionTask
 from memmlp.training.optim import Optim
@@ -30,7 +30,7 @@ A single window is no batch to some layers.
 """
 
 
-def training_flops(model: WindowModel, loss: Loss, optim: Optim) -> int:
+def training_flops(model: MotionModel, loss: Loss, optim: Optim) -> int:
     """Count the FLOPs of a whole training of a network.
 
     Args:
@@ -43,7 +43,7 @@ def training_flops(model: WindowModel, loss: Loss, optim: Optim) -> int:
     return optim.steps * (few + (optim.batch - COUNTED[0]) * each)
 
 
-def step_flops(model: WindowModel, loss: Loss, optim: Optim) -> int:
+def step_flops(model: MotionModel, loss: Loss, optim: Optim) -> int:
     """Count the FLOPs of one training step, by taking it on random frames."""
     task = MotionTask(model, loss, TeacherForcing(), _frames(model), optim, 0, validate=lambda network: {})
     task.module.train()
@@ -52,7 +52,7 @@ def step_flops(model: WindowModel, loss: Loss, optim: Optim) -> int:
     return int(counter.get_total_flops())
 
 
-def _frames(model: WindowModel) -> MotionDataset:
+def _frames(model: MotionModel) -> MotionDataset:
     """Return a clip of random frames that is as long as a training call sees."""
     length = model.length + model.stride
     draw = torch.Generator().manual_seed(0)

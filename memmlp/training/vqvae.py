@@ -42,13 +42,14 @@ class VQVAETraining:
         self,
         architecture: Architecture,
         data: Prepared,
-        above: Path | None,
+        upstream: Path | None,
         run: Run,
         device: torch.device,
     ) -> dict[str, float]:
         """Train the architecture's VQ-VAE, from the run's checkpoint if there is one, and write its weights.
 
-        Nothing is `above` it. For the other arguments see `NetworkTraining.train`.
+        It builds upon no run, so that `upstream` is None. For the other arguments see
+        `NetworkTraining.train`.
 
         Returns:
             Its errors on the validation frames.

@@ -21,8 +21,8 @@ from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES
 from memmlp.live.wearer import stature
 from memmlp.motion.body import FPS, JOINTS, PARENTS, TRACKED
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming import StreamingGraph, has_stream, streaming
-from memmlp.networks.window_model import WindowModel
 from memmlp.web.weights import without_weights
 
 SPACE = SPACES["openxr"]  # of everything on the site
@@ -48,7 +48,7 @@ class SiteNetwork:
     key: str
     name: str
     run: str
-    model: WindowModel
+    model: MotionModel
     clips: tuple[str, ...] = ()
 
     @property
@@ -124,7 +124,7 @@ class Writer:
     def _pair(
         self,
         network: SiteNetwork,
-        graph: WindowModel | StreamingGraph,
+        graph: MotionModel | StreamingGraph,
         name: str,
         made: Path,
         played: Entry | None,

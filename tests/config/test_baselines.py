@@ -8,12 +8,12 @@ from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.deploy import latency
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 
 NAMES = list(tiny.BASELINES)
 
 
-def built(*overrides: str) -> WindowModel:
+def built(*overrides: str) -> MotionModel:
     """The network of a command line, with random weights."""
     architecture = build_experiment(composed(list(overrides))).architecture
     return architecture.build(Normalizer.raw(architecture.coordinates, tiny.REST), None).eval()

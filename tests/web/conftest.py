@@ -21,7 +21,7 @@ from memmlp.deploy.export import export
 from memmlp.live.full_graph import export_full
 from memmlp.motion.coordinates import World
 from memmlp.networks.memory import NoMemory
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 from memmlp.web.clips import packed
 from memmlp.web.networks import SiteNetwork
 from memmlp.web.site import Site
@@ -37,7 +37,7 @@ class Made(NamedTuple):
     step: Path
 
 
-def network() -> WindowModel:
+def network() -> MotionModel:
     """A tiny network of random weights that stands as a person does."""
     return wearer.at_ease(tiny.model(NoMemory, coordinates=World()), PERSON.frames)
 

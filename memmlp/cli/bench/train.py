@@ -48,7 +48,7 @@ WARM_UP = 3  # steps of each that are taken before any is timed
     help="File of what was measured, written after each seed; what it has already is not measured again.",
 )
 @click.option(
-    "--profile",
+    "--breakdown",
     type=click.IntRange(1),
     metavar="STEPS",
     help="Show instead where the time of a step goes, over so many steps of each.",
@@ -63,7 +63,7 @@ def train(
     every: int,
     times: float,
     file: Path | None,
-    profile: int | None,
+    breakdown: int | None,
     overrides: tuple[str, ...],
 ) -> None:
     """Time a recipe of training beside today's.
@@ -77,13 +77,13 @@ def train(
     import shlex
 
     own = tuple(shlex.split(recipe))
-    if profile:
+    if breakdown:
         os.environ.setdefault(
             "KINETO_LOG_LEVEL", "99"
         )  # before torch is there, whose profiler talks on stderr
         for arm, words in zip(ARMS, ((), own), strict=True):
             if words or arm == ARMS[0]:
-                show_profile(arm, (*BASE, *overrides, *words), profile)
+                show_breakdown(arm, (*BASE, *overrides, *words), breakdown)
         return
     subject = {"overrides": list(overrides), "recipe": list(own), "error": error, "every": every}
     rows = known_rows(file, subject)
@@ -261,7 +261,7 @@ def conclusion(found: dict[str, Any]) -> str:
     return f"{found['ratio']:.2f} times sooner (95 % interval over seeds: {interval}); {claim}"
 
 
-def show_profile(arm: str, words: Sequence[str], steps: int) -> None:
+def show_breakdown(arm: str, words: Sequence[str], steps: int) -> None:
     """Print how long a step takes, and each part of it."""
     from memmlp.training.step_profile import PARTS, step_parts
 

@@ -20,7 +20,7 @@ from memmlp.common.errors import InputError
 )
 @click.option("--fps", multiple=True, metavar="[FOLDER=]HZ", help="True frame rate, for all or one folder.")
 @click.option(
-    "--floor",
+    "--ground",
     default="auto",
     show_default=True,
     metavar="auto|none|METRES",
@@ -37,7 +37,7 @@ def import_(
     out: Path,
     skeleton: str | None,
     fps: tuple[str, ...],
-    floor: str,
+    ground: str,
     take: tuple[str, ...],
     body: str,
     strict: bool,
@@ -50,7 +50,7 @@ def import_(
     """
     from memmlp.motion.importing.folder import ImportSettings, import_folder
 
-    how = ImportSettings(skeleton, dict(map(_rate, fps)), body, _floor(floor), take, strict, sound)
+    how = ImportSettings(skeleton, dict(map(_rate, fps)), body, _height(ground), take, strict, sound)
     report = import_folder(source, out, how)
     for note in report.notes:
         click.echo(f"note: {note}")
@@ -72,7 +72,7 @@ def _rate(text: str) -> tuple[str, float]:
         raise InputError(f"--fps {text}: no frame rate; allowed: HZ or FOLDER=HZ, such as salsa=60") from None
 
 
-def _floor(text: str) -> str | float:
+def _height(text: str) -> str | float:
     """Parse auto, none or metres. Raises InputError for anything else."""
     if text in ("auto", "none"):
         return text
@@ -81,5 +81,5 @@ def _floor(text: str) -> str | float:
     except ValueError:
         height = math.nan
     if not abs(height) <= 1000:
-        raise InputError(f"--floor {text}: no height; allowed: auto, none, or metres up to 1000")
+        raise InputError(f"--ground {text}: no height; allowed: auto, none, or metres up to 1000")
     return height

@@ -226,9 +226,9 @@ class NoMemoryConfig(MemoryConfig):
 
 
 @dataclass
-class NoCodesMemoryConfig(MemoryConfig):
-    name: str = called("no_codes")
-    _target_: str = target("memmlp.networks.memory.NoCodesMemory")
+class OwnPastMemoryConfig(MemoryConfig):
+    """What the memories of the network's own past, with and without code-vectors, have in common."""
+
     layers: list[int] = key(EachOf(Within(1)))
     width: int = at_least(1)
     shift: str = one_of("frame", "window")
@@ -238,13 +238,19 @@ class NoCodesMemoryConfig(MemoryConfig):
 
 
 @dataclass
-class CodeMemoryConfig(NoCodesMemoryConfig):
+class NoCodesMemoryConfig(OwnPastMemoryConfig):
+    name: str = called("no_codes")
+    _target_: str = target("memmlp.networks.memory.NoCodesMemory")
+
+
+@dataclass
+class CodeMemoryConfig(OwnPastMemoryConfig):
     name: str = called("vq")
     _target_: str = target("memmlp.networks.memory.CodeMemory")
 
 
 @dataclass
-class JointCodeMemoryConfig(NoCodesMemoryConfig):
+class JointCodeMemoryConfig(OwnPastMemoryConfig):
     name: str = called("vq_joint")
     _target_: str = target("memmlp.networks.memory.JointCodeMemory")
 

@@ -19,10 +19,10 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.diffusion import Diffusion
 from memmlp.networks.layers import MLPBlock
 from memmlp.networks.memory import State
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 
 
-class WholeWindow(WindowModel):
+class WholeWindow(MotionModel):
     """The base of networks that map a whole window of inputs to its rotations (`rotations`)."""
 
     def rotations(self, encoded: Tensor) -> Tensor:
@@ -30,7 +30,7 @@ class WholeWindow(WindowModel):
         raise NotImplementedError
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames; see WindowModel.
+        """Take in the newest frames; see MotionModel.
 
         By default all T frames are returned. The work is always that of the whole window, as published.
         """

@@ -14,7 +14,7 @@ from memmlp.motion.body import N_JOINTS, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.encoder import EncoderLayer
 from memmlp.networks.memory import State
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 
 ROOT = 6  # components of the root's orientation, the first of the rotations
 
@@ -24,7 +24,7 @@ def head(width: int, size: int) -> nn.Module:
     return nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, size))
 
 
-class OwnWindows(WindowModel):
+class OwnWindows(MotionModel):
     """The base of networks that make every frame from its own window (`rotations`).
 
     Both evaluation modes give the same numbers, except for the shifted tail window: there the buffer does not
@@ -36,7 +36,7 @@ class OwnWindows(WindowModel):
         raise NotImplementedError
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames; see WindowModel.
+        """Take in the newest frames; see MotionModel.
 
         By default the n new frames are returned, which are the most that it can make.
         """

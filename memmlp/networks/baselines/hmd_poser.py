@@ -234,7 +234,7 @@ class HMDPoser(StreamModel):
         return tokens.flatten(-2), {"hidden": hidden, "cell": cell}
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames; see WindowModel.
+        """Take in the newest frames; see MotionModel.
 
         By default the n new frames are returned, which are the most that it can make.
         """
@@ -243,7 +243,7 @@ class HMDPoser(StreamModel):
         return self.normalizer.posed(self.pose(features[:, -wanted:]), sparse[:, -wanted:]), kept
 
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
-        """Make a training call, which predicts the shape too; see WindowModel."""
+        """Make a training call, which predicts the shape too; see MotionModel."""
         features, kept = self.features(sparse, state)
         self._shapes = self.shape(features) if self.shape is not None else None
         return self.normalizer.posed(self.pose(features), sparse), kept

@@ -46,7 +46,7 @@ from memmlp.networks.baselines.limb_solver import (
     swivels,
 )
 from memmlp.networks.memory import State
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 
 KEPT = (1, 2, 3, 6, 9, 12, 13, 14, 16, 17)
 """The joints whose local rotations are predicted, beside the root's: the trunk's, shoulders and hips."""
@@ -159,7 +159,7 @@ def off(made: Tensor, true: Tensor) -> Tensor:
     return (made - true).abs().mean()
 
 
-class Manikin(WindowModel):
+class Manikin(MotionModel):
     """What both networks have in common: limbs that are solved, and how they are trained.
 
     Any loss compares the solved pose, through which it reaches all parts; the network's own losses are of the
@@ -187,7 +187,7 @@ class Manikin(WindowModel):
         return Parts.of(made, self.normalizer).posed(encoded, self.normalizer)
 
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
-        """Make a training call with each window turned by a heading of its own; see WindowModel."""
+        """Make a training call with each window turned by a heading of its own; see MotionModel."""
         inputs, kept = self.taken_in(sparse, state)
         heading, space = self.heading(truth), Heading()
         window = space.sparse_in(inputs[:, -self.frames :], heading)

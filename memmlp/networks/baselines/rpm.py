@@ -135,7 +135,7 @@ class RPM(StreamModel):
         return self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames, one after the other; see WindowModel.
+        """Take in the newest frames, one after the other; see MotionModel.
 
         By default the n new frames are returned, which are the most that it can make.
         """

@@ -95,5 +95,5 @@ class SAGENet(OwnWindows):
         return self.decoder(upper, self.lower_latent(upper, encoded), encoded)[:, -1]
 
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
-        """Make a training call through both samplers, of the newest frame alone; see WindowModel."""
+        """Make a training call through both samplers, of the newest frame alone; see MotionModel."""
         return self.advance(sparse, state, 1)

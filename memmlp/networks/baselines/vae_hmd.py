@@ -128,7 +128,7 @@ class VAEHMD(StreamModel):
         return self.encoder(torch.cat([encoded[..., part] for part in POSES], -1))
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Take in the newest frames, each on its own; see WindowModel.
+        """Take in the newest frames, each on its own; see MotionModel.
 
         By default the n new frames are returned, which are the most that it can make.
         """

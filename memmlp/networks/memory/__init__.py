@@ -13,7 +13,13 @@ from memmlp.networks.memory.features import (
     Recurred,
     State,
 )
-from memmlp.networks.memory.own_past import CodeMemory, JointCodeMemory, NoCodesMemory, VQMemory
+from memmlp.networks.memory.own_past import (
+    CodeMemory,
+    JointCodeMemory,
+    NoCodesMemory,
+    OwnPastMemory,
+    VQMemory,
+)
 from memmlp.networks.memory.recurrent import GRUMemory, LSTMMemory, RecurrentMemory
 from memmlp.networks.memory.slot import Memory, NoMemory
 
@@ -27,6 +33,7 @@ __all__ = [
     "MemoryBlock",
     "NoCodesMemory",
     "NoMemory",
+    "OwnPastMemory",
     "Past",
     "ProjectedFeature",
     "Projection",

@@ -15,8 +15,8 @@ from memmlp.networks.memory.slot import FeatureMemory
 from memmlp.networks.vqvae import VQVAE, straight_through
 
 
-class NoCodesMemory(FeatureMemory):
-    """A memory of the network's own past without code-vectors (Table 11).
+class OwnPastMemory(FeatureMemory):
+    """A memory of the network's own past, with or without code-vectors; the base of both.
 
     Args:
         layers: the backbone's layers (1-based) that get a memory feature.
@@ -53,10 +53,6 @@ class NoCodesMemory(FeatureMemory):
         self.shift = {"frame": 1, "window": frames}[shift]
         self.length = frames + self.shift - 1
 
-    def feature(self) -> nn.Module:
-        """Make the module that computes a block's memory feature."""
-        return NoCodesFeature(self.width, self.blend)
-
     def initial_state(self, batch: int) -> State:
         """Return a motion of zeros, the paper's fallback where there is no previous prediction."""
         return {"motion": torch.zeros(batch, self.length, MOTION_DIM)}
@@ -88,8 +84,8 @@ class NoCodesMemory(FeatureMemory):
         return Past(sparse, motion, self.code_vectors(sparse, motion))
 
     def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
-        """Return code-vectors of width 0, (B, T, 0), since this memory has none."""
-        return sparse[..., :0]
+        """Return code-vectors (B, T, code width) of inputs (B, T, 54) and motion (B, T, 198)."""
+        raise NotImplementedError
 
     def remember(self, motion: Tensor, past: Past | Recurred | None, state: State, new: int) -> State:
         """Return the state after an output.
@@ -106,7 +102,19 @@ class NoCodesMemory(FeatureMemory):
         return {"motion": buffer}
 
 
-class VQMemory(NoCodesMemory):
+class NoCodesMemory(OwnPastMemory):
+    """A memory of the network's own past without code-vectors (Table 11)."""
+
+    def feature(self) -> nn.Module:
+        """Make the module that computes a block's memory feature."""
+        return NoCodesFeature(self.width, self.blend)
+
+    def code_vectors(self, sparse: Tensor, motion: Tensor) -> Tensor:
+        """Return code-vectors of width 0, (B, T, 0), since this memory has none."""
+        return sparse[..., :0]
+
+
+class VQMemory(OwnPastMemory):
     """A memory of the network's own past with code-vectors (Sec. 3.2.1), whatever VQ-VAE they come from.
 
     Each frame of the past window has one code-vector, shared by all memory blocks (reading 4).

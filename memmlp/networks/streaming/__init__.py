@@ -18,6 +18,7 @@ from memmlp.networks.baselines.rpm import RPM
 from memmlp.networks.baselines.sage_net import SAGENet
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.mem_mlp import MemMLP
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.recurrent_poser import RecurrentPoser
 from memmlp.networks.refiner import Refined
 from memmlp.networks.streaming.baselines import (
@@ -38,11 +39,10 @@ from memmlp.networks.streaming.mem_mlp import MemMLPStream
 from memmlp.networks.streaming.recurrent_poser import RecurrentPoserStream
 from memmlp.networks.streaming.refined import RefinedStream
 from memmlp.networks.streaming.sage import SAGENetStream
-from memmlp.networks.window_model import WindowModel
 
 __all__ = ["StreamingGraph", "has_stream", "streaming"]
 
-STREAMS: dict[type[WindowModel], type[StreamingGraph]] = {
+STREAMS: dict[type[MotionModel], type[StreamingGraph]] = {
     MemMLP: MemMLPStream,
     AvatarPoser: AvatarPoserStream,
     EgoPoser: EgoPoserStream,
@@ -60,7 +60,7 @@ STREAMS: dict[type[WindowModel], type[StreamingGraph]] = {
 }
 
 
-def streaming(model: WindowModel) -> StreamingGraph:
+def streaming(model: MotionModel) -> StreamingGraph:
     """Make the streaming graph of a trained network, which itself stays as it is.
 
     Raises:
@@ -83,7 +83,7 @@ def streaming(model: WindowModel) -> StreamingGraph:
     return STREAMS[type(model)](model)
 
 
-def has_stream(model: WindowModel) -> bool:
+def has_stream(model: MotionModel) -> bool:
     """Return whether there is a streaming graph of a network; of parts of one's own there may be none."""
     if isinstance(model, Refined):
         return has_stream(model.network)

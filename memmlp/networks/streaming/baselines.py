@@ -24,9 +24,9 @@ from memmlp.networks.baselines.rpm import RPM
 from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.layers import MLPBlock
 from memmlp.networks.memory import State
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.stream_model import StreamModel
 from memmlp.networks.streaming.graph import StreamingGraph, filled, slid
-from memmlp.networks.window_model import WindowModel
 
 
 class AvatarPoserStream(StreamingGraph):
@@ -36,7 +36,7 @@ class AvatarPoserStream(StreamingGraph):
     model: AvatarPoser
     layers: list[EncoderLayer]
 
-    def build(self, model: WindowModel) -> None:
+    def build(self, model: MotionModel) -> None:
         """Make the graph's parts from a copy of the network."""
         assert isinstance(model, AvatarPoser)
         self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))
@@ -95,13 +95,13 @@ class EgoPoserStream(StreamingGraph):
     """EgoPoser's streaming graph: what the embedding makes of each frame is carried, in order of time.
 
     Which frames the slow view adds to which changes at every step, so nothing after that can be carried. The
-    movement since the window's first frame is linear, so the first frame's share of it is taken off the sum.
+    movement since the window's first frame is linear, so the first frame's contribution is taken off the sum.
     """
 
     float32_modules = ("model.embedding", "model.orientation", "model.rotation")
     model: EgoPoser
 
-    def build(self, model: WindowModel) -> None:
+    def build(self, model: MotionModel) -> None:
         """Make the graph's parts from a copy of the network."""
         assert isinstance(model, EgoPoser)
         self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))
@@ -133,7 +133,7 @@ class AGRoLStream(StreamingGraph):
     width: int
 
     def windows(self) -> State:
-        """Return zeros (T - 1, d): the stem's share of each earlier frame's inputs."""
+        """Return zeros (T - 1, d): what the stem makes of each earlier frame's inputs."""
         return {"stem": torch.zeros(self.frames - 1, self.width)}
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
@@ -143,11 +143,11 @@ class AGRoLStream(StreamingGraph):
         return self.normalizer.posed(self.rotation(window), sparse), {"stem": window[1:]}
 
     def entering(self, encoded: Tensor) -> Tensor:
-        """Return the stem's share (1, d) of a frame's inputs (1, 54)."""
+        """Return what the stem makes (1, d) of a frame's inputs (1, 54)."""
         raise NotImplementedError
 
     def rotation(self, window: Tensor) -> Tensor:
-        """Map a window of such shares (T, d) to the rotations (1, 132) of its newest frame."""
+        """Map a window of such contributions (T, d) to the rotations (1, 132) of its newest frame."""
         raise NotImplementedError
 
 
@@ -157,7 +157,7 @@ class AGRoLMLPStream(AGRoLStream):
     model: AGRoLMLP
     blocks: list[MLPBlock]
 
-    def build(self, model: WindowModel) -> None:
+    def build(self, model: MotionModel) -> None:
         """Make the graph's parts from a copy of the network."""
         assert isinstance(model, AGRoLMLP)
         self.model, self.width = model, model.stem.out_features
@@ -186,7 +186,7 @@ class AGRoLDiffusionStream(AGRoLStream):
     blocks: list[MLPBlock]
     shifts: Tensor
 
-    def build(self, model: WindowModel) -> None:
+    def build(self, model: MotionModel) -> None:
         """Make the graph's parts from a copy of the network."""
         assert isinstance(model, AGRoLDiffusion)
         self.model, self.width = model, model.stem.out_features
@@ -196,7 +196,7 @@ class AGRoLDiffusionStream(AGRoLStream):
         self.register_buffer("shifts", torch.stack([block.time(embedding) for block in timed], 1))
 
     def entering(self, encoded: Tensor) -> Tensor:
-        """Return the stem's output (1, d) for a frame's inputs (1, 54), less the noisy motion's share."""
+        """Return the stem's output (1, d) for a frame's inputs (1, 54), less what the noisy motion adds."""
         return F.linear(encoded, self.model.stem.weight[:, ROTATION.stop :], self.model.stem.bias)
 
     def rotation(self, window: Tensor) -> Tensor:
@@ -221,7 +221,7 @@ class FrameStream(StreamingGraph):
 
     model: StreamModel
 
-    def build(self, model: WindowModel) -> None:
+    def build(self, model: MotionModel) -> None:
         """Make the graph's parts from a copy of the network."""
         assert isinstance(model, StreamModel)
         self.model = model
@@ -278,7 +278,7 @@ class AvatarJLMStream(StreamingGraph):
     model: AvatarJLM
     layers: list[EncoderLayer]
 
-    def build(self, model: WindowModel) -> None:
+    def build(self, model: MotionModel) -> None:
         """Make the graph's parts from a copy of the network."""
         assert isinstance(model, AvatarJLM)
         self.model, self.layers = model, cast(list[EncoderLayer], list(model.layers))

@@ -13,7 +13,7 @@ from memmlp.networks.layers import MLPBlock, PlainFusion, ResidualFusion
 from memmlp.networks.memory import MemoryBlock
 from memmlp.networks.predictor import Branch
 
-Take = Callable[[Tensor], Tensor]
+Selection = Callable[[Tensor], Tensor]
 
 
 def newest(window: Tensor) -> Tensor:
@@ -38,19 +38,19 @@ class Block(nn.Module):
         self.time_norm, self.time_mix = block.time_norm, block.time_mix
         self.norm, self.linear = block.norm, block.linear
 
-    def forward(self, h: Tensor, shares: Sequence[Tensor], take: Take = whole) -> Tensor:
+    def forward(self, h: Tensor, contributions: Sequence[Tensor], take: Selection = whole) -> Tensor:
         """Map (T, d) to what `take` selects of the block's output, without computing the rest.
 
         Args:
             h: the hidden state (T, d).
-            shares: what each memory block's feature adds to its linear layer, a window (T, d) each.
+            contributions: what each memory block's feature adds to its linear layer, a window (T, d) each.
             take: `whole` or `newest`.
         """
         mix = self.time_mix
         h = take(h) + F.silu(torch.addmm(take(mix.bias), take(mix.weight), self.time_norm(h)))
-        return self.channels(h, shares, take)
+        return self.channels(h, contributions, take)
 
-    def channels(self, h: Tensor, shares: Sequence[Tensor], take: Take) -> Tensor:
+    def channels(self, h: Tensor, contributions: Sequence[Tensor], take: Selection) -> Tensor:
         """Apply the block's second half, which works frame by frame."""
         return h + F.silu(self.linear(self.norm(h)))
 
@@ -58,21 +58,21 @@ class Block(nn.Module):
 class SharedBlock(Block):
     """A memory block whose memory feature was multiplied by its part of the linear layer beforehand.
 
-    That product is the feature's share: [h; z] W = h W_h + z W_z, and z W_z is known when a frame enters.
+    The feature's contribution: [h; z] W = h W_h + z W_z, and z W_z is known when a frame enters.
 
     Args:
         block: the network's block.
-        share: the block's index among the memory blocks.
+        index: the block's index among the memory blocks.
 
     Attributes:
-        feature_part: computes the share (1, d) of a feature (1, k), bias included.
+        feature_part: computes the contribution (1, d) of a feature (1, k), bias included.
     """
 
     feature_part: nn.Linear
 
-    def __init__(self, block: MLPBlock, share: int):
+    def __init__(self, block: MLPBlock, index: int):
         super().__init__(block)
-        self.share = share
+        self.index = index
         self.hidden = block.norm.normalized_shape[0]
 
     def own(self, layer: nn.Linear) -> nn.Linear:
@@ -88,25 +88,25 @@ class SharedBlock(Block):
 class ResidualBlock(SharedBlock):
     """The streaming form of ResidualFusion: h + f([h; z])."""
 
-    def __init__(self, block: ResidualFusion, share: int):
-        super().__init__(block, share)
+    def __init__(self, block: ResidualFusion, index: int):
+        super().__init__(block, index)
         self.linear = self.own(block.linear)
 
-    def channels(self, h: Tensor, shares: Sequence[Tensor], take: Take) -> Tensor:
+    def channels(self, h: Tensor, contributions: Sequence[Tensor], take: Selection) -> Tensor:
         """Apply the block's second half, which works frame by frame."""
-        return h + F.silu(self.linear(self.norm(h)) + take(shares[self.share]))
+        return h + F.silu(self.linear(self.norm(h)) + take(contributions[self.index]))
 
 
 class PlainBlock(SharedBlock):
     """The streaming form of PlainFusion: an MLP block, then Linear([h; z])."""
 
-    def __init__(self, block: PlainFusion, share: int):
-        super().__init__(block, share)
+    def __init__(self, block: PlainFusion, index: int):
+        super().__init__(block, index)
         self.merge = self.own(block.merge)
 
-    def channels(self, h: Tensor, shares: Sequence[Tensor], take: Take) -> Tensor:
+    def channels(self, h: Tensor, contributions: Sequence[Tensor], take: Selection) -> Tensor:
         """Apply the block's second half and the merging layer, which work frame by frame."""
-        return self.merge(super().channels(h, shares, take)) + take(shares[self.share])
+        return self.merge(super().channels(h, contributions, take)) + take(contributions[self.index])
 
 
 def part(layer: nn.Linear, inputs: slice, bias: Tensor | None) -> nn.Linear:
@@ -146,12 +146,12 @@ class StreamedBranch(nn.Module):
         super().__init__()
         self.blocks, self.linear = nn.ModuleList(blocks), linear
 
-    def forward(self, h: Tensor, shares: Sequence[Tensor], count: int) -> Tensor:
+    def forward(self, h: Tensor, contributions: Sequence[Tensor], count: int) -> Tensor:
         """Map the window (T, d) to the newest frame's outputs (1, size); `count` is always 1."""
         *earlier, last = self.blocks
         for block in earlier:
-            h = block(h, shares)
-        return self.linear(last(h, shares, newest))
+            h = block(h, contributions)
+        return self.linear(last(h, contributions, newest))
 
 
 class Converter:

@@ -11,14 +11,14 @@ from torch import Tensor, nn
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.networks.baselines.ancestral import Made
 from memmlp.networks.baselines.bodiffusion import NOISY, BoDiffusion, DiTBlock
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming.baselines import AGRoLStream
-from memmlp.networks.window_model import WindowModel
 
 
 class BoDiffusionStream(AGRoLStream):
     """BoDiffusion's streaming graph, in which layers that follow each other without a non-linearity are one.
 
-    The stem's share of each frame's inputs is carried, in order of time. What the diffusion times make of
+    What the stem makes of each frame's inputs is carried, in order of time. What the diffusion times make of
     each block is the same at every step of a stream, so it is computed once. Of the last call the newest
     frame alone is made.
     """
@@ -28,7 +28,7 @@ class BoDiffusionStream(AGRoLStream):
     blocks: list[DiTBlock]
     modulations: Tensor
 
-    def build(self, model: WindowModel) -> None:
+    def build(self, model: MotionModel) -> None:
         """Make the graph's parts from a copy of the network."""
         assert isinstance(model, BoDiffusion)
         self.model, self.width = model, model.stem.out_features
@@ -48,7 +48,7 @@ class BoDiffusionStream(AGRoLStream):
         self.made = linear(made.transpose(1, 2).flatten(0, 2), bias.transpose(0, 1).flatten())
 
     def entering(self, encoded: Tensor) -> Tensor:
-        """Return the stem's output (1, d) for a frame's inputs (1, 54), less the noisy motion's share."""
+        """Return the stem's output (1, d) for a frame's inputs (1, 54), less what the noisy motion adds."""
         return self.sparse(encoded)
 
     def rotation(self, window: Tensor) -> Tensor:
@@ -65,7 +65,7 @@ class BoDiffusionStream(AGRoLStream):
         return diffusion.sample(step, self.model.noises)
 
     def _made(self, noisy: Tensor, window: Tensor, index: int, count: int) -> Made:
-        """Predict the newest `count` frames' noise and share at sampling step `index` of (T, 132)."""
+        """Predict the newest `count` frames' noise and variance at sampling step `index` of (T, 132)."""
         h = window + self.motion(noisy) + self.model.places
         *earlier, last = zip(self.blocks, self.modulations[index], strict=True)
         for block, modulation in earlier:

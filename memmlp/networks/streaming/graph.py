@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.networks.memory import State
-from memmlp.networks.window_model import WindowModel
+from memmlp.networks.motion_model import MotionModel
 
 
 def filled(earlier: Tensor, first: Tensor, fresh: Tensor) -> Tensor:
@@ -55,7 +55,7 @@ class StreamingGraph(nn.Module):
 
     float32_modules: tuple[str, ...]
 
-    def __init__(self, model: WindowModel):
+    def __init__(self, model: MotionModel):
         super().__init__()
         model = copy.deepcopy(model).eval().requires_grad_(False)
         self.frames, self.normalizer, self.branches = model.frames, model.normalizer, model.branches
@@ -63,11 +63,11 @@ class StreamingGraph(nn.Module):
         self.requires_grad_(False)
 
     @classmethod
-    def fits(cls, model: WindowModel) -> bool:
+    def fits(cls, model: MotionModel) -> bool:
         """Return whether a network of the graph's class has only parts that it knows."""
         return True
 
-    def build(self, model: WindowModel) -> None:
+    def build(self, model: MotionModel) -> None:
         """Make the graph's parts from a copy of the network."""
         raise NotImplementedError
 

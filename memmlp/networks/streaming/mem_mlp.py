@@ -1,7 +1,7 @@
 """Mem-MLP's streaming graph: the numbers of `MemMLP.advance`, one frame at a time.
 
 When a frame enters, everything that depends on it alone is computed, and carried: the stem's output, the
-code-vector, the projections and, for each memory block, the share that its memory feature has in the block's
+code-vector, the projections and, for each memory block, what its memory feature contributes to the block's
 linear layer. Only the mixing over frames, and what follows it, is left for every step.
 """
 
@@ -13,12 +13,12 @@ from torch import Tensor, nn
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.networks.mem_mlp import MemMLP
 from memmlp.networks.memory import State
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.predictor import Branch
 from memmlp.networks.streaming.blocks import Converter
 from memmlp.networks.streaming.graph import StreamingGraph, filled, slid
 from memmlp.networks.streaming.one_frame_normalizer import OneFrameNormalizer
 from memmlp.networks.streaming.recall import recall
-from memmlp.networks.window_model import WindowModel
 
 
 class MemMLPStream(StreamingGraph):
@@ -33,11 +33,11 @@ class MemMLPStream(StreamingGraph):
     )
 
     @classmethod
-    def fits(cls, model: WindowModel) -> bool:
+    def fits(cls, model: MotionModel) -> bool:
         """Return whether the predictor is made of branches, which alone can be streamed."""
         return isinstance(model, MemMLP) and all(isinstance(c, Branch) for c in model.predictor.children())
 
-    def build(self, model: WindowModel) -> None:
+    def build(self, model: MotionModel) -> None:
         """Make the graph's parts from a copy of the network."""
         assert isinstance(model, MemMLP)
         self.conversions = OneFrameNormalizer(model.normalizer)
@@ -49,14 +49,14 @@ class MemMLPStream(StreamingGraph):
             assert isinstance(branch, Branch)
             setattr(self.predictor, name, converter.branch(branch))
         self.recall = recall(model.memory, converter.features, converter.shared)
-        self.shares = [f"memory.{index}" for index in range(len(converter.shared))]
+        self.contributions = [f"memory.{index}" for index in range(len(converter.shared))]
 
     def windows(self) -> State:
-        """Return zeros: windows of the stem's outputs and of the shares (T, d), and what the memory keeps."""
+        """Return zeros: windows (T, d) of stem outputs and of contributions, and the memory's state."""
         memory, window = self.recall.memory, torch.zeros(self.frames, self.stem.out_features)
         return {
             "sparse": torch.zeros(1, memory.length, SPARSE_DIM),
-            **{name: window.clone() for name in ("stem", *self.shares)},
+            **{name: window.clone() for name in ("stem", *self.contributions)},
             **memory.initial_state(1),
         }
 
@@ -69,11 +69,11 @@ class MemMLPStream(StreamingGraph):
         past = memory.recall(queue, state, 1)
         stem = self.stem(encoded)
         kept = {"stem": slid(state["stem"], stem, stem, fresh)}
-        for name, share, before in zip(self.shares, *self.recall(past), strict=True):
-            kept[name] = slid(state[name], share, before, fresh)
-        h, *shares = kept.values()
+        for name, contribution, before in zip(self.contributions, *self.recall(past), strict=True):
+            kept[name] = slid(state[name], contribution, before, fresh)
+        h, *contributions = kept.values()
         for block in self.blocks:
-            h = block(h, shares)
-        motion = self.predictor(h, shares, sparse, self.normalizer, 1)
+            h = block(h, contributions)
+        motion = self.predictor(h, contributions, sparse, self.normalizer, 1)
         kept |= memory.remember(motion[None], past, state, 1) | {"sparse": queue[:, 1:]}
         return self.conversions.decode_motion(motion, origin), kept

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from memmlp.networks.memory import (
     Memory,
-    NoCodesMemory,
+    OwnPastMemory,
     Past,
     ProjectedFeature,
     Projection,
@@ -98,13 +98,13 @@ class Recall(nn.Module):
         """Join the blocks' feature modules into one that computes a frame's features for all of them."""
 
     def forward(self, past: Past | Recurred | None) -> tuple[Pieces, Pieces]:
-        """Return each block's share (1, d) of the frame that enters, and of frames before the first one."""
+        """Return what each block (1, d) gets from the frame that enters, and from frames before the first."""
         if not self.parts:
             return (), ()
         z = self.feature(past)
-        shares = self._shares(z)
+        contributions = self._contributions(z)
         before = self.before(z)
-        return shares, shares if before is z else self._shares(before)
+        return contributions, contributions if before is z else self._contributions(before)
 
     def feature(self, past: Any) -> Tensor:
         """Return the features (1, blocks, k) of the frame that enters."""
@@ -114,7 +114,7 @@ class Recall(nn.Module):
         """Return the features of frames before the first one, given the first one's (1, blocks, k)."""
         return first
 
-    def _shares(self, z: Tensor) -> Pieces:
+    def _contributions(self, z: Tensor) -> Pieces:
         return [part(of) for part, of in zip(self.parts, z.flatten(0, 1).split(1), strict=True)]
 
 
@@ -178,7 +178,7 @@ def recall(memory: Memory, features: Sequence[nn.Module], blocks: Sequence[Share
     """Choose the kind of Recall that fits the memory."""
     ways: dict[type[Memory], type[Recall]] = {
         VQMemory: Coded,
-        NoCodesMemory: OwnPast,
+        OwnPastMemory: OwnPast,
         RecurrentMemory: FromRecurrence,
         Memory: Recall,
     }

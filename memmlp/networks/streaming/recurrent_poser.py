@@ -5,10 +5,10 @@ from __future__ import annotations
 from torch import Tensor
 
 from memmlp.networks.memory import State
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.recurrent_poser import RecurrentPoser
 from memmlp.networks.streaming.baselines import FrameStream
 from memmlp.networks.streaming.one_frame_normalizer import OneFrameNormalizer
-from memmlp.networks.window_model import WindowModel
 
 
 class RecurrentPoserStream(FrameStream):
@@ -20,7 +20,7 @@ class RecurrentPoserStream(FrameStream):
 
     model: RecurrentPoser
 
-    def build(self, model: WindowModel) -> None:
+    def build(self, model: MotionModel) -> None:
         """Make the graph's parts from a copy of the network."""
         assert isinstance(model, RecurrentPoser)
         self.model = model

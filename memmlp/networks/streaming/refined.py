@@ -5,10 +5,10 @@ from __future__ import annotations
 from torch import Tensor
 
 from memmlp.networks.memory import State
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.refiner import HIDDEN, Refined
 from memmlp.networks.streaming.blocks import FrameGRU
 from memmlp.networks.streaming.graph import StreamingGraph
-from memmlp.networks.window_model import WindowModel
 
 
 class RefinedStream(StreamingGraph):
@@ -30,7 +30,7 @@ class RefinedStream(StreamingGraph):
             "model.head",
         )
 
-    def build(self, model: WindowModel) -> None:
+    def build(self, model: MotionModel) -> None:
         """Keep a copy of the refiner; of the network the graph has one."""
         assert isinstance(model, Refined)
         self.model, self.hidden = model, model.initial_state(1)[HIDDEN]

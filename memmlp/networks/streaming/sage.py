@@ -14,9 +14,9 @@ from memmlp.networks.baselines.bodiffusion import DiTBlock
 from memmlp.networks.baselines.sage import LATENT, UpperDenoiser, places
 from memmlp.networks.baselines.sage_net import SAGENet
 from memmlp.networks.memory import State
+from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming.bodiffusion import linear
 from memmlp.networks.streaming.graph import StreamingGraph, slid
-from memmlp.networks.window_model import WindowModel
 
 
 class SAGENetStream(StreamingGraph):
@@ -29,7 +29,7 @@ class SAGENetStream(StreamingGraph):
     float32_modules: tuple[str, ...] = ("sparse", "decoder.heads")
     places: Tensor
 
-    def build(self, model: WindowModel) -> None:
+    def build(self, model: MotionModel) -> None:
         """Make the graph's parts from a copy of the network."""
         assert isinstance(model, SAGENet)
         self.diffusion, self.noises, self.decoder = model.diffusion, model.noises, model.decoder
@@ -104,7 +104,7 @@ class Sampler(nn.Module):
         self.denoiser, self.seen, self.noisy = denoiser, linear(seen, denoiser.stem.bias), linear(noisy)
 
     def condition(self, seen: Tensor) -> Tensor:
-        """Return the stem's share (T // 2, d) of what is seen of the window (T, d)."""
+        """Return what the stem makes (T // 2, d) of what is seen of the window (T, d)."""
         return self.seen(self.denoiser.condition.shortened(seen))
 
     def forward(self, noisy: Tensor, condition: Tensor, index: int) -> Tensor:

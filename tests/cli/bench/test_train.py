@@ -67,7 +67,7 @@ def test_a_file_goes_on_with_the_seeds_that_it_lacks_and_refuses_another_compari
 
 @pytest.mark.slow
 def test_a_profile_has_every_part_of_both(memmlp: Memmlp):
-    ran = memmlp("bench", "train", "--profile", "2", "--recipe", "optim=muon", *TINY)
+    ran = memmlp("bench", "train", "--breakdown", "2", "--recipe", "optim=muon", *TINY)
     assert ran.code == 0, ran.err
     assert ran.out.count("matrix products") == 4
     assert "recipe: " in ran.out

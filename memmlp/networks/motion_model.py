@@ -10,7 +10,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import State
 
 
-class WindowModel(nn.Module):
+class MotionModel(nn.Module):
     """A network that sees the last T frames and is moved in time by `advance`; the interface of all networks.
 
     Evaluation, export, timing and training know no more of a network than this. In this base class the state
