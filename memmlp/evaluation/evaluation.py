@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from memmlp.common.errors import InputError
 from memmlp.evaluation import modes
 from memmlp.evaluation.ik import IK
 from memmlp.evaluation.metrics import OwnMetrics
@@ -16,6 +17,7 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks.motion_model import MotionModel
 
+SAME = 0.1  # MPJPE, cm: up to here the positions of a network without a position branch are those of its rotations
 PICTURE_FRAMES = 600  # the picture shows the first 10 s of the first test clip
 
 
@@ -43,13 +45,33 @@ class Evaluation:
         Returns:
             "mean", the metrics by branch, and "clips", a row for each clip with its metrics by branch; and
             "offline" of a network that is no stream.
+
+        Raises:
+            InputError: if the network learns no positions, and its own are not those of its rotations.
         """
         torch.manual_seed(self.seed)  # a mode's result does not depend on which modes came before it
         found = modes.evaluate(model, test, [mode], self.batch, self.ik, self.metrics)
         facts = ("name", "group", "source", "frames")
         rows = [{key: row[key] for key in facts if key in row} | row[mode] for row in found["clips"]]
+        if "position" not in model.branches:
+            check_positions(type(model).__name__, rows)
         label = {} if model.streams else {"offline": True}
         return {"mean": found["mean"][mode], "clips": rows, **label}
+
+
+def check_positions(network: str, rows: Sequence[dict[str, Any]]) -> None:
+    """Check that positions which a network does not learn follow from its rotations by forward kinematics.
+
+    Raises:
+        InputError: if they don't: then the network, or the way it was loaded, is broken.
+    """
+    for row in rows:
+        own, followed = row["position"]["MPJPE"], row["rotation"]["MPJPE"]
+        if not abs(own - followed) <= SAME:
+            raise InputError(
+                f"{network}: its positions have an MPJPE of {own:.2f} cm in clip {row['name']}, those of its rotations "
+                f"{followed:.2f} cm; allowed without a position branch (branches) is forward kinematics of the rotations"
+            )
 
 
 def picture(model: MotionModel, test: MotionDataset, path: Path) -> None:

@@ -1,0 +1,49 @@
+"""The stage that evaluates, and the broken network that it refuses."""
+
+import pytest
+import tiny
+from exported import NETWORKS
+from torch import nn
+
+from memmlp.common.errors import InputError
+from memmlp.evaluation.evaluation import Evaluation
+from memmlp.evaluation.ik import NoIK
+from memmlp.motion.coordinates import Heading
+
+STREAM = Evaluation(("stream",), batch=4, ik=NoIK(), seed=0)
+TEST = tiny.frames((14, 11))
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        *NETWORKS.values(),
+        *(lambda o=o: tiny.recurrent_poser(Heading(), output=o) for o in ("local", "global")),
+    ],
+    ids=[*NETWORKS, "recurrent_local", "recurrent_global"],
+)
+def test_positions_that_are_not_learned_follow_from_the_rotations(network):
+    model = network()
+    row = STREAM.report(model, TEST, "stream")["clips"][0]
+    same = row["position"]["MPJPE"] == pytest.approx(row["rotation"]["MPJPE"], abs=1e-3)
+    assert same == ("position" not in model.branches)
+
+
+class Displaced(nn.Module):
+    """A head that leaves all bones away, as one did that was built before the rest pose was known."""
+
+    def __init__(self, head: nn.Module):
+        super().__init__()
+        self.head = head
+
+    def posed(self, h, sparse, normalizer):
+        motion = self.head.posed(h, sparse, normalizer).clone()
+        motion[..., -66:] = sparse[..., 36:39].repeat_interleave(22, -1)
+        return motion
+
+
+def test_positions_that_are_not_those_of_the_rotations_are_refused():
+    model = tiny.recurrent_poser(Heading(), output="global")
+    model.head = Displaced(model.head)
+    with pytest.raises(InputError, match=r"RecurrentPoser: its positions have an MPJPE of .* clip clip0"):
+        STREAM.report(model, TEST, "stream")
