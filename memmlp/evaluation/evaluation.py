@@ -17,7 +17,7 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks.motion_model import MotionModel
 
-SAME = 0.1  # MPJPE, cm: up to here the positions of a network without a position branch are those of its rotations
+SAME = 0.1  # cm: MPJPE of two branches up to this apart is that of the same joints
 PICTURE_FRAMES = 600  # the picture shows the first 10 s of the first test clip
 
 
@@ -69,8 +69,9 @@ def check_positions(network: str, rows: Sequence[dict[str, Any]]) -> None:
         own, followed = row["position"]["MPJPE"], row["rotation"]["MPJPE"]
         if not abs(own - followed) <= SAME:
             raise InputError(
-                f"{network}: its positions have an MPJPE of {own:.2f} cm in clip {row['name']}, those of its rotations "
-                f"{followed:.2f} cm; allowed without a position branch (branches) is forward kinematics of the rotations"
+                f"{network}: its positions have an MPJPE of {own:.2f} cm in clip {row['name']}, those of its "
+                f"rotations {followed:.2f} cm; allowed without a position branch (branches) is forward "
+                "kinematics of the rotations"
             )
 
 
