@@ -1,5 +1,7 @@
 """The stage that evaluates, and the broken network that it refuses."""
 
+from functools import partial
+
 import pytest
 import tiny
 from exported import NETWORKS
@@ -9,19 +11,16 @@ from memmlp.common.errors import InputError
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
 from memmlp.motion.coordinates import Heading
+from memmlp.networks.recurrent_poser import OUTPUTS
 
 STREAM = Evaluation(("stream",), batch=4, ik=NoIK(), seed=0)
 TEST = tiny.frames((14, 11))
 
 
-@pytest.mark.parametrize(
-    "network",
-    [
-        *NETWORKS.values(),
-        *(lambda o=o: tiny.recurrent_poser(Heading(), output=o) for o in ("local", "global")),
-    ],
-    ids=[*NETWORKS, "recurrent_local", "recurrent_global"],
-)
+RECURRENT = {name: partial(tiny.recurrent_poser, Heading(), output=name) for name in OUTPUTS}
+
+
+@pytest.mark.parametrize("network", [*NETWORKS.values(), *RECURRENT.values()], ids=[*NETWORKS, *RECURRENT])
 def test_positions_that_are_not_learned_follow_from_the_rotations(network):
     model = network()
     row = STREAM.report(model, TEST, "stream")["clips"][0]
