@@ -8,8 +8,20 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from memmlp.pipeline.run_stages import Outcome
+
+SLOTS = ("model", "memory", "predictor", "hand", "loss", "rollout", "refiner", "term")
+"""Of Mem-MLP, or of what is asked for in its place: with an override of them it is shown alone."""
+
+NETWORKS = ("Mem-MLP", "RecurrentPoser")
+LABELS = [word for name in NETWORKS for word in ("--label", name)]
 
 
 @click.command("demo")
@@ -17,27 +29,54 @@ import click
 def demo(overrides: tuple[str, ...]) -> None:
     """Run synthetic motion -> VQ-VAE -> Mem-MLP -> metrics -> ONNX -> latency, in minutes, on the CPU.
 
-    OVERRIDES are those of `memmlp train`, for example profile=tiny.
+    RecurrentPoser, this project's own network, goes the same way after it, and both are shown side by side.
+    OVERRIDES are those of `memmlp train`, for example profile=tiny. With another model, or an override of
+    Mem-MLP's slots, that network is shown alone.
     """
-    from memmlp.cli.train import train
+    from memmlp.cli.train_summary import show_side_by_side
 
     started = time.monotonic()
-    train(["data=synth", "profile=small", *overrides])
+    outcomes = trained(overrides)
+    if not any(word.lstrip("+~").startswith(SLOTS) for word in overrides):
+        outcomes += trained([*overrides, "model=recurrent_poser"])
+    if len(outcomes) == len(NETWORKS):
+        show_side_by_side(dict(zip(NETWORKS, outcomes, strict=True)))
     click.echo(f"the demo took {(time.monotonic() - started) / 60:.1f} minutes")
-    click.echo(next_steps(overrides, unentered()))
+    click.echo(next_steps(overrides, unentered(), [one.run.id for one in outcomes]))
 
 
-def next_steps(overrides: Sequence[str], environment: Path | None = None) -> str:
+def trained(overrides: Sequence[str]) -> list[Outcome]:
+    """Bring the run of these overrides to its end, show its results and return them."""
+    from memmlp.cli.train import run_training, train
+
+    outcomes: list[Outcome] = []
+
+    def job(cfg: DictConfig) -> None:
+        if outcome := run_training(cfg):
+            outcomes.append(outcome)
+
+    train(["data=synth", "profile=small", *overrides], job)
+    return outcomes
+
+
+def next_steps(overrides: Sequence[str], environment: Path | None = None, runs: Sequence[str] = ()) -> str:
     """Return the commands to try next, which train as the demo did.
 
     Args:
         overrides: those of the demo, which the same network without its memory needs, too.
         environment: the folder of an environment that this shell has not entered; None for none.
+        runs: ids of the demo's runs; two are drawn beside the truth.
     """
     words = " ".join(map(shlex.quote, ["memmlp", "train", *overrides, "memory=none"]))
+    both = (
+        []
+        if len(runs) < 2
+        else [shlex.join(["memmlp", "render", *runs, *LABELS, "--to", "3", "--out", "both.gif"])]
+    )
     enter = [f"source {shlex.quote(str(environment / 'bin' / 'activate'))}"] if environment else []
     lines = [
         *enter,
+        *both,
         f"{words}          the same without the memory; then memmlp runs list",
         "memmlp data import BVH_FOLDER --out outputs/data/mine",
         " ".join(["memmlp train", *sizes(overrides), "data=mocap data.root=outputs/data/mine"]),

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import click
 from hydra import version
@@ -19,6 +20,9 @@ from memmlp.config.compose import CONFIG, VERSION_BASE, help_text, parse, prefli
 from memmlp.config.explain import explain
 from memmlp.config.packaged import packaged
 from memmlp.config.schema import check, register
+
+if TYPE_CHECKING:
+    from memmlp.pipeline.run_stages import Outcome
 
 
 @click.command(
@@ -104,8 +108,12 @@ def _collecting(
     return task
 
 
-def run_training(cfg: DictConfig) -> None:
-    """Check the config, bring its run to its end, and print the results."""
+def run_training(cfg: DictConfig) -> Outcome | None:
+    """Check the config, bring its run to its end, and print and return the results.
+
+    Returns:
+        None in the processes that trained along.
+    """
     import torch
 
     from memmlp.cli.train_summary import show
@@ -117,3 +125,4 @@ def run_training(cfg: DictConfig) -> None:
         torch.set_num_threads(cfg.threads)
     if outcome := run_distributed(build_experiment(cfg)):
         show(outcome)
+    return outcome

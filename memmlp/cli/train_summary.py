@@ -37,6 +37,29 @@ def show(outcome: Outcome) -> None:
     console.print(f"picture  {run.picture}", soft_wrap=True)
 
 
+def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:
+    """Print what networks, by their names, make of the same test clips, and what they cost.
+
+    The errors are those of the rotations, in stream mode where that was measured.
+    """
+    found = {name: outcome.results for name, outcome in outcomes.items()}
+    mode = "stream" if all("stream" in results for results in found.values()) else "window"
+    table = Table(title=f"side by side, {mode}", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("metric")
+    table.add_column("unit")
+    for name in found:
+        table.add_column(name, justify="right")
+    for metric, unit in UNITS.items():
+        values = [results[mode]["rotation"].get(metric) for results in found.values()]
+        if None not in values:
+            table.add_row(metric, unit, *(f"{value:.2f}" for value in values))
+    costs = [results["latency"] for results in found.values() if "latency" in results]
+    if len(costs) == len(found):
+        table.add_row("a frame", "ms", *(f"{cost['median_ms']:.2f}" for cost in costs))
+        table.add_row("parameters", "M", *(f"{cost['parameters'] / 1e6:.2f}" for cost in costs))
+    Console(highlight=False).print(table)
+
+
 def show_latency(console: Console, measured: Mapping[str, Any]) -> None:
     """Print what a frame takes, and how large the network is."""
     console.print(

@@ -16,8 +16,19 @@ def test_each_stage_has_a_line_without_a_terminal(memmlp):
     ran = memmlp("demo", *TINY)
     assert ran.code == 0
     stages = [line.partition(":")[0] for line in ran.err.splitlines()]
-    assert stages == ["data", "VQ-VAE", "network", "evaluation", "deployment"]
+    again = ["data", "network", "evaluation", "deployment"]
+    assert stages == ["data", "VQ-VAE", "network", "evaluation", "deployment", *again]
+    head = next(line for line in ran.out.splitlines() if "Mem-MLP" in line)
+    assert head.split() == ["metric", "unit", "Mem-MLP", "RecurrentPoser"]
     assert "the demo took" in ran.out
+    assert "--label Mem-MLP --label RecurrentPoser" in ran.out.partition("next: ")[2]
+
+
+@pytest.mark.slow
+def test_an_override_of_mem_mlps_slots_shows_it_alone(memmlp):
+    ran = memmlp("demo", *TINY, "memory=none", "evaluation.modes=[stream]", "export.graph=off")
+    assert (ran.code, ran.out.count("run      ")) == (0, 1)
+    assert "side by side" not in ran.out
 
 
 def test_what_comes_next_repeats_the_words_of_the_demo():

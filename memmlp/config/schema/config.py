@@ -177,6 +177,8 @@ class ProfileConfig:
     recurrent_poser_frames: Optional[int] = optional(Within(2))
     recurrent_poser_width: Optional[int] = optional(Within(1))
     recurrent_poser_depth: Optional[int] = optional(Within(1))
+    recurrent_poser_lr: Optional[float] = optional(Within(0, strict=True))
+    recurrent_poser_warmup: Optional[int] = optional(Within(0))
     refiner_width: Optional[int] = optional(Within(1))
     refiner_frames: Optional[int] = optional(Within(4))
     refiner_pieces: Optional[int] = optional(Within(1))
