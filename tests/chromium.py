@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from processes import MARK, until
+from processes import MARK, PATIENCE, until
 
 SETPRIV = shutil.which("setpriv")
 MODEST = [SETPRIV, "--bounding-set=-sys_nice"] if SETPRIV and os.geteuid() == 0 else []
@@ -131,7 +131,9 @@ class Browser:
 
     def resolved(self, expression: str) -> Any:
         """What a promise on the page resolves to."""
-        result = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        late = f"setTimeout(() => fail(new Error('not within {PATIENCE:.0f} s')), {1000 * PATIENCE:.0f})"
+        bounded = f"Promise.race([{expression}, new Promise((_, fail) => {late})])"
+        result = self.call("Runtime.evaluate", expression=bounded, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 

@@ -58,6 +58,8 @@
     return { position: { x: m.m41, y: m.m42, z: m.m43 }, orientation: q };
   }
 
+  const drawn = () => new Promise(resolve => kept.session.requestAnimationFrame(resolve));
+
   // Play frames of trackers (joints) at 60 Hz with devices that sit on the body as `offsets` say; resolves at the end.
   // The last frame is kept until `over()` holds.
   kept.play = async (frames, offsets, over = () => true) => {
@@ -66,7 +68,6 @@
       const turned = multiply(rotation, inverse(offsets.rotations[i]));
       return { position: minus(position, rotate(turned, offsets.positions[i])), rotation: turned };
     });
-    const drawn = () => new Promise(resolve => kept.session.requestAnimationFrame(resolve));
     const began = await drawn();
     for (let now = began; ; now = await drawn()) {
       const frame = Math.floor((now - began) * 0.06);
@@ -88,9 +89,15 @@
     return session;
   }
 
-  kept.pull = () => {
-    device.controllers.right.updateButtonValue('trigger', 1);
-    setTimeout(() => device.controllers.right.updateButtonValue('trigger', 0), 100);
+  // Pull the trigger and let go, over as many frames as it takes to be seen.
+  kept.pull = async () => {
+    let seen = false;
+    kept.session.addEventListener('select', () => { seen = true; }, { once: true });
+    for (let value = 1; !seen; value = 1 - value) {
+      device.controllers.right.updateButtonValue('trigger', value);
+      for (let i = 0; i < 2; i++) await drawn();
+    }
+    device.controllers.right.updateButtonValue('trigger', 0);
   };
   window.headset = kept;
 })();

@@ -114,7 +114,8 @@ def worn(browser: Browser, site: Made) -> dict[str, Any]:
     browser.resolved(
         "import('./headset.js').then(module => { window.offsets = module.usualOffsets('controllers'); })"
     )
-    browser.value(f"window.tPose = {json.dumps(t_pose(site))}; headset.pull()")
+    browser.value(f"window.tPose = {json.dumps(t_pose(site))}")
+    browser.resolved("headset.pull()")
     browser.resolved(f"headset.play([tPose], offsets, () => {SITE}.calibrated)")
     browser.resolved(f"headset.play({json.dumps(joints())}, offsets)")
     browser.resolved("headset.session.end()")
