@@ -12,10 +12,10 @@ objectives: [MPJPE]                 # on validation, to be lowered; [MPJPE, Jitt
 n_trials: 30                        # in all, however often the search is started
 seeds: 1                            # runs of each trial, whose value is their mean; the first is pruned on
 sampler: tpe                        # or random; or grid: each combination of choices once
-startup: 10                         # random trials (after the first) before TPE learns from them
+startup: 10                         # random trials (after the first) before TPE learns; null without TPE
 seed: 0                             # of the sampler
 pruner: median                      # stops a trial that is worse than the median of the others; or none
-prune_after: 5                      # so many trials are finished before one may be stopped
+prune_after: 5                      # so many trials are finished before one is stopped; null for no pruner
 storage: null                       # null: a journal in the search's folder; or a storage URL of Optuna's
 """
 
@@ -107,10 +107,10 @@ class Search:
     n_trials: int
     seeds: int
     sampler: str
-    startup: int
+    startup: int | None
     seed: int
     pruner: str
-    prune_after: int
+    prune_after: int | None
     storage: str | None
 
     def first_trials(self) -> list[dict[str, Value]]:
@@ -173,10 +173,10 @@ def parse_search(content: Mapping[str, Any]) -> Search:
         n_trials=_whole(content, "n_trials", 1),
         seeds=_whole(content, "seeds", 1),
         sampler=_one_of(content, "sampler", SAMPLERS),
-        startup=_whole(content, "startup", 1),
+        startup=_whole_or_null(content, "startup", needed=content["sampler"] == "tpe"),
         seed=_whole(content, "seed", 0),
         pruner=_one_of(content, "pruner", PRUNERS),
-        prune_after=_whole(content, "prune_after", 1),
+        prune_after=_whole_or_null(content, "prune_after", needed=content["pruner"] != "none"),
         storage=storage,
     )
 
@@ -293,6 +293,10 @@ def _whole(content: Mapping[str, Any], name: str, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise InputError(f"search.{name}={value}: allowed is a whole number of at least {least}")
     return value
+
+
+def _whole_or_null(content: Mapping[str, Any], name: str, needed: bool) -> int | None:
+    return None if content[name] is None and not needed else _whole(content, name, 1)
 
 
 def _one_of(content: Mapping[str, Any], name: str, words: Sequence[str]) -> str:

@@ -52,7 +52,8 @@ class Study:
         """
         if search.storage is None:
             mend(journal(folder))
-        pruner = optuna.pruners.MedianPruner(search.prune_after, 0)
+        after = search.prune_after
+        pruner = optuna.pruners.NopPruner() if after is None else optuna.pruners.MedianPruner(after, 0)
         kept: dict[str, Any] = {"storage": storage(search, folder), "study_name": name, "pruner": pruner}
         try:
             study = optuna.load_study(**kept)
@@ -229,7 +230,7 @@ def sampler(search: Search, number: int) -> optuna.samplers.BaseSampler:
     So a search that is resumed does not draw the random numbers of its earlier trials again.
     """
     seed = int(np.random.SeedSequence([search.seed, number]).generate_state(1)[0])
-    if search.sampler != "tpe":  # a grid's trials have their values already
+    if search.startup is None or search.sampler != "tpe":  # a grid's trials have their values already
         return optuna.samplers.RandomSampler(seed=seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ExperimentalWarning)

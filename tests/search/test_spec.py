@@ -104,6 +104,8 @@ def test_an_objective_that_is_not_validated_is_named():
             "search.seeds=3: allowed is 1 where the space has the seed",
         ),
         ({"startup": 1.5}, "search.startup=1.5"),
+        ({"startup": None}, "search.startup=None: allowed is a whole number of at least 1"),
+        ({"prune_after": None}, "search.prune_after=None: allowed is a whole number of at least 1"),
         ({"seed": -1}, "search.seed=-1"),
         ({"sampler": "gp"}, "search.sampler=gp: allowed is tpe or random or grid"),
         (

@@ -44,7 +44,7 @@ def test_the_seed_changes_what_is_proposed_and_the_sampler_too(tmp_path: Path):
 
 def test_a_grid_has_each_combination_once_in_order_however_often_it_is_stopped(tmp_path: Path):
     space = {"loss": {"rotation": {"choices": [1.0, 2.0]}, "hand": {"choices": [0.1, 0.2, 0.3]}}}
-    grid = {"sampler": "grid", "space": space, "n_trials": 6}
+    grid = {"sampler": "grid", "space": space, "n_trials": 6, "startup": None, "prune_after": None}
     for _ in range(3):
         one = director(open_study(tmp_path, **grid), tmp_path)
         finish(one.look(1))
