@@ -41,13 +41,14 @@ def collect(
     Args:
         sweep: the sweep; where seeds were spent in rounds, `rounds.spent(sweep)`.
         runs: the finished runs of every runnable arm, by seed (`finished_runs`).
-        modes: the modes of evaluation to show ("stream", "window").
+        modes: the modes of evaluation to show ("stream", "window"); one that no run has is left out where
+            another has one.
         command: the command that makes missing runs; `memmlp sweep` with the sweep's name by default.
         state: says in a word how far the unfinished run of an arm and seed is; None for nothing to say.
         older: names the run of an earlier recipe that there is in place of a missing one; None for none.
         rounds: the rounds whose verdicts stand; None for verdicts of a fixed number of seeds.
     """
-    shown = tuple(modes) if set(sweep.metrics) - set(COSTS) else tuple(modes)[:1]
+    shown = _shown(modes, runs) if set(sweep.metrics) - set(COSTS) else tuple(modes)[:1]
     seen = with_existing_branches(sweep, runs)
     # The correction is over both modes, whichever of them are shown.
     every = MODES if set(sweep.metrics) - set(COSTS) else shown
@@ -70,6 +71,12 @@ def collect(
         flags=tuple(flags(seen, sweep, runs, command or f"memmlp sweep {sweep.name}", state, older)),
         looks=tuple((look.seeds, look.level) for look in rounds.taken) if rounds else (),
     )
+
+
+def _shown(modes: Sequence[str], runs: Mapping[str, Runs]) -> tuple[str, ...]:
+    """Return those of the modes in which runs were evaluated; all where there are none."""
+    measured = {mode for found in runs.values() for run in found.values() for mode in run.means}
+    return tuple(mode for mode in modes if mode in measured) or tuple(modes)
 
 
 class OnSource(NamedTuple):

@@ -82,3 +82,16 @@ def test_arms_without_a_sources_clips_are_left_out_and_named(tmp_path: Path):
     assert all(len(run.clips) == len(clips) // 2 for run in old.runs["both"].values())
     with pytest.raises(InputError, match=r"--source third: no finished run .* allowed is new, old"):
         on_source(sweep, runs, "third")
+
+
+def test_a_mode_in_which_nothing_was_measured_is_left_out(tmp_path: Path):
+    sweep = parse_sweep("two", {"arms": {"one": [], "both": ["optim.lr=1"]}, "seeds": [0]})
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
+    assert collect(sweep, runs).modes == ("stream", "window")
+    streamed = {
+        label: {seed: replace(run, means={"stream": run.means["stream"]}) for seed, run in found.items()}
+        for label, found in runs.items()
+    }
+    assert collect(sweep, streamed).modes == ("stream",)
+    assert collect(sweep, {**streamed, "both": runs["both"]}).modes == ("stream", "window")
+    assert collect(sweep, streamed, ["window"]).modes == ("window",)
