@@ -40,6 +40,8 @@ def demo(overrides: tuple[str, ...]) -> None:
     if not any(word.lstrip("+~").startswith(SLOTS) for word in overrides):
         outcomes += trained([*overrides, "model=recurrent_poser"])
     if len(outcomes) == len(NETWORKS):
+        if "profile=tiny" in overrides:
+            click.echo("profile=tiny trains for a few steps: these errors say nothing of the networks")
         show_side_by_side(dict(zip(NETWORKS, outcomes, strict=True)))
     click.echo(f"the demo took {(time.monotonic() - started) / 60:.1f} minutes")
     click.echo(next_steps(overrides, unentered(), [one.run.id for one in outcomes]))
@@ -79,14 +81,14 @@ def next_steps(overrides: Sequence[str], environment: Path | None = None, runs: 
         *both,
         f"{words}          the same without the memory; then memmlp runs list",
         "memmlp data import BVH_FOLDER --out outputs/data/mine",
-        " ".join(["memmlp train", *sizes(overrides), "data=mocap data.root=outputs/data/mine"]),
+        " ".join(["memmlp train", *machine(overrides), "data=mocap data.root=outputs/data/mine"]),
     ]
     return "next: " + "\n      ".join(lines)
 
 
-def sizes(overrides: Sequence[str]) -> list[str]:
-    """Return the words among the overrides that choose the profile."""
-    return [shlex.quote(word) for word in overrides if word.startswith("profile=")]
+def machine(overrides: Sequence[str]) -> list[str]:
+    """Return the words among the overrides that say how large and on what to train, whatever the data."""
+    return [shlex.quote(word) for word in overrides if word.startswith(("profile=", "threads=", "device="))]
 
 
 def unentered() -> Path | None:

@@ -100,5 +100,7 @@ def clip_index(test: MotionDataset, name: str, key: str = "--clip") -> int:
     key: what the name was given as, for that line.
     """
     if name not in test.names:
-        raise InputError(f"{key} {name}: no such test clip; allowed are {', '.join(test.names)}")
+        raise InputError(
+            f"{key} {name}: no such test clip of the run's data; allowed are {', '.join(test.names)}"
+        )
     return test.names.index(name)

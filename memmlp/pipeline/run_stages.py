@@ -61,7 +61,7 @@ def of_tests(clips: Sequence[ClipRecord]) -> str:
     counts = f"test clips: {len(tested)}, in groups: {len(set(tested))}"
     if len(set(tested)) > 1:
         return counts
-    return f"{counts}, which decides nothing; data.split.test=0.35 tests on more"
+    return f"{counts}, which decides nothing; more motion or a larger data.split.test tests on more"
 
 
 def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
@@ -216,15 +216,15 @@ def train_upstream(
 def recording_outcome(experiment: Experiment, run: Run, again: bool = False) -> Iterator[None]:
     """Follow work on a run in the trackers, and record its failure in the run's folder.
 
-    Only failures of the work itself count: bad input, interruptions, a full disk and the loss of the run to
-    another process leave it as it is.
+    Only failures of the work itself count: bad input, interruptions, a full disk, a reader of our output that
+    went away, and the loss of the run to another process leave it as it is.
     """
     missing = again or not run.done or not all(map(run.has, experiment.stages))
     tracking = experiment.tracking if missing else Tracking((), experiment.outputs)
     with tracking.following(run):
         try:
             yield
-        except LeaseLost:
+        except (LeaseLost, BrokenPipeError):
             raise
         except TrainingDiverged as error:
             run.fail(str(error))
@@ -239,7 +239,9 @@ def train_run(
     experiment: Experiment, run: Run, data: Prepared, upstream: Run | None, watch: Watch = unwatched
 ) -> None:
     """Train the network of a run, and mark the run as done."""
-    tell(f"network: train it for {experiment.training.optim.steps} steps (run {run.id})")
+    steps = experiment.training.optim.steps
+    onward = ", on from its checkpoint" if run.checkpoint.exists() else ""
+    tell(f"network: train it for {steps} steps{onward} (run {run.id})")
     begin(experiment, run, experiment.identity(data.digest), experiment.config)
     run.write_manifest({"body": data.manifest.body, "partial": partial_words(experiment, data)})
     run.clear_stages()

@@ -154,7 +154,7 @@ class Run:
     @property
     def status(self) -> str:
         """One of STATUSES: what a process is doing with the run, or else how far it is."""
-        return self.stage or self.state(self.done)
+        return self.stage or self.state(self.done and not self.failure)
 
     @property
     def stage(self) -> str | None:

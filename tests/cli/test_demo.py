@@ -32,10 +32,17 @@ def test_an_override_of_mem_mlps_slots_shows_it_alone(memmlp):
 
 
 def test_what_comes_next_repeats_the_words_of_the_demo():
-    first, imported, own = next_steps(["profile=tiny", "seed=1"]).splitlines()
-    assert first.startswith("next: memmlp train profile=tiny seed=1 memory=none ")
+    first, imported, own = next_steps(["profile=tiny", "seed=1", "threads=1"]).splitlines()
+    assert first.startswith("next: memmlp train profile=tiny seed=1 threads=1 memory=none ")
     assert "memmlp data import" in imported
-    assert own.split() == ["memmlp", "train", "profile=tiny", "data=mocap", "data.root=outputs/data/mine"]
+    assert own.split() == [
+        "memmlp",
+        "train",
+        "profile=tiny",
+        "threads=1",
+        "data=mocap",
+        "data.root=outputs/data/mine",
+    ]
 
 
 def test_an_environment_that_was_not_entered_is_entered_first(

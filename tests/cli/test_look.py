@@ -66,7 +66,10 @@ def test_a_films_branch_mode_and_times(memmlp: Memmlp, finished: Run, clips: lis
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--clip", "nobody", "--out", "a.png"], ("--clip nobody", "no such test clip; allowed are ")),
+        (
+            ["--clip", "nobody", "--out", "a.png"],
+            ("--clip nobody", "no such test clip of the run's data; allowed are "),
+        ),
         (["--out", "a.avi"], ("--out a.avi", ".png, .gif, .mp4")),
         (["--out", "no/a.png"], ("no folder no",)),
         (["--from", "900", "--out", "a.png"], ("--from 900", "nothing between")),

@@ -187,7 +187,7 @@ def test_list_shows_what_differs_as_far_as_there_is_room(
         monkeypatch.setenv("COLUMNS", width)
         seen[width] = memmlp("runs", "list").out
     assert heads(seen["40"]) == {"run", "status", "seed", "MPJPE", "stream"}
-    assert "differ in memory.layers, too: --columns shows it" in seen["40"]
+    assert "differ in memory.layers, too: --columns memory.layers" in seen["40"]
     assert heads(seen["70"]) == {"run", "status", "name", "seed", "memory.", "layers", "MPJPE", "stream"}
     assert "too:" not in seen["70"]
     assert heads(seen["120"]) == heads(seen["70"]) | {"window", "Jitter", "age", "ms"}

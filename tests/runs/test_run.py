@@ -234,6 +234,8 @@ def test_the_status_names_the_stage_that_somebody_is_at(tmp_path: Path):
             run.attempt(stage)
             assert (run.stage, run.status, run.state(False)) == (word, word, "running")
     assert (run.stage, run.status) == (None, "done")
+    run.fail("the evaluation's memory")
+    assert (run.status, run.done) == ("failed", True)
 
 
 def test_runs_need_neither_torch_nor_hydra():

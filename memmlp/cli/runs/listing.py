@@ -72,7 +72,7 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
     keys = wanted(columns, records, listed)
     hidden = show_runs([{**records[run.id], "age": age(run)} for run in listed], keys, bool(columns))
     if hidden:
-        click.echo(f"they differ in {', '.join(hidden)}, too: --columns shows it")
+        click.echo(f"they differ in {', '.join(hidden)}, too: --columns {','.join(hidden)}")
     if upstream := Counter(kind_words(run.manifest["kind"]) for run in there if run not in found):
         told = ", ".join(f"{count} finished {word}" for word, count in upstream.items())
         click.echo(f"{told}: memmlp runs list --all")

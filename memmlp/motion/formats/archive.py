@@ -144,7 +144,7 @@ def open_npz(path: Path) -> Iterator[Npz]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     if magic != MAGIC:
-        raise InputError(f"{path}: no zip, so no npz")
+        raise InputError(f"{path}: no zip, so no npz (memmlp data import makes one of BVH)")
     try:
         with _Bounded(io.FileIO(path)) as file, zipfile.ZipFile(file) as archive:
             yield Npz(path, archive)

@@ -239,7 +239,7 @@ def _import_file(
 
 def _notes(clips: Sequence[Imported], maps: Mapping[str, SkeletonMap], how: ImportSettings) -> Iterator[str]:
     """Yield what a person has to know of an import, a line each."""
-    yield from dict.fromkeys(_rate_note(clip) for clip in clips if clip.fps != clip.header_fps)
+    yield from _rate_notes([clip for clip in clips if clip.fps != clip.header_fps])
     yield from (f"{skeleton.name}: {skeleton.note}" for skeleton in maps.values() if skeleton.note)
     for name in maps:
         yield from _family_notes(name, [clip for clip in clips if clip.skeleton == name])
@@ -262,10 +262,15 @@ def _family_notes(name: str, clips: Sequence[Imported]) -> Iterator[str]:
         yield f"{name}: {each}, so head, hands and feet may be turned differently; a map's rest mends that"
 
 
-def _rate_note(clip: Imported) -> str:
-    """Describe a folder's corrected rate in one line."""
-    folder = Path(clip.source).parent.as_posix()
-    return f"{folder}: {clip.fps:g} Hz, {clip.fps_reason}; the header says {clip.header_fps:g} Hz"
+def _rate_notes(clips: Sequence[Imported]) -> Iterator[str]:
+    """Describe corrected rates, a line for the clips of a folder that have the same one."""
+    alike: dict[str, list[str]] = {}
+    for clip in clips:
+        told = f"{clip.fps:g} Hz, {clip.fps_reason}; the header says {clip.header_fps:g} Hz"
+        alike.setdefault(f"{Path(clip.source).parent.as_posix()}: {told}", []).append(Path(clip.source).name)
+    for told, names in alike.items():
+        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+        yield f"{told} ({', '.join(names[:3])}{more})"
 
 
 def _publish(staging: Path, out: Path, report: ImportReport, body: str) -> None:

@@ -75,7 +75,7 @@ def test_import_writes_clips_and_record(source: Path, tmp_path: Path) -> None:
         "salsa/02.bvh",
         "top.bvh",
     ]
-    assert report.notes == ("salsa: 60 Hz, in salsa/motion.yaml; the header says 120 Hz",)
+    assert report.notes == ("salsa: 60 Hz, in salsa/motion.yaml; the header says 120 Hz (01.bvh, 02.bvh)",)
     record = json.loads((out / "import.json").read_text())
     assert [clip["clip"] for clip in record["clips"]] == sorted(rates(out))
     assert record["clips"][3]["sha256"] == hashlib.sha256((source / "top.bvh").read_bytes()).hexdigest()
