@@ -21,6 +21,9 @@ from memmlp.search.spec import parse_search
 ROOT = Path(__file__).parent.parent
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"(?<!`)`([^`\n]+(?:\n[^`\n]+)?)`(?!`)")
+OF_BOTH_SOURCES = (
+    "mix", "scaling", "networks", "recurrent_poser", "recurrent_poser_ingredients", "data=cmu_bandai",
+)  # fmt: skip
 OWN = re.compile(r"[\w./-]*\.yaml")  # a sweep file that a page invents
 
 
@@ -163,7 +166,7 @@ def make_placeholders(words: list[str]) -> None:
         elif key == "data.body" and value != "builtin":
             Path(value).parent.mkdir(parents=True, exist_ok=True)
             Path(value).touch()
-        elif word in ("mix", "scaling", "networks", "data=cmu_bandai"):
+        elif word in OF_BOTH_SOURCES:
             make_placeholders(["data.root=outputs/data/cmu,outputs/data/bandai"])
         elif word == "myconf":
             Path("myconf/hand").mkdir(parents=True, exist_ok=True)
