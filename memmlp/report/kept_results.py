@@ -85,7 +85,7 @@ class Kept:
             InputError: where one has others, so that the runs are of another arm with the same label.
         """
         for label, words in arms.items():
-            if label in self.arms and self.arms[label] != words:
+            if self.runs.get(label) and self.arms.get(label, words) != words:
                 before, now = ", ".join(self.arms[label]) or "none", ", ".join(words) or "none"
                 raise InputError(f"arm '{label}' was made with the overrides {before}, and has {now}")
 

@@ -339,3 +339,10 @@ def test_by_hand_is_what_a_page_has(sweep: Sweep, kept: Kept):
 
 def test_nothing_to_keep(sweep: Sweep):
     assert Kept("table14", (), runs_of(sweep, nothing), {}).every == []
+
+
+def test_an_arm_that_was_never_run_may_become_another(sweep: Sweep, kept: Kept):
+    waiting = replace(kept, runs={**kept.runs, "2": {}})
+    other = {**kept.arms, "2": ("memory=gru",)}
+    waiting.check(other)
+    assert waiting.merged(replace(kept, arms=other)).arms["2"] == ("memory=gru",)
