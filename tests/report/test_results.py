@@ -258,19 +258,25 @@ def test_every_interval_of_the_clone_follows_from_what_is_kept():
     for name, one in sources(DOCS).items():
         text, printed = (DOCS / f"{name}.md").read_text(encoding="utf-8"), []
         content = json.loads((DOCS / "data" / f"{name}.json").read_text())
-        for table in (one.table, *one.by_source):  # what the sources' arms share are the clips of all tables
+        sources_of = [None, *(one.kept.sources if one.by_source else ())]
+        for source_name, table in zip(sources_of, (one.table, *one.by_source), strict=True):
             for row in table.rows:
                 for mode, cells in row.cells.items():
                     for metric, cell in cells.items():
                         if cell.effect is not None and cell.effect.low is not None:
-                            interval = by_hand(content, row, table, mode, metric)
+                            interval = by_hand(content, row, table, mode, metric, source_name)
                             assert (cell.effect.low, cell.effect.high) == pytest.approx(interval)
                             printed.append(interval)
         assert len(re.findall(r"\\\[[^\]]*\d, [^\]]*\d\\\]", text)) == len(printed)
 
 
-def by_hand(content: dict, row, table, mode: str, metric: str) -> tuple[float, float]:
-    """Compute the interval of a row's difference from its control, from a file's content alone."""
+def by_hand(
+    content: dict, row, table, mode: str, metric: str, source: str | None = None
+) -> tuple[float, float]:
+    """Compute the interval of a row's difference from its control, from a file's content alone.
+
+    source: whose clips count; None for all.
+    """
     branches = {other.label: other.branch for other in table.rows}
     seeds = sorted(set(content["cells"][row.label]) & set(content["cells"][row.against]))
     every = {
@@ -278,9 +284,14 @@ def by_hand(content: dict, row, table, mode: str, metric: str) -> tuple[float, f
         for label in (row.label, row.against)
     }
     clips = [
-        {clip: group for clip, group, *_ in content["clips"][runs[0]["clips"]]} for runs in every.values()
+        {clip: (group, *rest) for clip, group, *rest in content["clips"][runs[0]["clips"]]}
+        for runs in every.values()
     ]
-    groups = {clip: group for clip, group in clips[0].items() if clip in clips[1]}
+    groups = {
+        clip: group
+        for clip, (group, *rest) in clips[0].items()
+        if clip in clips[1] and (source is None or rest == [source])
+    }
     sides = []
     for (label, runs), names in zip(every.items(), clips, strict=True):
         places = [list(names).index(clip) for clip in groups]
