@@ -61,10 +61,11 @@ def connect(kind: str) -> None:
 
 
 def leave() -> None:
-    """Part from the other processes."""
+    """Part from the other processes, when all have heard the last word: who still receives it would abort."""
     if size() > 1:
         from torch import distributed
 
+        distributed.barrier()
         distributed.destroy_process_group()
 
 

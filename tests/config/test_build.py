@@ -346,4 +346,4 @@ def test_a_joint_vqvae_is_part_of_the_runs_identity_and_its_own_stage_is_not():
     base = identity()
     assert all(identity(change) != base for change in ("vqvae.codes=32", "vqvae.encoder_depth=2"))
     assert all(identity(change) == base for change in ("vqvae.steps=7", "vqvae.lr=0.5", "tracking=none"))
-    assert experiment_of().above("data") == []
+    assert experiment_of().upstream_identities("data") == []

@@ -102,7 +102,7 @@ def test_a_key_changes_the_runs_in_which_it_acts_and_all_that_build_upon_them():
 
 def chain_of(cfg) -> list[str]:
     experiment = build_experiment(cfg)
-    return [identity.id for identity in (*experiment.above("d"), experiment.identity("d"))]
+    return [identity.id for identity in (*experiment.upstream_identities("d"), experiment.identity("d"))]
 
 
 @pytest.mark.slow
