@@ -17,10 +17,8 @@ if TYPE_CHECKING:
 
     from memmlp.pipeline.run_stages import Outcome
 
-SLOTS = ("model", "memory", "predictor", "hand", "loss", "rollout", "refiner", "term")
-"""Of Mem-MLP, or of what is asked for in its place: with an override of them it is shown alone."""
-
 NETWORKS = ("Mem-MLP", "RecurrentPoser")
+RECURRENT_POSER = "model=recurrent_poser"
 LABELS = [word for name in NETWORKS for word in ("--label", name)]
 
 
@@ -30,21 +28,41 @@ def demo(overrides: tuple[str, ...]) -> None:
     """Run synthetic motion -> VQ-VAE -> Mem-MLP -> metrics -> ONNX -> latency, in minutes, on the CPU.
 
     RecurrentPoser, this project's own network, goes the same way after it, and both are shown side by side.
-    OVERRIDES are those of `memmlp train`, for example profile=tiny. With another model, or an override of
-    Mem-MLP's slots, that network is shown alone.
+    OVERRIDES are those of `memmlp train`, for example profile=tiny. With another model, or overrides that
+    RecurrentPoser has no place for, the one network is shown alone.
     """
     from memmlp.cli.train_summary import show_side_by_side
 
     started = time.monotonic()
+    both = fit_recurrent_poser(overrides)  # asked first: the first network takes minutes
     outcomes = trained(overrides)
-    if not any(word.lstrip("+~").startswith(SLOTS) for word in overrides):
-        outcomes += trained([*overrides, "model=recurrent_poser"])
+    if both:
+        outcomes += trained([*overrides, RECURRENT_POSER])
     if len(outcomes) == len(NETWORKS):
         if "profile=tiny" in overrides:
             click.echo("profile=tiny trains for a few steps: these errors say nothing of the networks")
         show_side_by_side(dict(zip(NETWORKS, outcomes, strict=True)))
     click.echo(f"the demo took {(time.monotonic() - started) / 60:.1f} minutes")
     click.echo(next_steps(overrides, unentered(), [one.run.id for one in outcomes]))
+
+
+def fit_recurrent_poser(overrides: Sequence[str]) -> bool:
+    """Return whether the overrides of a demo choose no other network and go with RecurrentPoser, too."""
+    from hydra import version
+
+    from memmlp.common.errors import InputError
+    from memmlp.config.compose import VERSION_BASE, parse, preflight
+    from memmlp.config.schema import register
+
+    if any(word.startswith(("model=", "experiment=", "-")) for word in overrides):
+        return False
+    register()
+    version.setbase(VERSION_BASE)
+    try:
+        preflight(parse(["data=synth", "profile=small", *overrides, RECURRENT_POSER])[0])
+    except InputError:
+        return False
+    return True
 
 
 def trained(overrides: Sequence[str]) -> list[Outcome]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from command_line import TINY
 
-from memmlp.cli.demo import next_steps, unentered
+from memmlp.cli.demo import fit_recurrent_poser, next_steps, unentered
 
 
 @pytest.mark.slow
@@ -29,6 +29,24 @@ def test_an_override_of_mem_mlps_slots_shows_it_alone(memmlp):
     ran = memmlp("demo", *TINY, "memory=none", "evaluation.modes=[stream]", "export.graph=off")
     assert (ran.code, ran.out.count("run      ")) == (0, 1)
     assert "side by side" not in ran.out
+
+
+@pytest.mark.parametrize(
+    ("words", "both"),
+    [
+        (["profile=tiny", "threads=1"], True),
+        (["vqvae.steps=7", "optim.steps=500"], True),
+        (["optim.steps=50"], False),  # shorter than its warm-up
+        (["memory=none"], False),
+        (["evaluation.ik=lbfgs"], False),
+        (["predictor=rotation_only", "hand=off"], False),
+        (["model=avatar_poser"], False),
+        (["experiment=no_memory"], False),
+    ],
+    ids=str,
+)
+def test_overrides_that_recurrent_poser_has_no_place_for_are_known_before_anything_is_trained(words, both):
+    assert fit_recurrent_poser(words) == both
 
 
 def test_what_comes_next_repeats_the_words_of_the_demo():
