@@ -106,7 +106,7 @@ class Machine:
 class Scheduler:
     """Lets one of several threads go at a time, from system call to system call, in an order drawn by lot."""
 
-    CALLS = ("listdir", "open", "write", "utime", "replace")
+    CALLS = ("listdir", "open", "write", "link", "utime", "replace")
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, clock: Clock, dice: random.Random, pause: float):
         self.clock, self.dice, self.pause = clock, dice, pause

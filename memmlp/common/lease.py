@@ -21,6 +21,7 @@ import re
 import sys
 import threading
 import time
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -60,7 +61,8 @@ class Claim(NamedTuple):
     def owner(self) -> dict[str, Any] | None:
         """The process that made the claim; empty for nobody, None where that cannot be read.
 
-        An empty file is nobody's: if somebody is about to write it, the fence stops who is too late.
+        An empty file is nobody's: if somebody is about to write it (see Claims.make), the fence stops who is
+        too late.
         """
         try:
             found = json.loads(self.text or "{}")
@@ -110,16 +112,30 @@ class Claims:
             return Claim(number, file.read(), os.fstat(file.fileno()).st_mtime_ns)
 
     def make(self, number: int, owner: dict[str, Any] | None = None) -> bool:
-        """Make a claim, by default nobody's, and return whether nobody else had made that one."""
+        """Make a claim, by default nobody's, and return whether nobody else had made that one.
+
+        An owner's claim is a link to a finished file, so that nobody sees it empty, which is nobody's. Where
+        links are not to be had it is written after it is made.
+        """
+        text = json.dumps(owner) if owner else ""
+        if not text:
+            return _write_new(self.path(number), text)
+        draft = self._draft(number)
+        _write_new(draft, text)
         try:
-            handle = os.open(self.path(number), os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
-        except FileExistsError:
-            return False
-        try:
-            os.write(handle, json.dumps(owner).encode() if owner else b"")
+            os.link(draft, self.path(number))
+        except (FileExistsError, FileNotFoundError):  # a server may have made the link and lost its answer
+            return _links(draft) > 1
+        except OSError:
+            return _write_new(self.path(number), text)
         finally:
-            os.close(handle)
+            draft.unlink(missing_ok=True)
         return True
+
+    def _draft(self, number: int) -> Path:
+        """Return a name of its own for a claim in the making, under which the next owner removes it."""
+        stem = self.prefix.removesuffix("lease-")
+        return self.folder / f"{stem}claim.lease-{number}.{uuid.uuid4().hex[:12]}.tmp"
 
     def remove_below(self, number: int) -> None:
         """Remove superseded claims in ascending order: cut short, it leaves no earlier one as the last."""
@@ -335,6 +351,27 @@ class Lock:
 def _open(claim: Claim | None, idle: float) -> bool:
     """Return whether only time will tell if the claim's owner lives, after `idle` seconds without a sign."""
     return claim is not None and not claim.free and claim.lives is None and idle <= LEASE
+
+
+def _write_new(path: Path, text: str) -> bool:
+    """Write a file that is not there yet; return False where it is."""
+    try:
+        handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+    except FileExistsError:
+        return False
+    try:
+        os.write(handle, text.encode())
+    finally:
+        os.close(handle)
+    return True
+
+
+def _links(path: Path) -> int:
+    """Return how many names a file has; 0 where it is gone."""
+    try:
+        return os.stat(path).st_nlink
+    except FileNotFoundError:
+        return 0
 
 
 def _say(line: str) -> None:
