@@ -6,6 +6,7 @@ import gc
 import os
 import re
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -63,7 +64,7 @@ settings.register_profile(
 settings.load_profile("memmlp")
 
 # Networks are tiny and test processes many: more threads only wait for each other.
-os.environ.setdefault("OMP_NUM_THREADS", "1")
+THREADS = int(os.environ.setdefault("OMP_NUM_THREADS", "1"))
 
 # Begun first, so that no process is left alone with one of them at the end. Those that mostly wait for other
 # processes stand among those that compute.
@@ -102,6 +103,14 @@ def clean(monkeypatch: pytest.MonkeyPatch) -> None:
 def _own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     clean(monkeypatch)
     remember()
+
+
+@pytest.fixture(autouse=True)
+def _threads_stay_as_they_were() -> Iterator[None]:
+    """A command that sets torch's threads sets them for its process, which here goes on with other tests."""
+    yield
+    if (torch := sys.modules.get("torch")) and torch.get_num_threads() != THREADS:
+        torch.set_num_threads(THREADS)
 
 
 @pytest.fixture(autouse=True)
