@@ -158,14 +158,18 @@ def test_the_file_is_the_network_and_its_cells_become_int8(tmp_path):
     assert kinds[False] == {onnx.TensorProto.FLOAT}
 
 
-def test_it_sees_the_world_as_the_head_looks_and_learns_the_weights_of_its_loss():
-    cfg = composed(["model=recurrent_poser", "profile=tiny"])
+@pytest.mark.parametrize("weighting", ["fixed", "learned"])
+def test_it_sees_the_world_as_the_head_looks_and_weighs_the_terms_of_its_loss(weighting):
+    cfg = composed(["model=recurrent_poser", "profile=tiny", f"loss.weighting={weighting}"])
     assert (cfg.frame.coordinates, cfg.frame.normalize) == ("heading", True)
     assert (cfg.memory, cfg.predictor, cfg.hand) == (None, None, None)
     loss = build_experiment(cfg).training.loss(frozenset({"rotation"}))
     begun = {name: value for name, value in cfg.loss.items() if name in loss.weighting.weights()}
     assert loss.weighting.weights() == pytest.approx(begun)
-    assert set(begun) == {"orientation", "rotation", "world_position", "velocity", "velocity_3", "velocity_5"}
+    assert set(begun) == {
+        "orientation", "rotation", "angle", "world_position", "velocity", "velocity_3", "velocity_5"
+    }  # fmt: skip
+    assert bool(list(loss.weighting.parameters())) == (weighting == "learned")
 
 
 REFUSED = [
@@ -197,7 +201,8 @@ def test_each_cell_is_a_run_of_its_own():
         return build_experiment(composed(["model=recurrent_poser", "profile=tiny", *words])).identity("d").id
 
     ids = [identity(f"model.cell={cell}") for cell in CELLS]
-    ids += [identity("loss.weighting=fixed"), identity("loss.lr=0.1"), identity("rollout=streams")]
+    learned = "loss.weighting=learned"
+    ids += [identity(learned), identity(learned, "loss.lr=0.1"), identity("rollout=streams")]
     ids += [identity("data.mirror=true")]
     assert len(set(ids)) == len(ids)
-    assert identity("loss.weighting=fixed", "loss.lr=0.1") == identity("loss.weighting=fixed")
+    assert identity("loss.lr=0.1") == identity()

@@ -179,6 +179,7 @@ class ProfileConfig:
     recurrent_poser_depth: Optional[int] = optional(Within(1))
     recurrent_poser_lr: Optional[float] = optional(Within(0, strict=True))
     recurrent_poser_warmup: Optional[int] = optional(Within(0))
+    recurrent_poser_weight_decay: Optional[float] = optional(Within(0))
     refiner_width: Optional[int] = optional(Within(1))
     refiner_frames: Optional[int] = optional(Within(4))
     refiner_pieces: Optional[int] = optional(Within(1))
