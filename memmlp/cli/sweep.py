@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from statistics import fmean
 from typing import TYPE_CHECKING
 
 import click
@@ -151,25 +150,20 @@ def unprepared(chosen: Sweep, plan: Plan) -> int:
 
 
 def forecast(chosen: Sweep, plan: Plan, workers: int) -> None:
-    """Print how long the remaining runs may take, judged by the plan's finished runs of the same kind.
+    """Print how long the remaining runs may take.
 
     Which VQ-VAEs there are besides is only known of runs whose data is prepared.
     """
+    from memmlp.sweep.forecast import forecast
+
     left, later = plan.left(), unprepared(chosen, plan)
-    known = {kind: _seconds(plan, kind) for kind in {task.kind for task in left}}
     besides = ", and the VQ-VAEs that they need" if later else ""
     line = f"{len(left) + later} of {len(plan.tasks) + later} runs to do{besides}, {workers} at once"
-    if left and not later and all(known.values()):
-        minutes = sum(fmean(known[task.kind]) for task in left) / workers / 60
-        line += f": about {minutes:.0f} min, by {sum(map(len, known.values()))} finished runs of it"
+    if not later and (found := forecast(plan)):
+        line += f": about {found.seconds / workers / 60:.0f} min, by {found.finished} finished runs of it"
+        if found.unlike:
+            line += f" ({found.unlike} are of arms that have none, and are judged by the others)"
     click.echo(line)
-
-
-def _seconds(plan: Plan, kind: str) -> list[float]:
-    """Return the seconds that each of the plan's finished runs of that kind took, all stages together."""
-    runs = [plan.run_of(task) for task in plan.tasks if task.kind == kind]
-    found = [run.manifest.get("seconds", 0) for run in runs if run.done]
-    return [sum(seconds.values()) if isinstance(seconds, dict) else seconds for seconds in found]
 
 
 def report(shown: SweepToShow, words: Sequence[str], chosen: Sweep) -> None:

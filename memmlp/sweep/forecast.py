@@ -1,0 +1,59 @@
+"""How long a plan's remaining runs may take, judged by its finished ones."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from statistics import fmean
+from typing import NamedTuple
+
+from memmlp.runs.run import Run
+from memmlp.sweep.plan import Plan, RunTask
+
+
+class Forecast(NamedTuple):
+    """What one worker would need for the runs that are left.
+
+    Attributes:
+        seconds: its time.
+        finished: how many finished runs say so.
+        unlike: how many runs are left of arms that have no finished run, and are judged by other arms.
+    """
+
+    seconds: float
+    finished: int
+    unlike: int
+
+
+def forecast(plan: Plan) -> Forecast | None:
+    """Judge each run that is left by the finished runs of its arm, else by those of its kind.
+
+    Returns:
+        None where nothing is left, or no run of a kind that is left has finished.
+    """
+    left, took = plan.left(), {task.id: seconds(plan.run_of(task)) for task in plan.tasks}
+    took = {name: time for name, time in took.items() if time}
+    kinds: dict[str, list[str]] = defaultdict(list)
+    for task in plan.tasks:
+        if task.id in took:
+            kinds[task.kind].append(task.id)
+    if not left or not all(kinds[task.kind] for task in left):
+        return None
+    alike = {task.key: [name for name in _arm(plan, task) if name in took] for task in left}
+    judged = [alike[task.key] or kinds[task.kind] for task in left]
+    return Forecast(
+        seconds=sum(fmean(took[name] for name in names) for names in judged),
+        finished=len({name for names in judged for name in names}),
+        unlike=sum(not alike[task.key] for task in left if _arm(plan, task)),
+    )
+
+
+def seconds(run: Run) -> float:
+    """Return how long a finished run took, all stages together; 0 for one that has not finished."""
+    found = run.manifest.get("seconds", 0) if run.done else 0
+    return sum(found.values()) if isinstance(found, dict) else found
+
+
+def _arm(plan: Plan, task: RunTask) -> set[str]:
+    """Return the runs of the arms that a task is of, of all seeds; none for what is upstream of arms."""
+    labels = {entry.label for entry in plan.entries if entry.id == task.id}
+    return {entry.id for entry in plan.entries if entry.label in labels}

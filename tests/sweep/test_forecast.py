@@ -1,0 +1,57 @@
+"""How long a plan's runs may take: each judged by its own arm where that has finished runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from memmlp.sweep.forecast import Forecast, forecast
+from memmlp.sweep.plan import Entry, Plan, RunTask
+
+CODES, QUICK, SLOW = ("c" * 16,), ("a" * 16, "b" * 16), ("d" * 16, "e" * 16)
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> Plan:
+    """Two arms of two seeds each, and what is upstream of them."""
+    arms = {"quick": QUICK, "slow": SLOW}
+    entries = [Entry(arm, seed, name) for arm, names in arms.items() for seed, name in enumerate(names)]
+    tasks = [RunTask(CODES[0], "vqvae", {})]
+    tasks += [RunTask(entry.id, "memmlp", {}, CODES[0]) for entry in entries]
+    return Plan("trial", tmp_path, tuple(entries), tuple(tasks))
+
+
+def finish(plan: Plan, name: str, seconds: object) -> None:
+    """End a run that took so long."""
+    task = next(task for task in plan.tasks if task.id == name)
+    run = plan.run_of(task)
+    run.begin(task.kind, {}, data="d", upstream=task.upstream)
+    run.write_manifest({"seconds": seconds})
+    run.results_path.write_text("{}")
+    run.finish(["results.json"])
+
+
+def test_nothing_is_foretold_of_a_kind_of_which_nothing_has_finished(plan: Plan):
+    assert forecast(plan) is None
+    finish(plan, CODES[0], 10.0)
+    assert forecast(plan) is None
+
+
+def test_a_run_is_judged_by_its_arm(plan: Plan):
+    finish(plan, CODES[0], 10.0)
+    finish(plan, QUICK[0], {"train": 50.0, "evaluate": 10.0})
+    finish(plan, SLOW[0], {"train": 1000.0, "evaluate": 200.0})
+    assert forecast(plan) == Forecast(60.0 + 1200.0, finished=2, unlike=0)
+
+
+def test_an_arm_without_a_finished_run_is_judged_by_the_others_and_counted(plan: Plan):
+    finish(plan, CODES[0], 10.0)
+    finish(plan, QUICK[0], 60.0)
+    assert forecast(plan) == Forecast(60.0 + 2 * 60.0, finished=1, unlike=2)
+
+
+def test_of_a_finished_plan_nothing_is_foretold(plan: Plan):
+    for name in (*CODES, *QUICK, *SLOW):
+        finish(plan, name, 1.0)
+    assert forecast(plan) is None
