@@ -24,7 +24,8 @@ def measure_pose(path: Path, steps: int) -> dict[str, float]:
     """Time whole poses of an exported network on one thread: median and 95th percentile, in milliseconds.
 
     A pose is a call of `Stream.step`: features, conversions and forward kinematics, with the network's step
-    among them.
+    among them. No yardstick runs between poses, as one does between the steps of `measure_step`, so that a
+    small network stays in the caches and its pose may take less than its step there.
     """
     seconds = alternate(Stream(path), None, WARM_UP + max(steps, LEAST))[WARM_UP:, 1]
     return {
