@@ -70,9 +70,9 @@ class Form(NamedTuple):
 )
 @click.option(
     "--scope",
-    default="network",
+    default="step",
     show_default=True,
-    type=click.Choice(["network", "full"]),
+    type=click.Choice(["step", "full"]),
     help="What the file computes: the network's step, from its 54 inputs, or all of the way from the "
     "trackers' poses to the joints.",
 )
@@ -131,7 +131,7 @@ def export(
     if out is not None and not out.parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}")
     named = f"--space {space}" if space else f"--rotations {rotations}" if rotations else None
-    if scope == "network" and named:
+    if scope == "step" and named:
         raise InputError(f"{named}: the network itself knows AMASS' world alone; allowed with --scope full")
     full = (space or "amass", rotations or "matrix") if scope == "full" else None
     with tempfile.TemporaryDirectory(prefix="memmlp-export-") as folder:
@@ -175,7 +175,7 @@ def write(run: str, out: Path, outputs: Path, form: Form, clips: int, max_growth
         write_less_precise(network, out, found.id, train, test, form, max_growth)
     else:
         allowed = (
-            "--scope network and a streaming graph"
+            "--scope step and a streaming graph"
             if form.precision.startswith("int8")
             else "a streaming graph"
         )

@@ -78,7 +78,7 @@ class OnnxStream:
         """Run a step and return copies of its outputs, in the file's order.
 
         Args:
-            given: values of the inputs, in the file's order. A file of scope `network` takes sparse (1, 54)
+            given: values of the inputs, in the file's order. A file of scope `step` takes sparse (1, 54)
                 and returns rotation6d (1, 22, 6) and position (1, 22, 3).
         """
         for array, value in zip(self.inputs.values(), given, strict=True):

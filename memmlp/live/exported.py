@@ -17,7 +17,7 @@ AGAIN = "export it again with memmlp export RUN --out FILE.onnx"
 
 
 class ExportedNetwork(OnnxStream):
-    """An ONNX file of scope `network`.
+    """An ONNX file of scope `step`.
 
     Attributes:
         sparse: the input (1, 54), to be written before a step.
@@ -40,7 +40,7 @@ class ExportedNetwork(OnnxStream):
     def _read(self, meta: dict[str, str]) -> None:
         """Read and check the file's metadata."""
         if "tracker_positions" in self.inputs:
-            raise InputError(f"{self.path}: an ONNX file of scope full; allowed here is one of scope network")
+            raise InputError(f"{self.path}: an ONNX file of scope full; allowed here is one of scope step")
         if "sparse" not in self.inputs or "fps" not in meta:
             raise InputError(f"{self.path}: no network of memmlp's; allowed is what memmlp export writes")
         missing = [key for key in NEEDED if key not in meta]

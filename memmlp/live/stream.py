@@ -93,7 +93,7 @@ class Stream:
     60 Hz, to lost trackers and after gaps.
 
     Args:
-        source: a finished run or its folder, or an ONNX file as `memmlp export` writes it (--scope network).
+        source: a finished run or its folder, or an ONNX file as `memmlp export` writes it (--scope step).
         space: the frame of reference of what goes in and comes out: amass, openxr or unity.
         rotations: what rotations come out as: matrix or quaternion (xyzw).
         offsets: the offsets of the joints from the devices; None for none.

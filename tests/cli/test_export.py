@@ -85,7 +85,7 @@ def test_a_run_in_fp16_for_unity(home: Path, memmlp: Memmlp, monkeypatch: pytest
     assert {TensorProto.FLOAT, TensorProto.FLOAT16} <= kinds
     shapes = {o.name: [d.dim_value for d in o.type.tensor_type.shape.dim] for o in model.graph.output}
     assert shapes["rotations"] == [1, 22, 4]
-    one_line(memmlp("export", run, "--out", "a.onnx", *whole, "--precision", "int8"), "--scope network")
+    one_line(memmlp("export", run, "--out", "a.onnx", *whole, "--precision", "int8"), "--scope step")
     said = memmlp("export", run, "--check", "unity")
     assert said.code == 1
     assert f"{run}.onnx: outside of what unity publishes" in said.err

@@ -150,7 +150,7 @@ def test_interface_and_metadata(folder: Path):
     }
     props = {p.key: p.value for p in graph.metadata_props}
     assert (props["scope"], props["space"], props["run_id"]) == ("full", "unity", RUN)
-    with pytest.raises(InputError, match="scope full; allowed here is one of scope network"):
+    with pytest.raises(InputError, match="scope full; allowed here is one of scope step"):
         Stream(folder / "unity.onnx")
 
 
