@@ -38,12 +38,12 @@ def forecast(plan: Plan) -> Forecast | None:
             kinds[task.kind].append(task.id)
     if not left or not all(kinds[task.kind] for task in left):
         return None
-    alike = {task.key: [name for name in _arm(plan, task) if name in took] for task in left}
-    judged = [alike[task.key] or kinds[task.kind] for task in left]
+    arms = [_arm(plan, task) for task in left]
+    judged = [arm & took.keys() or kinds[task.kind] for arm, task in zip(arms, left, strict=True)]
     return Forecast(
         seconds=sum(fmean(took[name] for name in names) for names in judged),
         finished=len({name for names in judged for name in names}),
-        unlike=sum(not alike[task.key] for task in left if _arm(plan, task)),
+        unlike=sum(bool(arm) and not arm & took.keys() for arm in arms),
     )
 
 
