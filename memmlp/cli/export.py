@@ -175,9 +175,7 @@ def write(run: str, out: Path, outputs: Path, form: Form, clips: int, max_growth
         write_less_precise(network, out, found.id, train, test, form, max_growth)
     else:
         allowed = (
-            "--scope step and a streaming graph"
-            if form.precision.startswith("int8")
-            else "a streaming graph"
+            "--scope step and a streaming graph" if form.precision.startswith("int8") else "a streaming graph"
         )
         raise InputError(f"--precision {form.precision}: allowed with {allowed}")
 
