@@ -151,11 +151,21 @@ class Browser:
         self.wait(f"location.href.startsWith({url!r}) && document.readyState == 'complete'")
 
     def click(self, selector: str) -> None:
-        """Press the mouse in the middle of an element."""
+        """Press the mouse in the middle of an element, and again where the page moved it away meanwhile."""
+        until(lambda: self._pressed(selector), f"a click on {selector}; {self.errors}", self.process)
+
+    def _pressed(self, selector: str) -> bool:
+        """Whether a press of the mouse came to the element that it was meant for."""
+        meant = f"event => {{ window.pressed = Boolean(event.target.closest({selector!r})); }}"
+        self.value(
+            f"window.pressed = null; addEventListener('click', {meant}, {{ once: true, capture: true }})"
+        )
         box = f"document.querySelector({selector!r}).getBoundingClientRect()"
         x, y = self.value(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})")
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+        self.wait("window.pressed !== null")
+        return self.value("window.pressed !== false")  # another page knows nothing of it
 
     def picture(self) -> np.ndarray:
         """The page (H, W, 3), uint8."""

@@ -115,6 +115,7 @@ def worn(browser: Browser, site: Made) -> dict[str, Any]:
         "import('./headset.js').then(module => { window.offsets = module.usualOffsets('controllers'); })"
     )
     browser.value(f"window.tPose = {json.dumps(t_pose(site))}")
+    browser.resolved("headset.play([tPose], offsets)")  # the countdown does not wait for a slow machine
     browser.resolved("headset.pull()")
     browser.resolved(f"headset.play([tPose], offsets, () => {SITE}.calibrated)")
     browser.resolved(f"headset.play({json.dumps(joints())}, offsets)")
