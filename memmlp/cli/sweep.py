@@ -84,7 +84,7 @@ def sweep(
         if known:
             click.echo("\n".join([rounds.schedule(known), *rounds.told(known, chosen)]))
         if dry_run:
-            forecast(spent, plan, workers.number(workers.shares(devices(plan))))
+            show_forecast(spent, plan, workers.number(workers.shares(devices(plan))))
             click.echo(workers.script(sweep_folder(chosen, outputs)) or "", nl=False)
         return
     if retry:
@@ -149,7 +149,7 @@ def unprepared(chosen: Sweep, plan: Plan) -> int:
     return len(chosen.arm_seeds()) - len(plan.entries)
 
 
-def forecast(chosen: Sweep, plan: Plan, workers: int) -> None:
+def show_forecast(chosen: Sweep, plan: Plan, workers: int) -> None:
     """Print how long the remaining runs may take.
 
     Which VQ-VAEs there are besides is only known of runs whose data is prepared.
