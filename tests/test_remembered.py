@@ -45,6 +45,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 def test_the_same_is_composed_anew(monkeypatch: pytest.MonkeyPatch):
     twice = [[composed(overrides) for overrides in CASES] for _ in range(2)]
     for owner, name in REMEMBERED:

@@ -181,6 +181,7 @@ def test_help_says_what_can_be_chosen(memmlp: Memmlp):
     assert "memory: gru, lstm, no_codes, none, vq, vq_joint" in memmlp("train", "--help").out
 
 
+@pytest.mark.slow
 def test_info_says_where_configs_are_sought(tmp_path: Path):
     command = [sys.executable, "-m", "memmlp.cli.main", "train", "--info", "searchpath"]
     ran = finished(command, cwd=tmp_path)
@@ -211,6 +212,7 @@ def test_completion(memmlp: Memmlp, monkeypatch: pytest.MonkeyPatch, line: str, 
     assert set(ran.out.split()) == expected
 
 
+@pytest.mark.slow
 def test_completion_in_a_real_shell(tmp_path: Path):
     folder = Path(sys.executable).parent
     script = """

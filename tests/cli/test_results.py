@@ -42,6 +42,7 @@ def test_kept_results_become_pages(memmlp: Memmlp, planned: None):
     assert ", open" in Path("docs/results/README.md").read_text()
 
 
+@pytest.mark.slow
 def test_a_sweep_with_a_scale_has_a_figure_beside_its_page(
     memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch
 ):

@@ -181,6 +181,7 @@ def test_kept_rounds_of_another_sweep_decide_nothing(memmlp: Memmlp, runs: Runs)
     assert "seeds were spent in rounds with other smallest: these verdicts do not keep the 5 %" in page()
 
 
+@pytest.mark.slow
 def test_what_is_kept_says_that_seeds_were_spent_in_rounds(memmlp: Memmlp, runs: Runs):
     """Those of the looks and those of a fixed number don't become one table."""
     memmlp(*SWEEP)
@@ -209,6 +210,7 @@ def test_open_to_the_end_is_said_with_what_it_would_take(memmlp: Memmlp, runs: R
     assert "all verdicts are decided" not in out
 
 
+@pytest.mark.slow
 def test_failed_runs_are_late_and_made_up_for(memmlp: Memmlp, runs: Runs):
     runs.failing = {"worse"}
     ran = memmlp(*SWEEP)

@@ -63,12 +63,14 @@ def test_command_writes_the_format_of_the_ending(memmlp: Memmlp, planned: None, 
     assert json.loads(memmlp("table", "5", "--format", "json").out)["number"] == 5
 
 
+@pytest.mark.slow
 def test_command_prints_all_tables(memmlp: Memmlp, planned: None):
     out = memmlp("table", "all", "--mode", "stream").out
     assert [int(number) for number in re.findall(r"^Table (\d+):", out, re.MULTILINE)] == list(range(1, 18))
     assert "nothing measured: data.root: has no value" in " ".join(out.split())
 
 
+@pytest.mark.slow
 def test_all_as_json_is_one_list(memmlp: Memmlp, planned: None):
     assert len(json.loads(memmlp("table", "all", "--format", "json").out)) == 17
 

@@ -244,46 +244,6 @@ def test_a_claim_whose_maker_died_before_it_wrote_it_is_nobodys(tmp_path: Path, 
     assert Holder("two", tmp_path).take().number == 5
 
 
-def test_nobody_sees_a_claim_before_its_owner_stands_in_it(tmp_path: Path, clock: Clock, monkeypatch):
-    """Else it would count as nobody's, and two processes would do the same work."""
-    one, two, write, seen = Holder("one", tmp_path), Holder("two", tmp_path), os.write, []
-
-    def frozen(handle: int, text: bytes) -> int:
-        if not seen:
-            seen.append(one.lock.claims.last())
-            assert two.take().number == 1
-        return write(handle, text)
-
-    monkeypatch.setattr("memmlp.common.lease.os.write", frozen)
-    assert one.take() is None
-    assert seen == [None]
-    assert two.lock.held is True
-    assert [path.name for path in tmp_path.iterdir() if "lease" in path.name] == [".lease-1"]
-
-
-def test_a_link_whose_answer_was_lost_counts(tmp_path: Path, monkeypatch):
-    link = os.link
-
-    def lost(draft: Path, path: Path) -> None:
-        link(draft, path)
-        raise FileExistsError
-
-    monkeypatch.setattr("memmlp.common.lease.os.link", lost)
-    with taken(Lock(tmp_path)) as mine:
-        assert mine.number == 1
-
-
-def test_file_systems_without_links_will_do(tmp_path: Path, monkeypatch):
-    def refuse(*_: object) -> None:
-        raise OSError(errno.EPERM, os.strerror(errno.EPERM))
-
-    monkeypatch.setattr("memmlp.common.lease.os.link", refuse)
-    with taken(Lock(tmp_path)) as mine:
-        assert mine.number == 1
-        assert Lock(tmp_path).owner["pid"] == os.getpid()
-    assert Lock(tmp_path).held is None
-
-
 @pytest.mark.parametrize("name", ["", "data"])
 def test_the_next_owner_removes_claims_in_the_making(tmp_path: Path, name: str):
     lock = Lock(tmp_path, name)

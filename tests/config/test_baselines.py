@@ -101,6 +101,7 @@ PUBLISHED = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_paper_profile_has_the_published_size(name, monkeypatch):
     """Weights are counted, not drawn."""

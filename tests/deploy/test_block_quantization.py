@@ -28,6 +28,7 @@ def restored(codes: np.ndarray, scales: np.ndarray, inputs: int) -> np.ndarray:
     return whole.reshape(len(codes), -1)[:, :inputs]
 
 
+@pytest.mark.slow
 @given(outputs=st.integers(1, 5), inputs=st.integers(1, 80), seed=st.integers(0, 99))
 def test_a_weight_comes_back_within_half_a_step_of_its_block(outputs: int, inputs: int, seed: int):
     weight = np.random.default_rng(seed).standard_normal((outputs, inputs)).astype(np.float32)

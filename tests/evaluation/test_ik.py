@@ -66,6 +66,7 @@ def test_a_fit_that_is_perfect_already_stays():
     torch.testing.assert_close(local_rotations(solve(MOTION)), local_rotations(MOTION), atol=1e-4, rtol=0)
 
 
+@pytest.mark.slow
 def test_the_objective_falls_with_every_iteration_in_every_frame():
     problem = objective(perturbed(0.3))
     rows = torch.arange(len(MOTION))
@@ -119,6 +120,7 @@ def test_a_frame_is_solved_alike_alone_in_a_batch_and_in_chunks():
     assert torch.equal(together, LBFGS(15).solutions(NORMALIZER, motion, sparse)["combined"])
 
 
+@pytest.mark.slow
 def test_more_iterations_get_nearer():
     motion = perturbed(0.5)
     means = [float(distance(solve(motion, n)).mean()) for n in (1, 5, 15, 60)]

@@ -20,6 +20,7 @@ names = st.sampled_from(sorted(SPACES))
 FORWARD, UP, LEFT = np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), np.array([-1.0, 0, 0])  # amass
 
 
+@pytest.mark.slow
 @given(names, points, turns)
 def test_there_and_back(name, point, turn):
     space = SPACES[name]

@@ -187,6 +187,7 @@ def test_flight_is_ballistic():
     np.testing.assert_allclose(np.median(fall[inside]), -9.81, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_walks_differ_in_speed_and_direction():
     speeds, directions = [], []
     for seed in range(40):

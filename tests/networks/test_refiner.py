@@ -38,6 +38,7 @@ def test_none_is_the_network_itself():
     assert not isinstance(untrained(["model=avatar_poser", "profile=tiny"]), Refined)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NETWORKS)
 @torch.no_grad()
 def test_it_corrects_the_networks_stream(name):
@@ -52,6 +53,7 @@ def test_it_corrects_the_networks_stream(name):
     assert torch.equal(modes.window(model, [CLIP])[0], made)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NETWORKS)
 @torch.no_grad()
 def test_its_streaming_graph_is_it_and_carries_its_states_alone(name):

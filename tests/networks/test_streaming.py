@@ -53,6 +53,7 @@ def test_the_stream_is_the_network(kind, changes, predictor):
     assert largest_difference(tiny.model(kind, predictor, **changes).double(), CLIP.double()) < 1e-11
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", tiny.BASELINES)
 @pytest.mark.parametrize("depth", [1, 3])
 @torch.no_grad()

@@ -51,6 +51,7 @@ def test_nothing_to_show_is_refused(folder: Path, tmp_path: Path):
         some_clips(tmp_path / "none.npz", 1)
 
 
+@pytest.mark.slow
 def test_a_sheet_has_a_row_for_every_few_clips(folder: Path):
     clips = some_clips(folder, 5)[0]
     sheet = clip_sheet(clips)

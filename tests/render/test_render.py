@@ -167,6 +167,7 @@ def test_mp4(tmp_path: Path, short: Take):
     assert colour(right)[0] > 80
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a.gif", "a.mp4"])
 def test_nothing_is_left_of_a_film_that_was_broken_off(tmp_path, take, monkeypatch, name: str):
     if name.endswith("mp4"):
@@ -192,6 +193,7 @@ def test_without_pyav_a_line_says_what_to_install(tmp_path, take, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_the_demos_picture(tmp_path: Path):
     figure.poses_png(tmp_path / "poses.png", TRUTH, TRUTH + OFF, "one")
     assert Image.open(io.BytesIO((tmp_path / "poses.png").read_bytes())).size[0] > 1200

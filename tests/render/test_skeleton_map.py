@@ -52,6 +52,7 @@ def draw(folder: Path, name: str, far: bool = False) -> np.ndarray:
     return np.asarray(Image.open(folder / "out.png"))
 
 
+@pytest.mark.slow
 def test_sides_are_on_their_sides(tmp_path: Path):
     picture = draw(tmp_path, "mixamo")
     assert picture.shape == (HEIGHT, WIDTH, 3)
@@ -62,6 +63,7 @@ def test_sides_are_on_their_sides(tmp_path: Path):
     assert (body.max(-1) < 200).mean() > 0.05
 
 
+@pytest.mark.slow
 def test_nodes_far_away_are_left_out(tmp_path: Path):
     assert len(family("mixamo").names) > 22
     near, far = (draw(tmp_path, "mixamo", far) for far in (False, True))

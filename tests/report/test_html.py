@@ -111,6 +111,7 @@ def test_ids_are_unique_and_links_lead_somewhere(text: str):
     assert set(re.findall(r'<a href="#([^"]+)"', text)) <= set(of_page)
 
 
+@pytest.mark.slow
 def test_distributions_by_hand(tmp_path: Path):
     """Interquartile means, probabilities of improvement and profile of a metric are as computed here."""
     sweep = load_sweep(SHIPPED / "table14.yaml")
@@ -147,6 +148,7 @@ def test_config_differences(text: str):
     assert any("seed=2" in row and "&#x27;memory.layers=[2,4,6]&#x27;" in row for row in seeds)
 
 
+@pytest.mark.slow
 def test_labels_are_escaped(tmp_path: Path):
     content = (
         "arms: {'<script>alert(1)</script>': [a=b], '& <b>': [a=c]}\ntitle: <i>title</i>\nseeds: [0, 1]\n"
@@ -246,6 +248,7 @@ def test_command_writes_the_page(memmlp: Memmlp, planned: None):
     assert set(re.findall(r'class="result" id="(\w+)"', text)) == {"table05", "table06"}
 
 
+@pytest.mark.slow
 def test_command_takes_all_by_default(memmlp: Memmlp, planned: None):
     assert memmlp("report").out == "outputs/report.html\n"
     text = Path("outputs/report.html").read_text()
@@ -253,6 +256,7 @@ def test_command_takes_all_by_default(memmlp: Memmlp, planned: None):
     assert 'id="memory_control"' in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [(["99"], ("no such sweep",)), (["5", "--out", "/proc/no/x"], ("--out /proc/no/x",))],

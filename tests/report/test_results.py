@@ -245,6 +245,7 @@ def test_every_word_of_the_rule_is_found():
         assert len(claims(f"It {word} 0.3 cm.")) == 1
 
 
+@pytest.mark.slow
 def test_pages_of_the_clone_are_made_again_byte_for_byte():
     templates = {path.name: path.read_text(encoding="utf-8") for path in (DOCS / "templates").glob("*.md")}
     made = pages(sources(DOCS), templates)
@@ -253,6 +254,7 @@ def test_pages_of_the_clone_are_made_again_byte_for_byte():
         assert (DOCS / name).read_bytes() == text.encode(), name
 
 
+@pytest.mark.slow
 def test_every_interval_of_the_clone_follows_from_what_is_kept():
     """As many intervals as the pages print are computed here from the per-clip results, and are equal."""
     for name, one in sources(DOCS).items():

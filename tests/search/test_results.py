@@ -43,6 +43,7 @@ def test_trials_of_several_seeds_as_csv(tmp_path: Path):
     assert row["run"] in path.read_text()
 
 
+@pytest.mark.slow
 def test_two_objectives_give_a_front(tmp_path: Path):
     study = open_study(tmp_path, objectives=["MPJPE", "Jitter"])
     to_the_end(study, tmp_path)

@@ -121,6 +121,7 @@ def test_a_study_is_looked_at_while_its_owner_works(tmp_path: Path):
     assert Study.view(search(), "other", tmp_path) is None
 
 
+@pytest.mark.slow
 def test_a_team_storage_and_a_bad_one(tmp_path: Path):
     study = open_study(tmp_path, storage=f"sqlite:///{tmp_path}/team.db")
     to_the_end(study, tmp_path)

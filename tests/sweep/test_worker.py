@@ -172,6 +172,7 @@ def test_a_worker_stays_while_its_plan_is_open_and_wanted(tmp_path: Path, monkey
     assert done == [ALONE.id]
 
 
+@pytest.mark.slow
 def test_a_run_whose_process_died_is_lost_then_taken_over(tmp_path: Path):
     path = saved(tmp_path, ALONE)
     code = (

@@ -48,6 +48,7 @@ class Kill(Exception):
 PARTS = ["upper_codes", "lower_diffusion"]  # of SAGE-Net
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "make", [*ROLLOUTS, *tiny.BASELINES, *PARTS, "recurrent forced", "recurrent streams", "vqvae"]
 )
@@ -102,6 +103,7 @@ def test_another_seed_is_another_run(tmp_path):
 LEARNING = [name for name in tiny.BASELINES if name != "sage"]  # a part of it is quicker
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", ["vqvae", "own", "recurrent forced", *LEARNING, "upper_codes"])
 def test_it_learns_and_logs(make, tmp_path):
     optim = replace(OPTIM, steps=40, lr=1e-2, final_lr=1e-3, batch=8, validate_every=20)

@@ -49,6 +49,7 @@ def same(ours: dict[str, torch.Tensor], theirs: dict[str, torch.Tensor]) -> bool
     return all(torch.equal(value, theirs[name]) for name, value in ours.items())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OPTIMS)
 def test_a_resumed_training_is_the_same_however_often_it_was_validated(name: str, tmp_path: Path):
     """It is killed at its validation after 7 steps, two after the last checkpoint; the other has more."""
@@ -94,6 +95,7 @@ def test_every_knob_changes_the_weights(name: str, changes: dict, tmp_path: Path
     assert not torch.equal(one.model.stem.weight, other.model.stem.weight)
 
 
+@pytest.mark.slow
 def test_optimisers_are_not_the_same(tmp_path: Path):
     every = {"adamw": Optim(**COMMON), "muon": Muon(**COMMON), "free": ScheduleFree(**COMMON)}
     found = [trained(optim, tmp_path / name)[0].model.stem.weight for name, optim in every.items()]

@@ -56,6 +56,7 @@ def test_a_step_compares_the_corrected_pieces_and_reaches_the_refiner_alone():
     assert torch.equal(one.clips[drawn], result.clips)
 
 
+@pytest.mark.slow
 def test_it_smooths_what_the_network_makes():
     """A few steps bring the loss down, mostly that of velocities."""
     one = task(optim := replace(OPTIM, steps=60, checkpoint_every=100))
@@ -75,6 +76,7 @@ class Killed(Exception):
     """Raised where a process is killed."""
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_it_has_the_same_weights_bit_for_bit(tmp_path: Path):
     whole, cut = Run(tmp_path / "whole"), Run(tmp_path / "cut")
     for run in (whole, cut):

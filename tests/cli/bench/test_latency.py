@@ -43,6 +43,7 @@ def weights_of_torch(ours: AvatarPoser) -> dict[str, torch.Tensor]:
     return made
 
 
+@pytest.mark.slow
 def test_its_layers_share_no_weights(tmp_path):
     """Else a runtime reads one layer's weights for all of them, which is quicker than any trained network."""
     network = TorchAvatarPoser(frames=7, width=16, depth=2, heads=4, feedforward=32)

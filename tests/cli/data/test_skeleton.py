@@ -27,6 +27,7 @@ def run(*arguments: object):
     return CliRunner().invoke(data, ["skeleton", *map(str, arguments)])
 
 
+@pytest.mark.slow
 def test_a_map_is_printed_written_and_shown(file: Path, tmp_path: Path):
     out, picture = tmp_path / "mine.yaml", tmp_path / "mine.png"
     result = run("guess", file, "--out", out)

@@ -57,6 +57,7 @@ def check_same(clip: Clip, back: Clip) -> None:
     assert np.degrees(turned).max() < 0.01
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(clip=clips())
 def test_any_pose_comes_back(tmp_path_factory: pytest.TempPathFactory, clip: Clip):

@@ -46,6 +46,7 @@ def check(path: Path, chosen: SkeletonMap, unit: float, up: str) -> Converted:
 # The data's own files
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", CMU, ids=lambda path: f"{path.parent.name}-{path.stem}")
 def test_cmu_as_in_the_file(tmp_path: Path, path: Path) -> None:
     if not path.is_file():
@@ -55,6 +56,7 @@ def test_cmu_as_in_the_file(tmp_path: Path, path: Path) -> None:
     assert check(copy, chosen, 0.01, "y").fidelity.faults == ()
 
 
+@pytest.mark.slow
 def test_bandai_namco_as_in_the_file(tmp_path: Path) -> None:
     if not BANDAI.is_file():
         pytest.skip("Bandai-Namco's clips are not here")

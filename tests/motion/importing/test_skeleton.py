@@ -106,6 +106,7 @@ def test_what_a_map_leaves_out_is_found(tmp_path: Path) -> None:
     assert told == (None, None, False, "auto", "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "text", ["", "[", "a: 1\na: 2", "!!python/name:os.system", "[" * 1500, "\0", "- 1", "{{}: 1}"]
 )

@@ -141,6 +141,7 @@ def test_what_is_out_of_reach_is_a_limb_as_straight_or_bent_as_can_be_with_finit
         assert (reach > 0.99 * (upper.norm(dim=-1) + lower.norm(dim=-1))).all()
 
 
+@pytest.mark.slow
 def test_slopes_are_right():
     local, turned, joints = person(2)
     base = joints[:, list(BASES)]
