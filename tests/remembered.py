@@ -41,6 +41,23 @@ def _remember_exporter(module: Any) -> None:
         module.onnxscript_apis.get_torchlib_ops = functools.cache(module.onnxscript_apis.get_torchlib_ops)
 
 
+def _remember_signatures(module: Any) -> None:
+    """Of ONNX's operators: their signatures, made anew for each node of a graph, a tenth of an export."""
+    make = module.OpSignature.from_op_schema.__func__
+    if hasattr(make, "__wrapped__"):
+        return
+    known: dict[tuple[str, str, int], Any] = {}
+
+    @functools.wraps(make)
+    def from_op_schema(cls: type, schema: Any) -> Any:
+        key = (schema.domain, schema.name, schema.since_version)
+        if key not in known:
+            known[key] = make(cls, schema)
+        return known[key]
+
+    module.OpSignature.from_op_schema = classmethod(from_op_schema)
+
+
 def _remember_interpolations(module: Any) -> None:
     """Of OmegaConf: the parts of an interpolation such as ${seed}, which it only reads."""
     if not hasattr(module.parse, "cache_info"):
@@ -162,6 +179,7 @@ def _stamp(file: Path) -> tuple[int, int, int]:
 
 PATCHES = {
     "torch.onnx._internal.exporter._registration": _remember_exporter,
+    "onnx_ir.schemas": _remember_signatures,
     "omegaconf.base": _remember_interpolations,
     "hydra._internal.config_repository": _remember_configs,
     "hydra._internal.config_loader_impl": _remember_compositions,

@@ -50,6 +50,7 @@ def flags(
     yield from _no_numbers(sweep, runs)
     for attribute, what in ORIGIN.items():
         yield from _differing(what, [(getattr(run.origin, attribute), label) for label, run in every])
+    yield from _seen(every)
     yield from _partial(every)
     yield from _recipes(every)
     yield from _own_code(every)
@@ -187,6 +188,13 @@ def _differing(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:
     if len(groups) > 1:
         parts = [f"{value} of {_quoted(labels)}" for value, labels in groups.items()]
         yield f"{what} differs: {'; '.join(parts)}"
+
+
+def _seen(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
+    """Flag arms whose trainings saw more frames than others': windows may be longer, batches larger."""
+    known = [(run.training["frames"], label) for label, run in every if "frames" in run.training]
+    found = ((f"{frames / 1e6:.3g} M", label) for frames, label in sorted(known, key=lambda one: one[0]))
+    yield from _differing("number of frames seen in training", found)
 
 
 def _partial(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:

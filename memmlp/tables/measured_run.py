@@ -77,7 +77,8 @@ class Measured:
         latency: everything that was measured of its streaming step.
         sources: the source of each clip, where the data has several.
         run: the run's folder; None where the results were kept without one.
-        training: what its training took, where that is known: `seconds`, and `flops` where results are kept.
+        training: what its training took, where that is known: `seconds`; `frames`, those that it saw, each as
+            often as a window with it was drawn; and `flops` where results are kept.
     """
 
     id: str
@@ -175,9 +176,17 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     deployments = [run.deployment(name) for name in stages or () if run.deployment(name).done]
     latency = (deployments or [run.preferred_deployment])[-1].record
     origin = _evaluated(_origin(manifest), reports)
-    seconds = (manifest.get("seconds") or {}).get("train")
-    training = {} if seconds is None else {"seconds": float(seconds)}
+    training = _training(manifest, run.config)
     return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run, sources, training)
+
+
+def _training(manifest: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, float]:
+    """Return what a training took, as far as it is known."""
+    seconds = (manifest.get("seconds") or {}).get("train")
+    optim, model = config.get("optim") or {}, config.get("model") or {}
+    frames = [number for number in (optim.get("steps"), optim.get("batch"), model.get("frames")) if number]
+    took = {} if seconds is None else {"seconds": float(seconds)}
+    return took | ({"frames": float(math.prod(frames))} if len(frames) == 3 else {})
 
 
 def _join(known: dict[str, Any], more: Mapping[str, Any]) -> None:

@@ -145,6 +145,27 @@ def test_runs_of_different_origin_are_flagged(
     assert any("one seed" in flag for flag in table.flags)
 
 
+def test_arms_that_saw_more_in_training_are_said(sweep: Sweep, tmp_path: Path):
+    """A window twice as long, or a batch twice as large, is twice the data a step."""
+    settings = {"optim": {"steps": 2000, "batch": 32}, "model": {"frames": 41}}
+    more = settings | {"model": {"frames": 82}}
+    configs = {arm.label: dict(settings) for arm in sweep.runnable()}
+
+    def flags() -> list[str]:
+        runs = {label: fake_run(tmp_path, label, config=config) for label, config in configs.items()}
+        table = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label])
+        return [flag for flag in table.flags if "in training" in flag]
+
+    assert flags() == []
+    del configs["full_model"]["model"]  # not known
+    assert flags() == []
+    configs["by position"] = more
+    (flag,) = flags()
+    assert "number of frames seen in training differs: 2.62 M of " in flag
+    assert flag.endswith("; 5.25 M of 'by position'")
+    assert "full_model" not in flag
+
+
 def test_what_is_no_stream_is_said_in_every_format(sweep: Sweep, tmp_path: Path):
     late = {"by position": {"offline": True}}
     runs = {
