@@ -175,6 +175,7 @@ class ProfileConfig:
     rpm_depth: Optional[int] = optional(Within(1))
     rpm_feedforward: Optional[int] = optional(Within(1))
     recurrent_poser_frames: Optional[int] = optional(Within(2))
+    recurrent_poser_batch: Optional[int] = optional(Within(1))
     recurrent_poser_width: Optional[int] = optional(Within(1))
     recurrent_poser_depth: Optional[int] = optional(Within(1))
     recurrent_poser_lr: Optional[float] = optional(Within(0, strict=True))
