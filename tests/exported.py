@@ -23,10 +23,10 @@ NETWORKS: dict[str, Callable[[], MotionModel]] = {
     "lstm": partial(tiny.model, LSTMMemory, coordinates=Heading()),
     "no_memory": partial(tiny.model, NoMemory),
     "rotation_only": partial(tiny.model, NoMemory, RotationOnly),
-    "refined": lambda: tiny.refined(tiny.baseline("avatar_poser", Heading())),
-    **{name: partial(tiny.baseline, name, Heading()) for name in tiny.BASELINES},
-    **{name: partial(tiny.baseline, name) for name in LARGEST},
-    "bodiffusion": partial(tiny.baseline, "bodiffusion", Heading(), sampling_steps=2),
+    "refined": lambda: tiny.refined(tiny.baseline("avatar_poser", Heading(), depth=1)),
+    **{name: partial(tiny.baseline, name, Heading(), depth=1) for name in tiny.BASELINES},
+    **{name: partial(tiny.baseline, name, depth=1) for name in LARGEST},
+    "bodiffusion": partial(tiny.baseline, "bodiffusion", Heading(), depth=1, sampling_steps=2),
 }
 """By name. Relative to the heading, which makes the larger graph, unless it is the largest anyway."""
 

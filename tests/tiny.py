@@ -69,7 +69,7 @@ def normalizer(coordinates: World | None = None) -> Normalizer:
 def vqvae() -> VQVAE:
     """Make a VQ-VAE with random code-vectors."""
     torch.manual_seed(3)
-    model = VQVAE(codes=8, width=12, encoder_depth=1)
+    model = VQVAE(codes=8, width=12, encoder_depth=2)
     model.codebook.vectors.normal_()
     return model.eval()
 
@@ -104,31 +104,31 @@ def model(
 
 
 BASELINES: dict[str, Callable[..., MotionModel]] = {
-    "agrol_mlp": partial(AGRoLMLP, frames=7, width=16, depth=1),
+    "agrol_mlp": partial(AGRoLMLP, frames=7, width=16, depth=2),
     "agrol_diffusion": partial(
-        AGRoLDiffusion, frames=7, width=16, depth=1, diffusion_steps=50, sampling_steps=3, noise_seed=0
+        AGRoLDiffusion, frames=7, width=16, depth=2, diffusion_steps=50, sampling_steps=3, noise_seed=0
     ),
     "bodiffusion": partial(
-        BoDiffusion, frames=7, width=48, depth=1, heads=3, diffusion_steps=50, sampling_steps=3, noise_seed=0,
+        BoDiffusion, frames=7, width=48, depth=2, heads=3, diffusion_steps=50, sampling_steps=3, noise_seed=0,
         noise=1.0, bound=1.0, offline=False,
     ),
-    "avatar_poser": partial(AvatarPoser, frames=7, width=16, depth=1, heads=4, feedforward=32, dropout=0.1),
-    "ego_poser": partial(EgoPoser, frames=7, width=16, depth=1, heads=4, feedforward=32, dropout=0.1),
+    "avatar_poser": partial(AvatarPoser, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
+    "ego_poser": partial(EgoPoser, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1),
     "hmd_poser": partial(
-        HMDPoser, frames=7, width=16, depth=1, layers=1, heads=4, feedforward=32, dropout=0.1, shape=0.1
+        HMDPoser, frames=7, width=16, depth=2, layers=1, heads=4, feedforward=32, dropout=0.1, shape=0.1
     ),
-    "vae_hmd": partial(VAEHMD, frames=7, width=16, depth=1, latent=6, dropout=0.2, divergence=0.01),
+    "vae_hmd": partial(VAEHMD, frames=7, width=16, depth=2, latent=6, dropout=0.2, divergence=0.01),
     "avatar_jlm": partial(
-        AvatarJLM, frames=7, width=16, depth=1, heads=4, feedforward=32, dropout=0.1, coarse=1.0
+        AvatarJLM, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, coarse=1.0
     ),
     "rpm": partial(
-        RPM, frames=9, width=16, depth=1, heads=4, feedforward=32, dropout=0.1, context=3, horizon=4
+        RPM, frames=9, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, context=3, horizon=4
     ),
     "manikin_s": partial(
-        ManikinS, frames=7, width=16, depth=1, heads=4, feedforward=32, dropout=0.0, parts=1.0, turned=True
+        ManikinS, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.0, parts=1.0, turned=True
     ),
     "manikin_l": partial(
-        ManikinL, frames=7, width=16, depth=1, heads=4, feedforward=32, dropout=0.1, coarse=1.0, parts=1.0,
+        ManikinL, frames=7, width=16, depth=2, heads=4, feedforward=32, dropout=0.1, coarse=1.0, parts=1.0,
         turned=True, offline=False,
     ),
     "sage": partial(
@@ -165,7 +165,9 @@ def baseline(name: str, coordinates: World | None = None, seed: int = 0, **chang
 def recurrent_poser(coordinates: World | None = None, seed: int = 0, **changes) -> RecurrentPoser:
     """Make a tiny RecurrentPoser with random weights, in evaluation mode."""
     torch.manual_seed(seed)
-    settings = {"frames": 7, "width": 16, "depth": 2, "cell": "gru", "expansion": 2, "output": "local"}
+    settings = {
+        "frames": 7, "width": 16, "depth": 2, "cell": "gru", "expansion": 2, "output": "local", "members": 1,
+    }  # fmt: skip
     return RecurrentPoser(normalizer(coordinates), **settings | changes).eval()
 
 

@@ -120,6 +120,10 @@ class MotionModel(nn.Module):
             sparse: see `advance`.
             state: see `advance`.
             truth: world frames [X | Theta] (B, T, 252) of the window.
+
+        Returns:
+            Motion (B, n, 198) that is to be the true one, and the new state. A network of members that
+            each learn by themselves returns the motion of all, in turn: (members B, n, 198).
         """
         return self.advance(sparse, state)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import cast
 
 import torch
@@ -51,49 +51,46 @@ class RecurrentBlock(nn.Module):
         return h + self.mlp(self.norm(h))
 
 
-class RotationHead(nn.Linear):
-    """From the hidden state to the motion; the interface of what fills the slot `output`.
+class Output(nn.Module):
+    """What the rotations (..., 132) that a member makes stand for; the interface of the slot `output`."""
 
-    Args:
-        normalizer: converts between the world and network space.
-        width: d, the width of the hidden state.
-    """
+    def begin(self, head: nn.Linear, normalizer: Normalizer) -> None:
+        """Change the weights that a head begins with; by default they stay as they are."""
 
-    def __init__(self, normalizer: Normalizer, width: int):
-        super().__init__(width, ROTATION.stop)
-
-    def posed(self, h: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map the hidden state (..., d) to world motion (..., 198) at inputs (..., 54)."""
+    def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+        """Map rotations (..., 132), as they are made, to world motion (..., 198) at inputs (..., 54)."""
         raise NotImplementedError
 
 
-class LocalRotationHead(RotationHead):
-    """A head that makes each joint's rotation in its parent's frame."""
+class LocalRotations(Output):
+    """Each joint's rotation in its parent's frame."""
 
-    def posed(self, h: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map the hidden state (..., d) to world motion (..., 198) at inputs (..., 54)."""
-        return normalizer.posed(self(h), sparse)
+    def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+        """Map rotations (..., 132), as they are made, to world motion (..., 198) at inputs (..., 54)."""
+        return normalizer.posed(made, sparse)
 
 
-class GlobalRotationHead(RotationHead):
-    """A head that makes each joint's rotation in the frame of the network's space.
+class GlobalRotations(Output):
+    """Each joint's rotation in the frame of the network's space.
 
     No joint inherits its ancestors' errors, and the positions are sums of turned bones.
     """
 
     chains: Tensor
 
-    def __init__(self, normalizer: Normalizer, width: int):
-        super().__init__(normalizer, width)
+    def __init__(self) -> None:
+        super().__init__()
         self.register_buffer("chains", chains(), persistent=False)
-        with torch.no_grad():  # begin at the mean pose: from a turned one legs don't find home
-            self.weight *= 0.3
-            self.bias.copy_(mean_pose(normalizer))
 
-    def posed(self, h: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
-        """Map the hidden state (..., d) to world motion (..., 198) at inputs (..., 54)."""
-        made = self(h)
-        with in_float32(h.device):
+    def begin(self, head: nn.Linear, normalizer: Normalizer) -> None:
+        """Begin near the mean pose: from a turned one legs don't find home."""
+        with torch.no_grad():
+            head.weight *= 0.3
+            head.bias.copy_(mean_pose(normalizer))
+
+    def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+        """Map rotations (..., 132), as they are made, to world motion (..., 198) at inputs (..., 54)."""
+        with in_float32(made.device):
             sixd = normalizer.rotations_out(made.to(sparse.dtype), normalizer.origin(sparse))
             rotations = sixd_to_matrix(sixd.unflatten(-1, (N_JOINTS, 6)))
             parents = rotations[..., list(PARENTS[1:]), :, :]
@@ -120,25 +117,69 @@ def chains() -> Tensor:
     return made - made[HEAD]
 
 
-OUTPUTS: dict[str, type[RotationHead]] = {"local": LocalRotationHead, "global": GlobalRotationHead}
-"""The heads by the names that the config knows."""
+OUTPUTS: dict[str, type[Output]] = {"local": LocalRotations, "global": GlobalRotations}
+"""What the rotations may stand for, by the names that the config knows."""
+
+
+class Member(nn.Module):
+    """From encoded inputs to rotations: a linear stem, residual blocks, and a linear head.
+
+    Args:
+        cells: makes a recurrent cell of d inputs and outputs.
+        width: d, the width of the hidden state.
+        depth: number of blocks.
+        expansion: the hidden width of the blocks' MLPs, in d.
+    """
+
+    def __init__(self, cells: Callable[[int], Cell], width: int, depth: int, expansion: int):
+        super().__init__()
+        self.stem = nn.Linear(SPARSE_DIM, width)
+        self.blocks = nn.ModuleDict(
+            {f"block{i}": RecurrentBlock(cells(width), width, expansion) for i in range(1, depth + 1)}
+        )
+        self.norm = nn.LayerNorm(width)
+        self.head = nn.Linear(width, ROTATION.stop)
+
+    def named_blocks(self) -> Iterator[tuple[str, RecurrentBlock]]:
+        """Yield the blocks by their names, in order."""
+        return cast(Iterator[tuple[str, RecurrentBlock]], self.blocks.items())
+
+    def initial_state(self, like: Tensor, batch: int) -> State:
+        """Return the state of a fresh start: zeros (B, size) of each block's cell, by the block's name."""
+        return {name: like.new_zeros(batch, block.cell.size) for name, block in self.named_blocks()}
+
+    def forward(self, x: Tensor, state: State, newest: int) -> tuple[Tensor, State]:
+        """Map encoded inputs (B, n, 54) to the newest rotations (B, newest, 132) and the new state."""
+        h, kept = self.stem(x), {}
+        for name, block in self.named_blocks():
+            h, kept[name] = block(h, state[name])
+        return self.head(self.norm(h[:, h.shape[1] - newest :])), kept
+
+    def step(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        """Map one frame's encoded inputs (B, 54) to rotations (B, 132) and the state after it."""
+        h, kept = self.stem(x), {}
+        for name, block in self.named_blocks():
+            h, kept[name] = block.step(h, state[name])
+        return self.head(self.norm(h)), kept
 
 
 class RecurrentPoser(StreamModel):
-    """A linear stem, residual blocks of a recurrent cell and an MLP, and a linear head for the rotations.
+    """A recurrent stream of rotations: those of several members, averaged.
 
-    The positions follow from the rotations by forward kinematics, the head on its tracker. What the network
-    knows of the past is its cells' state; it sees none of its own outputs. Training unrolls it over T frames
-    from a zero state, as a live stream starts.
+    Each member learns by itself: in training its motion has its own loss. The positions follow from the
+    rotations by forward kinematics, the head on its tracker. What the network knows of the past is its cells'
+    state; it sees none of its own outputs. Training unrolls it over T frames from a zero state, as a live
+    stream starts.
 
     Args:
         normalizer: converts between the world and network space.
         frames: T, the frames of a training window.
-        width: d, the width of the hidden state.
-        depth: number of blocks.
+        width: d, the width of a member's hidden state.
+        depth: number of a member's blocks.
         cell: the recurrent cell, by its name in CELLS.
         expansion: the hidden width of the blocks' MLPs, in d.
-        output: the head, by its name in OUTPUTS.
+        output: what the rotations stand for, by its name in OUTPUTS.
+        members: number of members.
     """
 
     def __init__(
@@ -151,39 +192,52 @@ class RecurrentPoser(StreamModel):
         cell: str,
         expansion: int,
         output: str,
+        members: int,
     ):
         super().__init__(normalizer, frames)
-        self.stem = nn.Linear(SPARSE_DIM, width)
-        self.blocks = nn.ModuleDict(
-            {f"block{i}": RecurrentBlock(CELLS[cell](width), width, expansion) for i in range(1, depth + 1)}
+        self.output = OUTPUTS[output]()
+        self.members = nn.ModuleDict(
+            {f"member{i}": Member(CELLS[cell], width, depth, expansion) for i in range(1, members + 1)}
         )
-        self.norm = nn.LayerNorm(width)
-        self.head = OUTPUTS[output](normalizer, width)
+        for _, member in self.named_members():
+            self.output.begin(member.head, normalizer)
+
+    def named_members(self) -> Iterator[tuple[str, Member]]:
+        """Yield the members by their names, in order."""
+        return cast(Iterator[tuple[str, Member]], self.members.items())
 
     def initial_state(self, batch: int = 1) -> State:
-        """Return the state of a fresh start: zeros (B, size) of each block's cell, by the block's name."""
-        mean = self.normalizer.mean
-        return {name: mean.new_zeros(batch, block.cell.size) for name, block in self.named_blocks()}
-
-    def named_blocks(self) -> Iterator[tuple[str, RecurrentBlock]]:
-        """Yield the blocks by their names, in order."""
-        return cast(Iterator[tuple[str, RecurrentBlock]], self.blocks.items())
+        """Return the state of a fresh start: zeros (B, size) of each cell, by its member and block."""
+        return _joined(
+            {name: one.initial_state(self.normalizer.mean, batch) for name, one in self.named_members()}
+        )
 
     def encoded(self, sparse: Tensor) -> Tensor:
-        """Map world inputs (..., 54) to the hidden state (..., d) that enters the blocks."""
-        return self.stem(self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse)))
+        """Map world inputs (..., 54) to what the members see of them (..., 54)."""
+        return self.normalizer.encode_sparse(sparse, self.normalizer.origin(sparse))
 
-    def posed(self, h: Tensor, sparse: Tensor) -> Tensor:
-        """Map the hidden state (..., d) after the blocks to world motion (..., 198) at inputs (..., 54)."""
-        return self.head.posed(self.norm(h), sparse, self.normalizer)
+    def posed(self, made: Tensor, sparse: Tensor) -> Tensor:
+        """Map rotations (..., 132), as members make them, to world motion (..., 198) at inputs (..., 54)."""
+        return self.output.posed(made, sparse, self.normalizer)
+
+    def made(self, sparse: Tensor, state: State, newest: int) -> tuple[Tensor, State]:
+        """Return the newest rotations of each member (members, B, newest, 132), and the state after them."""
+        x, made, kept = self.encoded(sparse), [], {}
+        for name, member in self.named_members():
+            rotations, kept[name] = member(x, _of(state, name), newest)
+            made.append(rotations)
+        return torch.stack(made), _joined(kept)
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
         """Take in the newest frames; see MotionModel."""
         wanted = sparse.shape[1] if newest is None else newest
-        h, kept = self.encoded(sparse), {}
-        for name, block in self.named_blocks():
-            h, kept[name] = block(h, state[name])
-        return self.posed(h[:, -wanted:], sparse[:, -wanted:]), kept
+        made, kept = self.made(sparse, state, wanted)
+        return self.posed(made.mean(0), sparse[:, sparse.shape[1] - wanted :]), kept
+
+    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
+        """Make a training call; the motion is that of each member (members B, T, 198), in turn."""
+        made, kept = self.made(sparse, state, sparse.shape[1])
+        return self.posed(made, sparse.expand(len(made), -1, -1, -1)).flatten(0, 1), kept
 
     def step(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
         """Take in one frame of world inputs (B, 54), as `advance` does, in plain layers.
@@ -191,7 +245,19 @@ class RecurrentPoser(StreamModel):
         Returns:
             World motion (B, 198), and the state after the frame.
         """
-        h, kept = self.encoded(sparse), {}
-        for name, block in self.named_blocks():
-            h, kept[name] = block.step(h, state[name])
-        return self.posed(h, sparse), kept
+        x, made, kept = self.encoded(sparse), [], {}
+        for name, member in self.named_members():
+            rotations, kept[name] = member.step(x, _of(state, name))
+            made.append(rotations)
+        return self.posed(torch.stack(made).mean(0), sparse), _joined(kept)
+
+
+def _joined(states: Mapping[str, State]) -> State:
+    """Return the states of several members as one."""
+    return {f"{name}.{block}": value for name, state in states.items() for block, value in state.items()}
+
+
+def _of(state: State, member: str) -> State:
+    """Return a member's own state of that of all."""
+    own = f"{member}."
+    return {name.removeprefix(own): value for name, value in state.items() if name.startswith(own)}

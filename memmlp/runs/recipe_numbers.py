@@ -28,7 +28,7 @@ RECIPES: dict[str, int] = {
     "model.vae_hmd": 1,
     "model.rpm": 1,
     "model.avatar_jlm": 1,
-    "model.recurrent_poser": 2,
+    "model.recurrent_poser": 3,
     "model.sage": 1,
     "model.manikin_s": 1,
     "model.manikin_l": 1,

@@ -64,7 +64,8 @@ def test_the_cells_are_in_blocks_and_all_else_is_not(files: dict[str, Path]):
     assert layers
     assert all(".cell." in name for name in layers)
     assert not layers & stored  # the float32 weights are gone
-    assert {"model.model.stem.weight", "model.model.head.weight"} <= stored
+    member = "model.model.members.member1"
+    assert {f"{member}.stem.weight", f"{member}.head.weight"} <= stored
     assert sum(".mlp." in name and name.endswith(".weight") for name in stored) == 4
     assert sum(before.values()) == sum(after.values())
 

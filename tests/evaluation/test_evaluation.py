@@ -29,20 +29,20 @@ def test_positions_that_are_not_learned_follow_from_the_rotations(network):
 
 
 class Displaced(nn.Module):
-    """A head that leaves all bones away, as one did that was built before the rest pose was known."""
+    """An output that leaves all bones away, as one did that was built before the rest pose was known."""
 
-    def __init__(self, head: nn.Module):
+    def __init__(self, output: nn.Module):
         super().__init__()
-        self.head = head
+        self.output = output
 
-    def posed(self, h, sparse, normalizer):
-        motion = self.head.posed(h, sparse, normalizer).clone()
+    def posed(self, made, sparse, normalizer):
+        motion = self.output.posed(made, sparse, normalizer).clone()
         motion[..., -66:] = sparse[..., 36:39].repeat_interleave(22, -1)
         return motion
 
 
 def test_positions_that_are_not_those_of_the_rotations_are_refused():
     model = tiny.recurrent_poser(Heading(), output="global")
-    model.head = Displaced(model.head)
+    model.output = Displaced(model.output)
     with pytest.raises(InputError, match=r"RecurrentPoser: its positions have an MPJPE of .* clip clip0"):
         STREAM.report(model, TEST, "stream")

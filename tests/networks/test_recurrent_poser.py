@@ -23,13 +23,18 @@ CLIP = tiny.clip(40)
 SPARSE = CLIP[None, :, :SPARSE_DIM]
 
 
-@pytest.mark.parametrize(("cell", "output"), [*((cell, "local") for cell in CELLS), ("gru", "global")])
+FORMS = [*({"cell": cell} for cell in CELLS), {"output": "global"}, {"output": "global", "members": 2}]
+
+
+@pytest.mark.parametrize("form", FORMS, ids=str)
 @torch.no_grad()
-def test_training_evaluation_and_the_live_graph_are_one_stream(cell, output):
+def test_training_evaluation_and_the_live_graph_are_one_stream(form):
     """The unrolled call of training, calls of any size, both modes, and the graph of one frame."""
-    model = tiny.recurrent_poser(Heading(), cell=cell, output=output).double()
+    model = tiny.recurrent_poser(Heading(), **form).double()
     sparse = SPARSE.double()
-    unrolled = model.learn(sparse, model.initial_state(), CLIP[None].double())[0][0]
+    unrolled = model.advance(sparse, model.initial_state())[0][0]
+    if model.members.keys() == {"member1"}:
+        torch.testing.assert_close(model.learn(sparse, model.initial_state(), CLIP[None])[0][0], unrolled)
     state, made = model.initial_state(), []
     for part in sparse.split([1, 9, 30], 1):
         motion, state = model.advance(part, state)
@@ -42,6 +47,27 @@ def test_training_evaluation_and_the_live_graph_are_one_stream(cell, output):
     modes = [evaluation.predict(model, [CLIP.double()], mode, 8)[0] for mode in ("stream", "window")]
     for found in (torch.cat(made), torch.cat(live), *modes):
         torch.testing.assert_close(found, unrolled, atol=1e-11, rtol=0)
+
+
+@torch.no_grad()
+def test_each_member_learns_by_itself_and_live_they_are_averaged():
+    model = tiny.recurrent_poser(Heading(), members=2, output="global")
+    truth = torch.stack([tiny.clip(7, seed) for seed in (1, 2)])
+    sparse = truth[..., :SPARSE_DIM]
+    learned, after = model.learn(sparse, model.initial_state(2), truth)
+    alone = tiny.recurrent_poser(Heading(), output="global")
+    for index, name in enumerate(model.members):
+        alone.members["member1"].load_state_dict(model.members[name].state_dict())
+        motion, state = alone.advance(sparse, alone.initial_state(2))
+        torch.testing.assert_close(learned[2 * index : 2 * index + 2], motion)
+        for block, value in state.items():
+            torch.testing.assert_close(after[block.replace("member1", name)], value)
+    assert not torch.allclose(learned[:2], learned[2:], atol=1e-3)
+    one, two = (list(member.parameters())[-1] for member in model.members.values())  # the heads' biases
+    before = model.advance(sparse, model.initial_state(2))[0]
+    one += 0.1
+    two -= 0.1
+    torch.testing.assert_close(model.advance(sparse, model.initial_state(2))[0], before, atol=1e-5, rtol=0)
 
 
 @torch.no_grad()
@@ -79,9 +105,9 @@ def test_a_network_that_is_loaded_makes_the_same_motion(output, tmp_path):
 def test_a_global_head_begins_at_the_mean_pose():
     """With no hidden state its rotations are those of the normalizer's mean, seen along the heading."""
     model = tiny.recurrent_poser(Heading(), output="global")
-    model.head.weight.zero_()
+    model.members["member1"].head.weight.zero_()
     mean = model.normalizer.posed(torch.zeros(1, ROTATION.stop), SPARSE[0, :1])
-    made = model.posed(torch.zeros(1, 16), SPARSE[0, :1])
+    made = model.posed(model.members["member1"].head(torch.zeros(1, 16)), SPARSE[0, :1])
     found, expected = (evaluation.local_rotations(motion) for motion in (made, mean))
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
 
@@ -97,10 +123,11 @@ def test_side_by_side_is_one_by_one():
 @torch.no_grad()
 def test_cells_stay_exact_where_layers_are_rounded(cell):
     model, calls = tiny.recurrent_poser(cell=cell, output="global"), []
-    block = model.blocks["block2"]
+    blocks = model.members["member1"].blocks
+    block = blocks["block2"]
     block.cell.register_forward_hook(lambda of, given, made: calls.append((given, made)))
     with torch.autocast("cpu", torch.bfloat16):
-        assert model.blocks["block1"].mlp(torch.zeros(1, 16)).dtype == torch.bfloat16
+        assert blocks["block1"].mlp(torch.zeros(1, 16)).dtype == torch.bfloat16
         model.learn(SPARSE, model.initial_state(), CLIP[None])
     given, made = calls[0]
     for found, expected in zip(made, block.cell(*given), strict=True):
@@ -116,6 +143,7 @@ CHANGES = [
     {"cell": "mingru"},
     {"cell": "lru"},
     {"output": "global"},
+    {"members": 2},
 ]
 
 
@@ -131,12 +159,12 @@ def test_a_training_window_is_all_that_a_step_moves_by():
     assert (model.frames, model.stride, model.length) == (9, 9, 0)
 
 
-@pytest.mark.parametrize(("profile", "width", "depth"), [("small", 128, 4), ("paper", 256, 4)])
+@pytest.mark.parametrize(("profile", "width", "depth"), [("small", 128, 4), ("paper", 144, 4)])
 def test_parameters(profile, width, depth):
     """A block's GRU is 6 d d + 6 d, its MLP of d hidden units 2 d d + 2 d, its two norms 4 d."""
     model = untrained(["model=recurrent_poser", f"profile={profile}"])
     ends = 54 * width + width + 2 * width + 132 * width + 132
-    assert model.count_parameters() == depth * (8 * width**2 + 12 * width) + ends
+    assert model.count_parameters() == 2 * (depth * (8 * width**2 + 12 * width) + ends)
     assert model.count_parameters() < 4_200_000
 
 

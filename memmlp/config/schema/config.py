@@ -178,6 +178,7 @@ class ProfileConfig:
     recurrent_poser_batch: Optional[int] = optional(Within(1))
     recurrent_poser_width: Optional[int] = optional(Within(1))
     recurrent_poser_depth: Optional[int] = optional(Within(1))
+    recurrent_poser_members: Optional[int] = optional(Within(1))
     recurrent_poser_lr: Optional[float] = optional(Within(0, strict=True))
     recurrent_poser_warmup: Optional[int] = optional(Within(0))
     recurrent_poser_weight_decay: Optional[float] = optional(Within(0))

@@ -139,6 +139,7 @@ class RecurrentPoserConfig(BaselineConfig):
     cell: str = one_of("gru", "lstm", "mingru", "lru")
     output: str = standing("local", OneOf(("local", "global")))
     expansion: int = at_least(1)
+    members: int = at_least(1)
 
 
 @dataclass

@@ -25,8 +25,11 @@ class RecurrentPoserStream(FrameStream):
         assert isinstance(model, RecurrentPoser)
         self.model = model
         self.model.normalizer = OneFrameNormalizer(model.normalizer)
-        mlps = (f"model.blocks.{name}.mlp" for name in model.blocks)
-        self.float32_modules = ("model.normalizer", "model.stem", *mlps, "model.head")
+        outer = ["model.normalizer"]
+        for name, member in model.named_members():
+            inner = ["stem", *(f"blocks.{block}.mlp" for block in member.blocks), "head"]
+            outer += [f"model.members.{name}.{part}" for part in inner]
+        self.float32_modules = tuple(outer)
 
     def step(self, sparse: Tensor, state: State, fresh: Tensor) -> tuple[Tensor, State]:
         """Map world inputs (1, 54) and the state to world motion (1, 198) and what is carried on."""

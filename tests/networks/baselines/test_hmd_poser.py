@@ -65,7 +65,7 @@ def test_the_past_counts_without_end_and_the_future_does_not():
 
 
 def test_the_state_of_the_published_network_is_8192_numbers():
-    model = tiny.baseline("hmd_poser", depth=2, width=256, heads=8, feedforward=8)
+    model = tiny.baseline("hmd_poser", width=256, heads=8, feedforward=8)
     assert sum(part.numel() for part in model.initial_state(1).values()) == 8192
 
 
