@@ -254,10 +254,10 @@ class RecurrentPoser(StreamModel):
 
 def _joined(states: Mapping[str, State]) -> State:
     """Return the states of several members as one."""
-    return {f"{name}.{block}": value for name, state in states.items() for block, value in state.items()}
+    return {f"{name}_{block}": value for name, state in states.items() for block, value in state.items()}
 
 
 def _of(state: State, member: str) -> State:
     """Return a member's own state of that of all."""
-    own = f"{member}."
+    own = f"{member}_"
     return {name.removeprefix(own): value for name, value in state.items() if name.startswith(own)}
