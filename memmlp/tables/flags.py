@@ -14,6 +14,7 @@ from memmlp.tables.measured_run import Measured
 
 Say = Callable[[Arm, int], str | None]
 BUILT_IN = "builtin"
+ALIKE = 1.1  # how many times as much data a training may see before it is said
 SMPLH = (1, 2, 3)  # the paper's tables on AMASS, on the rest joints of SMPL-H bodies
 ORIGIN = {
     "code": "code", "data": "data", "hardware": "hardware", "device": "device", "gpu": "GPU",
@@ -192,9 +193,10 @@ def _differing(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:
 
 def _seen(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     """Flag arms whose trainings saw more frames than others': windows may be longer, batches larger."""
-    known = [(run.training["frames"], label) for label, run in every if "frames" in run.training]
-    found = ((f"{frames / 1e6:.3g} M", label) for frames, label in sorted(known, key=lambda one: one[0]))
-    yield from _differing("number of frames seen in training", found)
+    known = sorted((run.training["frames"], label) for label, run in every if "frames" in run.training)
+    if known and known[-1][0] > ALIKE * known[0][0]:
+        found = ((f"{frames / 1e6:.3g} M", label) for frames, label in known)
+        yield from _differing("number of frames seen in training", found)
 
 
 def _partial(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:

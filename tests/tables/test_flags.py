@@ -148,7 +148,7 @@ def test_runs_of_different_origin_are_flagged(
 def test_arms_that_saw_more_in_training_are_said(sweep: Sweep, tmp_path: Path):
     """A window twice as long, or a batch twice as large, is twice the data a step."""
     settings = {"optim": {"steps": 2000, "batch": 32}, "model": {"frames": 41}}
-    more = settings | {"model": {"frames": 82}}
+    nearly, more = (settings | {"model": {"frames": frames}} for frames in (40, 82))
     configs = {arm.label: dict(settings) for arm in sweep.runnable()}
 
     def flags() -> list[str]:
@@ -158,6 +158,8 @@ def test_arms_that_saw_more_in_training_are_said(sweep: Sweep, tmp_path: Path):
 
     assert flags() == []
     del configs["full_model"]["model"]  # not known
+    assert flags() == []
+    configs["by position"] = nearly
     assert flags() == []
     configs["by position"] = more
     (flag,) = flags()
