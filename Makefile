@@ -17,15 +17,15 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)
 	$(BIN)/memmlp demo
 
-# Twice as many processes as small machines have cores: some tests wait for others' processes.
+# Twice as many processes as small machines have cores: some tests wait for others' processes. The fast ones don't.
 # What they compile is kept, whatever the environment says: dozens of interpreters are started.
-PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder -n 4
 
 test: $(STAMP)
 	$(PYTEST)
 
 test-fast: $(STAMP)
-	$(PYTEST) -m "not slow"
+	$(PYTEST) -n 2 -m "not slow"
 
 coverage: $(STAMP)
 	$(PYTEST) --cov --cov-report=term:skip-covered

@@ -230,6 +230,7 @@ def test_rotation_only_positions_are_forward_kinematics():
     assert motion.shape[-1] == MOTION_DIM
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("predictor", [TwoBranch, RotationOnly, TwoBranchMemory])
 @pytest.mark.parametrize(("kind", "changes"), MEMORIES)
 @torch.no_grad()

@@ -126,6 +126,7 @@ def test_equivalence_is_the_interval_within_the_margin():
     np.testing.assert_array_equal(equivalence_p(d, np.full(len(d), 4.0)), p)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "name"), [*itertools.product(GRID, SHARES)])
 def test_promises(shape: tuple[int, int, int], name: str):
     d = differences(*shape, SHARES[name], tables=300)

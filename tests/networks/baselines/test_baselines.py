@@ -87,6 +87,7 @@ KNOBS = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "change"), KNOBS, ids=str)
 @torch.no_grad()
 def test_every_knob_changes_the_motion(name, change):
