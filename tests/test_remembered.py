@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import onnx
 import pytest
 from hydra._internal import defaults_list
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from onnx_ir import schemas
 
 from memmlp.config import compose
 
@@ -60,3 +62,12 @@ def test_a_file_that_changes_is_read_again(tmp_path: Path):
         (tmp_path / "memory" / "own.yaml").write_text(f"defaults: [vq]\nlayers: {layers}\n")
         found.append(composed(["--config-dir", str(tmp_path), "memory=own"]))
     assert [OmegaConf.create(text).memory.layers for text in found] == [[2], [4]]
+
+
+def test_signatures_of_operators_are_those_that_onnx_makes():
+    made = schemas.OpSignature.from_op_schema
+    for name, version in (("Gemm", 13), ("Split", 13), ("Split", 18), ("Split", 13)):
+        schema = onnx.defs.get_schema(name, version)
+        anew = made.__wrapped__(schemas.OpSignature, schema)
+        assert repr(made(schema)) == repr(anew)
+        assert made(schema) is made(schema)

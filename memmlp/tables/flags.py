@@ -14,7 +14,7 @@ from memmlp.tables.measured_run import Measured
 
 Say = Callable[[Arm, int], str | None]
 BUILT_IN = "builtin"
-ALIKE = 1.1  # how many times as much data a training may see before it is said
+ALIKE = 1.1  # how many times the frames of its control an arm may see in training before it is said
 SMPLH = (1, 2, 3)  # the paper's tables on AMASS, on the rest joints of SMPL-H bodies
 ORIGIN = {
     "code": "code", "data": "data", "hardware": "hardware", "device": "device", "gpu": "GPU",
@@ -51,7 +51,7 @@ def flags(
     yield from _no_numbers(sweep, runs)
     for attribute, what in ORIGIN.items():
         yield from _differing(what, [(getattr(run.origin, attribute), label) for label, run in every])
-    yield from _seen(every)
+    yield from _seen(sweep, runs)
     yield from _partial(every)
     yield from _recipes(every)
     yield from _own_code(every)
@@ -191,12 +191,19 @@ def _differing(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:
         yield f"{what} differs: {'; '.join(parts)}"
 
 
-def _seen(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
-    """Flag arms whose trainings saw more frames than others': windows may be longer, batches larger."""
-    known = sorted((run.training["frames"], label) for label, run in every if "frames" in run.training)
-    if known and known[-1][0] > ALIKE * known[0][0]:
-        found = ((f"{frames / 1e6:.3g} M", label) for frames, label in known)
-        yield from _differing("number of frames seen in training", found)
+def _seen(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+    """Flag arms that saw more or fewer frames in training than their controls, by windows or batches."""
+    every = [(label, run.training.get("frames")) for label, found in runs.items() for run in found.values()]
+    frames = {label: number for label, number in every if number}
+    unequal = []
+    for arm in sweep.runnable():
+        other = control_arm(sweep, arm)
+        if other and {arm.label, other.label} <= frames.keys():
+            own, controls = frames[arm.label], frames[other.label]
+            if max(own, controls) > ALIKE * min(own, controls):
+                unequal.append(f"'{arm.label}' {own / 1e6:.3g} M to '{other.label}' {controls / 1e6:.3g} M")
+    if unequal:
+        yield f"number of frames seen in training differs: {_listed(unequal)}"
 
 
 def _partial(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:

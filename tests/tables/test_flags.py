@@ -157,15 +157,16 @@ def test_arms_that_saw_more_in_training_are_said(sweep: Sweep, tmp_path: Path):
         return [flag for flag in table.flags if "in training" in flag]
 
     assert flags() == []
-    del configs["full_model"]["model"]  # not known
-    assert flags() == []
     configs["by position"] = nearly
     assert flags() == []
     configs["by position"] = more
-    (flag,) = flags()
-    assert "number of frames seen in training differs: 2.62 M of " in flag
-    assert flag.endswith("; 5.25 M of 'by position'")
-    assert "full_model" not in flag
+    line = "number of frames seen in training differs: 'by position' 5.25 M to 'full_model' 2.62 M"
+    assert flags() == [line]
+    configs["full_model"] = more
+    assert len(flags()) == 1  # of the other arm now
+    assert "'no | memory' 2.62 M to 'full_model' 5.25 M" in flags()[0]
+    configs["full_model"] = {"optim": settings["optim"]}  # not known
+    assert flags() == []
 
 
 def test_what_is_no_stream_is_said_in_every_format(sweep: Sweep, tmp_path: Path):
