@@ -153,9 +153,10 @@ class TrainedRun(os.PathLike[str]):
         """One row for each mode, branch and test clip.
 
         Columns are run, seed, mode, branch, clip, group (the clips of one take or subject have one), frames
-        at 60 Hz, and the metrics, lower is better, whose units are in `.attrs["units"]`: MPJRE and geodesic
-        in degrees (NaN in the position branch), MPJPE and the other PE in cm, MPJVE in cm/s, Jitter in
-        10^2 m/s^3. A network without a position branch has the joints of its rotations there.
+        at 60 Hz, and the metrics, whose units are in `.attrs["units"]`: MPJRE and geodesic in degrees (NaN in
+        the position branch), MPJPE and the other PE in cm, MPJVE in cm/s, Jitter in 10^2 m/s^3. Lower is
+        better, but for metrics of a package that says otherwise. A network without a position branch has the
+        joints of its rotations there.
 
         Raises:
             InputError: where pandas is not installed, or a file of results is damaged.
@@ -210,13 +211,17 @@ class TrainedRun(os.PathLike[str]):
         space: SpaceName = "amass",
         rotations: RotationFormat = "matrix",
         offsets: Offsets | None = None,
+        height: float | None = None,
+        floor: float = 0.0,
         ik: LBFGS | None = None,
     ) -> Stream:
         """The network to be fed live, from its ONNX file; the arguments are those of `Stream`.
 
         Raises InputError as that does, and where the run has no ONNX file yet.
         """
-        return Stream(self._run, space=space, rotations=rotations, offsets=offsets, ik=ik)
+        return Stream(
+            self._run, space=space, rotations=rotations, offsets=offsets, height=height, floor=floor, ik=ik
+        )
 
     @cached_property
     def _opened(self) -> OpenedRun:

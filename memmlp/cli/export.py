@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 TARGETS = ("onnxruntime", "web", "wasm", "webgpu", "webnn", "unity", "tensorrt", "coreml", "qnn")
 """Those of memmlp.deploy.targets, without importing ONNX Runtime for the help."""
 
+FULL_TOLERANCE = (
+    0.1  # metres, and of rotation matrices: what fp16 changes is far less, what is broken far more
+)
+
 
 class Form(NamedTuple):
     """What file is wanted of a run.
@@ -87,7 +91,10 @@ class Form(NamedTuple):
     help="Format of the joints' rotations, with --scope full; quaternions are x, y, z, w.  [default: matrix]",
 )
 @click.option(
-    "--clips", default=1, show_default=True, help="How many test clips the file is checked on; 0 for all."
+    "--clips",
+    default=1,
+    show_default=True,
+    help="How many test clips a float32 file is checked on; 0 for all.",
 )
 @click.option(
     "--check",
@@ -172,7 +179,7 @@ def write(run: str, out: Path, outputs: Path, form: Form, clips: int, max_growth
             f"export: write {out} in {form.precision}, and measure what that costs on {len(test)} test clips"
         )
         train = data.open("train").clips() if form.precision == "int8" else []
-        write_less_precise(network, out, found.id, train, test, form, max_growth)
+        write_less_precise(model, network, out, found.id, train, test, form, max_growth)
     else:
         allowed = (
             "--scope step and a streaming graph" if form.precision.startswith("int8") else "a streaming graph"
@@ -235,6 +242,7 @@ def write_graph(network: MotionModel | StreamingGraph, path: Path, run_id: str, 
 
 
 def write_less_precise(
+    model: MotionModel,
     network: StreamingGraph,
     out: Path,
     run_id: str,
@@ -245,9 +253,11 @@ def write_less_precise(
 ) -> None:
     """Write the ONNX file of less precision, provided that it is accurate enough, and say what it costs.
 
-    What it costs is measured of the network, for a file of the whole way too: its layers are the same.
+    What it costs is measured of the network, for a file of the whole way too: its layers are the same. That
+    file is compared with torch on the first test clip, too.
 
     Args:
+        model: the network as it was trained.
         network: the streaming graph.
         out: the file to write.
         run_id: the run's id, for the file's metadata.
@@ -257,12 +267,14 @@ def write_less_precise(
         max_growth: the fraction by which MPJPE may grow (0.01 is 1 %).
 
     Raises:
-        ClickException: where MPJPE grows by more; nothing is written then.
+        ClickException: where MPJPE grows by more, or a file of the whole way is not the network's; nothing is
+            written then.
     """
     import tempfile
 
     from memmlp.deploy.deployment import lower
     from memmlp.deploy.precision_cost import compared
+    from memmlp.live.full_graph import full_parity
 
     precision = form.precision
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
@@ -278,6 +290,10 @@ def write_less_precise(
         if form.full:
             write_graph(network, exact, run_id, form)
             lower(precision, exact, other, network, train)
+            apart = full_parity(model, other, test[0], form.full[0])
+            said += f"; the whole way differs from torch by {apart:.1e} at most on the first"
+            if not apart <= FULL_TOLERANCE:
+                raise click.ClickException(f"{said}, more than {FULL_TOLERANCE:g}: not written")
         other.replace(out)
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, on test clips {said}")
 

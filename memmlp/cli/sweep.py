@@ -62,8 +62,8 @@ def sweep(
 
     OVERRIDES are those of `memmlp train`, for all arms; `seed=0,1` sets the seeds. The workers are processes
     of this machine, which share out its GPUs, jobs of Slurm (`executor=slurm slurm.partition=P
-    slurm.time=10:00:00 slurm.gpus=1`, and any option of sbatch) or tasks of Ray (`executor=ray
-    ray.num_gpus=1`).
+    slurm.time=10:00:00 slurm.gpus=1`, and any option of sbatch), or tasks of Ray (`executor=ray
+    ray.num_gpus=1`) or Dask (`executor=dask`).
 
     With --until-decided all arms get three seeds first. Then only those with open verdicts, and their
     controls, get more, up to --max-seeds.

@@ -30,8 +30,8 @@ class Claim(NamedTuple):
     def owner(self) -> dict[str, Any] | None:
         """The process that made the claim; empty for nobody, None where that cannot be read.
 
-        An empty file is nobody's: if somebody is about to write it (see Claims.make), the fence stops who is
-        too late.
+        An empty file is nobody's. Who writes into it later (see Claims.make) is stopped by the fence
+        (memmlp.common.fences).
         """
         try:
             found = json.loads(self.text or "{}")

@@ -61,7 +61,7 @@ def connect(kind: str) -> None:
 
 
 def leave() -> None:
-    """Part from the other processes, when all have heard the last word: who still receives it would abort."""
+    """Part from the other processes, once all have the last message: one that still receives would abort."""
     if size() > 1:
         from torch import distributed
 

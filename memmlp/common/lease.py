@@ -7,8 +7,8 @@ with the next number, so that numbers only grow. Who may make the next claim:
 - anybody where the last one is nobody's, or of a process of this machine that is dead;
 - who has seen the last claim unchanged for longer than LEASE, by a clock of its own.
 
-The kernel's lock (`.lock`) is taken where it can be had. If another process has it, a claim counts only as
-over once its lease has expired. That nobody has it proves nothing.
+The kernel's lock (`.lock`) is taken where it can be had. While another process has it, a claim is over only
+when its lease has expired. A lock that is free proves nothing: some file systems know none.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
         InputError: where the config's device, or the code of a component of one's own, is not there.
     """
     outputs = Path(cfg.paths.outputs)
-    refined = build_experiment(_unrefined(cfg), elsewhere) if cfg.refiner is not None else None
+    unrefined = build_experiment(_unrefined(cfg), elsewhere) if cfg.refiner is not None else None
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     config["plugins"] = plugins.used(config)
     metrics = build_metrics(cfg.evaluation.metrics)
@@ -91,7 +91,7 @@ def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
         predictions=Path(cfg.save_predictions) if cfg.save_predictions else None,
         tracking=build_tracking(cfg),
         called=readable_name,
-        refined=refined,
+        unrefined=unrefined,
     )
 
 

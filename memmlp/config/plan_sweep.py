@@ -157,8 +157,8 @@ def tasks_of(experiment: Experiment, data: str) -> list[RunTask]:
         RunTask(one.id, one.kind, experiment.config, one.upstream.id if one.upstream else None)
         for one in experiment.upstream_identities(data)
     ]
-    if experiment.refined:  # the network's training is enough of it
-        *upstream, network = tasks_of(experiment.refined, data)
+    if experiment.unrefined:  # the network's training is enough of it
+        *upstream, network = tasks_of(experiment.unrefined, data)
         upstream = [*upstream, replace(network, stages=())]
     last = upstream[-1].id if upstream else None
     return [*upstream, RunTask(own.id, own.kind, experiment.config, last, experiment.stages, own.what)]

@@ -10,6 +10,7 @@ from typing import Any
 
 from torch import Tensor
 
+from memmlp.common.progress import tell
 from memmlp.deploy import latency
 from memmlp.deploy.block_quantization import quantise_blocks
 from memmlp.deploy.half import halve
@@ -65,7 +66,7 @@ class Deployment:
             deployed: where the files go.
             run_id: the run's id, for the files' metadata.
             train: training clips (N, 252), to calibrate int8.
-            test: test clips (N, 252), to check the file and measure int8's accuracy.
+            test: test clips (N, 252), to check the file and measure what less precision costs.
 
         Returns:
             The files' sizes, times and the accuracy of the one of less precision.
@@ -92,8 +93,11 @@ class Deployment:
         }
         if self.alone:
             record |= self._alone(model)
-        if self.precision != "fp32" and isinstance(network, StreamingGraph):
-            record[self.precision] = self._less_precise(network, deployed, train, test)
+        if self.precision != "fp32":
+            if isinstance(network, StreamingGraph):
+                record[self.precision] = self._less_precise(network, deployed, train, test)
+            else:
+                tell(f"export: no file in {self.precision}, as {type(model).__name__} has no streaming graph")
         return record
 
     def _alone(self, model: MotionModel) -> dict[str, float]:

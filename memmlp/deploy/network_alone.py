@@ -8,10 +8,11 @@ from __future__ import annotations
 import copy
 from typing import TypeVar
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from memmlp.motion.body import MOTION_DIM, ROTATION
+from memmlp.motion.body import MOTION_DIM, N_JOINTS, POSITION, ROTATION
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.motion_model import MotionModel
 
@@ -40,6 +41,14 @@ class NoConversion(Normalizer):
     def posed(self, rotation: Tensor, sparse: Tensor) -> Tensor:
         """Return the rotations (..., 132) as motion (..., 198) whose positions are zeros."""
         return F.pad(rotation, (0, MOTION_DIM - ROTATION.stop))
+
+    def posed_globally(self, rotations: Tensor, sparse: Tensor) -> Tensor:
+        """Return the rotations (..., 132) as motion (..., 198) whose positions are zeros."""
+        return self.posed(rotations, sparse)
+
+    def pose(self, motion: Tensor, sparse: Tensor) -> Tensor:
+        """Return zeros (..., 22, 3) in place of joint positions."""
+        return torch.zeros_like(motion[..., POSITION]).unflatten(-1, (N_JOINTS, 3))
 
 
 def network_alone(model: Model) -> Model:

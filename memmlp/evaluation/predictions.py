@@ -33,6 +33,7 @@ def save_predictions(evaluation: Evaluation, model: MotionModel, test: MotionDat
     """Write `<folder>/<mode>/<clip>.npz` for every mode and test clip; see `prediction_arrays`."""
     clips = test.clips()
     for mode in evaluation.modes:
+        torch.manual_seed(evaluation.seed)  # as for the mode's metrics
         motions = modes.predict(model, clips, mode, evaluation.batch)
         for name, clip, motion in zip(test.names, clips, motions, strict=True):
             path = folder / mode / f"{name}.npz"
@@ -43,8 +44,14 @@ def save_predictions(evaluation: Evaluation, model: MotionModel, test: MotionDat
 
 
 def predict_clip(model: MotionModel, clip: Tensor, mode: str) -> dict[str, np.ndarray]:
-    """What a network makes of a clip's frames (N, 252) in a mode, beside the truth (`prediction_arrays`)."""
-    return prediction_arrays(model.normalizer, clip, modes.MODE_FUNCTIONS[mode](model, [clip])[0], NoIK())
+    """What a network makes of a clip's frames (N, 252) in a mode, beside the truth (`prediction_arrays`).
+
+    A network that draws numbers draws the same ones for a clip each time.
+    """
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        motion = modes.MODE_FUNCTIONS[mode](model, [clip])[0]
+    return prediction_arrays(model.normalizer, clip, motion, NoIK())
 
 
 def prediction_arrays(normalizer: Normalizer, clip: Tensor, motion: Tensor, ik: IK) -> dict[str, np.ndarray]:

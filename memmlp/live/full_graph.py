@@ -118,7 +118,7 @@ class FullStep(nn.Module):
         return own | self.model.initial_state(1)
 
     def forward(self, positions: Tensor, rotations: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        """Compute the outputs of the module's docstring from its inputs, both in that order."""
+        """Map positions, rotations and states to the outputs and new states of this file's beginning."""
         seen, last_positions, last_rotations = state[: len(OWN)]
         positions = positions @ self.world.T
         rotations = self.world @ rotations * self.body

@@ -17,7 +17,7 @@ from memmlp.motion.body import SPARSE_DIM
 
 WARM_UP = 30  # samples before the timed ones
 Key = TypeVar("Key", bound=Hashable)
-LEAST = 200  # samples are timed, however few are asked for
+LEAST = 200  # samples that are timed, at least
 
 
 def measure_pose(path: Path, steps: int) -> dict[str, float]:

@@ -107,7 +107,7 @@ class Stream:
         network_seconds: how long the network itself took in the last `step`.
 
     Raises:
-        InputError: for any other argument, in one line.
+        InputError: where an argument is none of the above, in one line.
     """
 
     def __init__(

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from memmlp.motion.body import PARENTS
+from memmlp.motion.body import HEAD, N_JOINTS, PARENTS
 
 
 def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
@@ -104,6 +104,18 @@ def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tenso
         positions.append(_taken(positions[-1], parents) + above @ offsets[joints])
         rotations.append(above @ local[..., joints, :, :])
     return torch.cat(rotations, -3), torch.cat(positions, -3)[..., 0]
+
+
+def bone_chains() -> Tensor:
+    """Return the matrix (22, 21) that adds turned bones up to joints as they are seen from the head.
+
+    A bone leads from a joint's parent to the joint; the root has none.
+    """
+    chains = torch.zeros(N_JOINTS, N_JOINTS - 1)
+    for joint in range(1, N_JOINTS):
+        chains[joint] = chains[PARENTS[joint]]
+        chains[joint, joint - 1] = 1
+    return chains - chains[HEAD]
 
 
 def _levels() -> Iterator[tuple[slice, list[slice]]]:

@@ -11,12 +11,13 @@ from memmlp.motion.body import (
     HEAD,
     MOTION_DIM,
     N_JOINTS,
+    PARENTS,
     ROTATION,
     SPARSE_DIM,
     SPARSE_POSITION,
 )
 from memmlp.motion.coordinates import World
-from memmlp.motion.geometry import forward_kinematics, sixd_to_matrix
+from memmlp.motion.geometry import bone_chains, forward_kinematics, matrix_to_sixd, sixd_to_matrix
 
 
 class Normalizer(nn.Module):
@@ -34,6 +35,7 @@ class Normalizer(nn.Module):
     rest: Tensor
     mean: Tensor
     std: Tensor
+    chains: Tensor
 
     def __init__(self, coordinates: World, rest: Tensor, mean: Tensor, std: Tensor):
         super().__init__()
@@ -41,6 +43,7 @@ class Normalizer(nn.Module):
         self.register_buffer("rest", rest.float())
         self.register_buffer("mean", mean.float())
         self.register_buffer("std", std.float().clamp_min(self.MIN_STD))
+        self.register_buffer("chains", bone_chains(), persistent=False)
 
     @classmethod
     def raw(cls, coordinates: World, rest: Tensor) -> Normalizer:
@@ -107,3 +110,18 @@ class Normalizer(nn.Module):
         world = self.decode_motion(motion, self.origin(sparse))
         positions = self.pose(world.detach(), sparse).flatten(-2)
         return torch.cat([world[..., ROTATION], positions], -1)
+
+    def posed_globally(self, rotations: Tensor, sparse: Tensor) -> Tensor:
+        """Make world motion (..., 198) from global rotations (..., 132), 6D, at world inputs (..., 54).
+
+        The rotations are in the coordinates of the inputs' origin. The positions are sums of turned
+        bones, without gradient, the head on its tracker.
+        """
+        sixd = self.rotations_out(rotations, self.origin(sparse))
+        matrices = sixd_to_matrix(sixd.unflatten(-1, (N_JOINTS, 6)))
+        parents = matrices[..., list(PARENTS[1:]), :, :]
+        local = parents.transpose(-1, -2) @ matrices[..., 1:, :, :]
+        offsets = self.rest[1:] - self.rest[list(PARENTS[1:])]
+        bones = (parents.detach() @ offsets[..., None])[..., 0]
+        positions = self.chains @ bones + sparse[..., SPARSE_POSITION][..., None, :3]
+        return torch.cat([sixd[..., :6], matrix_to_sixd(local).flatten(-2), positions.flatten(-2)], -1)

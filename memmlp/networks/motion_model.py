@@ -1,4 +1,4 @@
-"""The interface of every network: it sees a window of frames, and one call advances it in time."""
+"""The interface of every network: one call takes in new frames and returns motion and a state."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from memmlp.networks.memory import State
 
 
 class MotionModel(nn.Module):
-    """A network that sees the last T frames and is moved in time by `advance`; the interface of all networks.
+    """A network that `advance` moves in time; the interface of all networks.
 
-    Evaluation, export, timing and training know no more of a network than this. In this base class the state
-    is only the buffer of past inputs.
+    Evaluation, export, timing and training know no more of a network than this. In this base class a
+    network sees a window, the last T frames, and its state is only the buffer of past inputs (WindowlessModel
+    has none).
 
     Args:
         normalizer: converts between the world and network space.
@@ -44,7 +45,7 @@ class MotionModel(nn.Module):
 
     @property
     def windowless(self) -> bool:
-        """Whether the network has no window and is a stream in both evaluation modes (see StreamModel)."""
+        """Whether it has no window and is a stream in both evaluation modes (see WindowlessModel)."""
         return False
 
     @property

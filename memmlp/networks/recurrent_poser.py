@@ -8,13 +8,13 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from memmlp.motion.body import HEAD, N_JOINTS, PARENTS, ROTATION, SPARSE_DIM, SPARSE_POSITION
+from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.cells import CELLS, Cell
 from memmlp.networks.layers import in_float32
 from memmlp.networks.memory import State
-from memmlp.networks.stream_model import StreamModel
+from memmlp.networks.windowless_model import WindowlessModel
 
 
 class RecurrentBlock(nn.Module):
@@ -52,7 +52,7 @@ class RecurrentBlock(nn.Module):
 
 
 class Output(nn.Module):
-    """What the rotations (..., 132) that a member makes stand for; the interface of the slot `output`."""
+    """What a member's rotations (..., 132) stand for; the interface of the option `model.output`."""
 
     def begin(self, head: nn.Linear, normalizer: Normalizer) -> None:
         """Change the weights that a head begins with; by default they stay as they are."""
@@ -76,14 +76,8 @@ class GlobalRotations(Output):
     No joint inherits its ancestors' errors, and the positions are sums of turned bones.
     """
 
-    chains: Tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("chains", chains(), persistent=False)
-
     def begin(self, head: nn.Linear, normalizer: Normalizer) -> None:
-        """Begin near the mean pose: from a turned one legs don't find home."""
+        """Begin near the mean pose: a training that begins at random ones leaves legs turned wrongly."""
         with torch.no_grad():
             head.weight *= 0.3
             head.bias.copy_(mean_pose(normalizer))
@@ -91,30 +85,17 @@ class GlobalRotations(Output):
     def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
         """Map rotations (..., 132), as they are made, to world motion (..., 198) at inputs (..., 54)."""
         with in_float32(made.device):
-            sixd = normalizer.rotations_out(made.to(sparse.dtype), normalizer.origin(sparse))
-            rotations = sixd_to_matrix(sixd.unflatten(-1, (N_JOINTS, 6)))
-            parents = rotations[..., list(PARENTS[1:]), :, :]
-            local = parents.transpose(-1, -2) @ rotations[..., 1:, :, :]
-            offsets = normalizer.rest[1:] - normalizer.rest[list(PARENTS[1:])]
-            bones = (parents.detach() @ offsets[..., None])[..., 0]
-            positions = self.chains @ bones + sparse[..., SPARSE_POSITION][..., None, :3]
-            return torch.cat([sixd[..., :6], matrix_to_sixd(local).flatten(-2), positions.flatten(-2)], -1)
+            return normalizer.posed_globally(made.to(sparse.dtype), sparse)
 
 
 def mean_pose(normalizer: Normalizer) -> Tensor:
-    """Return the global rotations (132,), 6D, of the mean pose in the network's space."""
-    mean = normalizer.mean[SPARSE_DIM:][ROTATION]
-    local = sixd_to_matrix(mean.unflatten(-1, (N_JOINTS, 6)))
-    return matrix_to_sixd(forward_kinematics(local, mean[:3], normalizer.rest)[0]).flatten()
+    """Return the global rotations (132,), 6D, of the mean pose in the network's coordinates.
 
-
-def chains() -> Tensor:
-    """Return the map (22, 21) from bones, of each joint but the root, to the joints seen from the head."""
-    made = torch.zeros(N_JOINTS, N_JOINTS - 1)
-    for joint in range(1, N_JOINTS):
-        made[joint] = made[PARENTS[joint]]
-        made[joint, joint - 1] = 1
-    return made - made[HEAD]
+    They are zeros where the normalizer knows no mean (`frame.normalize=false`).
+    """
+    local = sixd_to_matrix(normalizer.mean[SPARSE_DIM:][ROTATION].unflatten(-1, (N_JOINTS, 6)))
+    rotations, _ = forward_kinematics(local, torch.zeros_like(normalizer.rest[0]), normalizer.rest)
+    return matrix_to_sixd(rotations).flatten()
 
 
 OUTPUTS: dict[str, type[Output]] = {"local": LocalRotations, "global": GlobalRotations}
@@ -163,7 +144,7 @@ class Member(nn.Module):
         return self.head(self.norm(h)), kept
 
 
-class RecurrentPoser(StreamModel):
+class RecurrentPoser(WindowlessModel):
     """A recurrent stream of rotations: those of several members, averaged.
 
     Each member learns by itself: in training its motion has its own loss. The positions follow from the

@@ -18,7 +18,7 @@ def run_distributed(experiment: Experiment) -> Outcome | None:
     Returns:
         None in the processes that trained along.
     """
-    if experiment.refined and distributed.size() > 1:
+    if experiment.unrefined and distributed.size() > 1:
         raise InputError("refiner: several processes can't train it; allowed is one process, or refiner=null")
     distributed.connect(experiment.device.type)
     if not distributed.first():

@@ -69,7 +69,7 @@ class Experiment:
         predictions: folder for predictions of the test clips; None for no such files.
         tracking: shows runs elsewhere.
         called: makes a name that people can read, of the config of a run and the word for its kind.
-        refined: the experiment of the network that a refiner stands behind; None without a refiner.
+        unrefined: the experiment of the network that a refiner stands behind; None without a refiner.
     """
 
     config: dict[str, Any]
@@ -85,7 +85,7 @@ class Experiment:
     predictions: Path | None
     tracking: Tracking
     called: Callable[[str, Mapping[str, Any]], str] = unnamed
-    refined: Experiment | None = None
+    unrefined: Experiment | None = None
 
     @property
     def evaluations(self) -> dict[str, str]:
@@ -116,5 +116,5 @@ class Experiment:
         own = {key: value for key, value in self.config.items() if key != "vqvae"}
         if self.architecture.trains_codes:
             own["vqvae"] = {key: self.config["vqvae"][key] for key in VQVAE_SETTINGS}
-        upstream = [self.refined.identity(data)] if self.refined else self.upstream_identities(data)
+        upstream = [self.unrefined.identity(data)] if self.unrefined else self.upstream_identities(data)
         return Identity(NETWORK, own, data, upstream[-1] if upstream else None)

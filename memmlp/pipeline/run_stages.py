@@ -164,8 +164,8 @@ def upstream_run(experiment: Experiment, data: Prepared, last: str | None = None
         data: the prepared motion.
         last: the id of the run upstream that is wanted; by default the last one.
     """
-    if experiment.refined:
-        return run_experiment(experiment.refined).run
+    if experiment.unrefined:
+        return run_experiment(experiment.unrefined).run
     run: Run | None = None
     identities = experiment.upstream_identities(data.digest)
     for training, identity in zip(experiment.upstream, identities, strict=True):
@@ -206,8 +206,7 @@ def train_upstream(
     tell(f"{training.told} (run {run.id})")
     weights = upstream.weights() if upstream else None
     distributed.of_first(training.kind)
-    with timed(run, "train"):
-        errors = training.train(experiment.architecture, data, weights, run, experiment.device)
+    errors = training.train(experiment.architecture, data, weights, run, experiment.device)
     write_json(run.results_path, {"val": errors})
     run.finish(("model.safetensors", "results.json"))
 
@@ -247,8 +246,7 @@ def train_run(
     run.clear_stages()
     weights = upstream.weights() if upstream else None
     distributed.of_first(NETWORK)
-    with timed(run, "train"):
-        experiment.training.train(experiment.architecture, data, weights, run, experiment.device, watch)
+    experiment.training.train(experiment.architecture, data, weights, run, experiment.device, watch)
     run.finish(("model.safetensors",))
 
 
@@ -334,8 +332,8 @@ def machine(experiment: Experiment) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def timed(run: Run, stage: str) -> Iterator[None]:
-    """Add the seconds that a stage takes to the run's manifest."""
+    """Add the seconds that a stage takes to those that it took before, of other modes or precisions."""
     started = time.monotonic()
     yield
-    seconds = run.manifest.get("seconds") or {}
-    run.write_manifest({"seconds": {**seconds, stage: round(time.monotonic() - started, 1)}})
+    before = run.manifest.get("seconds", {}).get(stage, 0.0)
+    run.took(stage, before + time.monotonic() - started)

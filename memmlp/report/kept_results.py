@@ -24,7 +24,7 @@ from memmlp.tables.effects import Runs
 from memmlp.tables.measured_run import Errors, Measured, Origin, known_mean
 
 DIGITS = 6
-SCALES = re.compile(r"\[\s+([^\[\]{}]*?)\s+\]")  # a list of plain values, which is written on one line
+FLAT_LIST = re.compile(r"\[\n([^\[\]{}]*?)\n *\]")  # of plain values; no string has a line's end in it
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,12 @@ def dumps(kept: Kept) -> str:
     }
     content["digest"] = _digest(content)
     text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
-    return SCALES.sub(lambda found: f"[{' '.join(found[1].split())}]", text) + "\n"
+    return FLAT_LIST.sub(_on_one_line, text) + "\n"
+
+
+def _on_one_line(found: re.Match[str]) -> str:
+    values = (line.strip() for line in found[1].split("\n"))
+    return f"[{' '.join(values)}]"
 
 
 def load_kept(path: Path) -> Kept:

@@ -225,8 +225,13 @@ class Run:
         before = self.manifest if self.checkpoint.exists() else {}
         made = joined(before, {**facts, **environment(), "sources": sources(facts.get("plugins", ()))})
         self.attempt("training")
-        times = {"started": self.manifest.get("started", now()), "finished": None}
+        times = {"started": self.manifest.get("started", now()), "finished": None, "seconds": {}}
         self.write_manifest(identity | times | made)
+
+    def took(self, stage: str, seconds: float) -> None:
+        """Record in the manifest how long a stage took, all processes that worked on it in turn together."""
+        known = self.manifest.get("seconds", {})
+        self.write_manifest({"seconds": {**known, stage: round(seconds, 1)}})
 
     def attempt(self, stage: str) -> None:
         """Record that a process begins to work on a stage of the run."""

@@ -200,8 +200,8 @@ def mend(path: Path) -> None:
     """Replace a journal by a copy without an incomplete last line, and remove its locks; only for the owner.
 
     A process that was killed may leave both behind (locks if it was of an earlier version). Optuna takes a
-    line appended to an incomplete one for damage. What an owner of before appends, who was frozen with the
-    journal open, is lost with the file that it had open.
+    line appended to an incomplete one for damage. An earlier owner that was frozen may append to the
+    file that it had open, which is this one no more, and so changes nothing.
     """
     check_journal(path)
     for left in path.parent.glob(f"{path.name}.lock*"):

@@ -115,7 +115,9 @@ def on_source(sweep: Sweep, runs: Mapping[str, Runs], source: str) -> OnSource:
     arms = [arm for arm in sweep.arms if arm.label not in without]
     arms = [replace(arm, against=None) if arm.against in without else arm for arm in arms]
     left = {label: seeds for label, seeds in own.items() if label not in without}
-    control = next(iter(left)) if sweep.control in without else sweep.control
+    control = (
+        next(label for label, seeds in left.items() if seeds) if sweep.control in without else sweep.control
+    )
     quoted = ", ".join(f"'{arm.label}'" for arm in sweep.arms if arm.label in without)
     flags = (f"no test clip of {source}, so left out: {quoted}",) if without else ()
     return OnSource(replace(sweep, arms=tuple(arms), control=control), left, flags)

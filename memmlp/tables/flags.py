@@ -14,7 +14,7 @@ from memmlp.tables.measured_run import Measured
 
 Say = Callable[[Arm, int], str | None]
 BUILT_IN = "builtin"
-ALIKE = 1.1  # how many times the frames of its control an arm may see in training before it is said
+ALIKE = 1.1  # how many times the frames of its control an arm may see in training before a flag says so
 SMPLH = (1, 2, 3)  # the paper's tables on AMASS, on the rest joints of SMPL-H bodies
 ORIGIN = {
     "code": "code", "data": "data", "hardware": "hardware", "device": "device", "gpu": "GPU",
@@ -192,7 +192,7 @@ def _differing(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:
 
 
 def _seen(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
-    """Flag arms that saw more or fewer frames in training than their controls, by windows or batches."""
+    """Flag arms that saw more or fewer frames in training than their controls, whatever the reason."""
     every = [(label, run.training.get("frames")) for label, found in runs.items() for run in found.values()]
     frames = {label: number for label, number in every if number}
     unequal = []

@@ -38,7 +38,8 @@ class Origin:
         precision: the precision of training.
         body: whose rest joints the motion is on: "builtin" or the file of a body model.
         recipes: the recipe number of each component.
-        vqvae: the id of the run upstream, a VQ-VAE's or a part's; None where there is none.
+        vqvae: the id of the run upstream: a VQ-VAE's, a part's, or that of the network before a refiner;
+            None where there is none.
         partial: which part of its protocol's list the data is, in words; None where it is all of it.
         plugins: version and digest of the code of each package of one's own that it uses.
         offline: whether its frames are made with later ones, so that it is no stream.
@@ -176,17 +177,30 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     deployments = [run.deployment(name) for name in stages or () if run.deployment(name).done]
     latency = (deployments or [run.preferred_deployment])[-1].record
     origin = _evaluated(_origin(manifest), reports)
-    training = _training(manifest, run.config)
+    training = _training(run, manifest)
     return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run, sources, training)
 
 
-def _training(manifest: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, float]:
+def _training(run: Run, manifest: Mapping[str, Any]) -> dict[str, float]:
     """Return what a training took, as far as it is known."""
-    seconds = (manifest.get("seconds") or {}).get("train")
-    optim, model = config.get("optim") or {}, config.get("model") or {}
-    frames = [number for number in (optim.get("steps"), optim.get("batch"), model.get("frames")) if number]
-    took = {} if seconds is None else {"seconds": float(seconds)}
-    return took | ({"frames": float(math.prod(frames))} if len(frames) == 3 else {})
+    seconds, frames = (manifest.get("seconds") or {}).get("train"), frames_seen(run)
+    took = {"seconds": float(seconds)} if seconds is not None else {}
+    return took | ({"frames": frames} if frames else {})
+
+
+def frames_seen(run: Run) -> float:
+    """Return how many frames a run's network saw in training, each as often as it did; 0 if that is unknown.
+
+    A refiner sees those that the network before it saw, and the pieces of its own training.
+    """
+    config = run.config
+    refiner, optim, model = (config.get(name) or {} for name in ("refiner", "optim", "model"))
+    length = (refiner or model).get("frames") or 0
+    seen = float((optim.get("steps") or 0) * (optim.get("batch") or 0) * length)
+    if not refiner:
+        return seen
+    before = frames_seen(Run(run.folder.parent / str(run.manifest.get("upstream"))))
+    return seen + before if seen and before else 0.0
 
 
 def _join(known: dict[str, Any], more: Mapping[str, Any]) -> None:

@@ -7,6 +7,7 @@ weights, bit for bit on a CPU, as one that was not. Several processes may train 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -100,7 +101,8 @@ def train(
     check_divisible(task, optim, description)
     optimiser = optim.build(task.parameter_groups())
     average = optim.average(task.module, optimiser)
-    start = resume(task, optimiser, average, run)
+    start, spent = resume(task, optimiser, average, run)
+    begun = time.monotonic() - spent
     distributed.align(task.module)
     with counting(description, optim.steps, start, shown=distributed.first(), unit="steps") as count:
         for step in range(start, optim.steps):
@@ -110,9 +112,11 @@ def train(
             first = distributed.first()
             validation = record(task, optim, average, run, step + 1, result, count) if first else {}
             if (step + 1) % optim.checkpoint_every == 0 or step + 1 == optim.steps:
-                save(task, optimiser, average, run, step + 1)
+                save(task, optimiser, average, run, step + 1, time.monotonic() - begun)
             if validation:
                 watch(step + 1, validation)
+    if distributed.first():
+        run.took("train", time.monotonic() - begun)
     average.put_in_place()
 
 
@@ -212,10 +216,17 @@ def validate(task: TrainingTask, average: Average) -> dict[str, float]:
         return task.validate()
 
 
-def save(task: TrainingTask, optimiser: torch.optim.Optimizer, average: Average, run: Run, step: int) -> None:
+def save(
+    task: TrainingTask,
+    optimiser: torch.optim.Optimizer,
+    average: Average,
+    run: Run,
+    step: int,
+    seconds: float,
+) -> None:
     """Write a checkpoint with all that a later process needs to go on after `step` steps.
 
-    Of several processes the first one writes, and the others go on with its weights.
+    These took the seconds. Of several processes the first one writes, and the others go on with its weights.
     """
     distributed.align(task.module)
     if not distributed.first():
@@ -224,15 +235,17 @@ def save(task: TrainingTask, optimiser: torch.optim.Optimizer, average: Average,
     tensors = checkpoint.module_tensors("module", task.module) | checkpoint.optimiser_tensors(optimiser)
     tensors |= average.tensors()
     tensors["rng.torch"] = torch.get_rng_state()
-    checkpoint.write(run.checkpoint, tensors, {"step": step, "initial_lr": rates})
+    checkpoint.write(run.checkpoint, tensors, {"step": step, "initial_lr": rates, "seconds": seconds})
 
 
-def resume(task: TrainingTask, optimiser: torch.optim.Optimizer, average: Average, run: Run) -> int:
-    """Load the run's checkpoint, if there is one, and return the number of finished steps."""
+def resume(
+    task: TrainingTask, optimiser: torch.optim.Optimizer, average: Average, run: Run
+) -> tuple[int, float]:
+    """Load the run's checkpoint, if there is one; return how many steps are finished, and their seconds."""
     found = checkpoint.read(run.checkpoint) if distributed.first() and run.checkpoint.exists() else None
     found = distributed.of_first(found)
     if found is None:
-        return 0
+        return 0, 0.0
     tensors, values = found
     checkpoint.load_module("module", task.module, tensors)
     checkpoint.load_optimiser(optimiser, tensors)
@@ -240,4 +253,4 @@ def resume(task: TrainingTask, optimiser: torch.optim.Optimizer, average: Averag
     torch.set_rng_state(tensors["rng.torch"])
     for group, rate in zip(optimiser.param_groups, values["initial_lr"], strict=True):
         group["initial_lr"] = rate
-    return values["step"]
+    return values["step"], values.get("seconds", 0.0)  # checkpoints of before have none

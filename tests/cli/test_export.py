@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import onnx
@@ -78,6 +79,13 @@ def test_a_run_in_fp16_for_unity(home: Path, memmlp: Memmlp, monkeypatch: pytest
     said = memmlp("export", run, "--out", "unity.onnx", *whole, "--precision", "fp16", "--check", "unity")
     assert said.code == 0
     assert "MPJPE" in said.out
+    assert float(re.search(r"whole way differs from torch by (\S+) at most", said.out)[1]) < 0.01
+    with monkeypatch.context() as patch:
+        patch.setattr("memmlp.cli.export.FULL_TOLERANCE", 1e-9)
+        said = memmlp("export", run, "--out", "none.onnx", *whole, "--precision", "fp16")
+    assert said.code == 1
+    assert "more than 1e-09: not written" in said.err
+    assert not Path("none.onnx").exists()
     model = onnx.load("unity.onnx")
     onnx.checker.check_model(model, full_check=True)
     assert [one.version for one in model.opset_import] == [15]

@@ -190,6 +190,7 @@ REFUSED = [
     (["loss=terms"], "loss=terms is of rotations alone"),
     (["model=agrol_mlp", "loss=terms", "loss.jerk=-1"], "loss.jerk=-1"),
     (["model=agrol_mlp", "loss=terms", "loss.jerks=1"], "loss.jerks"),
+    (["model=agrol_mlp", "export.precision=int8", "export.graph=naive"], "allowed is auto or streaming"),
 ]
 
 

@@ -7,7 +7,7 @@ import torch
 from memmlp.deploy.latency import macs
 from memmlp.deploy.network_alone import NoConversion, network_alone
 from memmlp.motion.body import POSITION, ROTATION, SPARSE_DIM
-from memmlp.motion.coordinates import World
+from memmlp.motion.coordinates import Heading, World
 from memmlp.motion.normalizer import Normalizer
 
 NETWORKS = {
@@ -35,6 +35,24 @@ def test_without_conversions_it_is_the_same_network(name):
         bare, theirs = alone.advance(clip[:, t : t + 1], theirs, 1)
         torch.testing.assert_close(bare[..., ROTATION], whole[..., ROTATION], atol=1e-5, rtol=1e-5)
     assert macs(alone) <= macs(model)
+
+
+@torch.no_grad()
+def test_rotations_of_the_world_stay_as_members_make_them():
+    """What follows from them, rotations in the parents' frames and positions, is kinematics."""
+    model = tiny.recurrent_poser(Heading(), output="global", members=2)
+    alone, x = network_alone(model), torch.randn(1, 1, SPARSE_DIM)
+    made, _ = alone.advance(x, alone.initial_state(), 1)
+    members = [one(x, one.initial_state(x, 1), 1)[0] for _, one in model.named_members()]
+    torch.testing.assert_close(made[..., ROTATION], sum(members) / 2)
+    assert (made[..., POSITION] == 0).all()
+
+
+@torch.no_grad()
+def test_a_refiner_alone_has_no_kinematics():
+    alone = network_alone(tiny.refined(tiny.baseline("avatar_poser")))
+    made, _ = alone.advance(torch.randn(1, 1, SPARSE_DIM), alone.initial_state(), 1)
+    assert (made[..., POSITION] == 0).all()
 
 
 @torch.no_grad()

@@ -8,12 +8,19 @@ import numpy as np
 import pytest
 import torch
 from tiny import REST, model
+from tiny import frames as tiny_frames
 
 from memmlp.common.errors import InputError
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import LBFGS, NoIK
 from memmlp.evaluation.modes import stream
-from memmlp.evaluation.predictions import Predictor, motion_clip, predict_clip, prediction_arrays
+from memmlp.evaluation.predictions import (
+    Predictor,
+    motion_clip,
+    predict_clip,
+    prediction_arrays,
+    save_predictions,
+)
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.clip import Clip
 from memmlp.motion.exporting.folder import plan_export
@@ -54,6 +61,22 @@ def test_a_clips_joints_are_those_that_are_measured(mode: str):
     measured = predict_clip(NETWORK, given, mode)["predicted_positions"]
     assert (clip.name, clip.fps, len(clip)) == ("clip", 60, 29)
     np.testing.assert_allclose(joints(clip), measured, atol=1e-5)
+
+
+@torch.no_grad()
+def test_a_network_that_draws_predicts_a_clip_alike_each_time(tmp_path: Path):
+    """Files of predictions draw as the evaluation does, which is seeded."""
+    network = model(blend="sampled")
+    given, found = frames(source(12)), []
+    for _ in range(2):
+        found.append(predict_clip(network, given, "stream")["predicted_rotations"])
+        torch.rand(7)
+    np.testing.assert_array_equal(*found)
+    evaluation, test = Evaluation(("stream",), 4, NoIK(), seed=0), tiny_frames((12,))
+    for folder in (tmp_path / "a", tmp_path / "b"):
+        save_predictions(evaluation, network, test, folder)
+    made = [(tmp_path / name / "stream" / "clip0.npz").read_bytes() for name in "ab"]
+    assert made[0] == made[1]
 
 
 def test_the_body_may_have_its_pelvis_anywhere():

@@ -72,7 +72,7 @@ def test_a_sweep_trains_what_is_upstream_first():
         def prepare(self):
             return type("Prepared", (), {"digest": "d"})
 
-    for task, own in zip(tasks[1:], (refined.refined, refined), strict=True):
+    for task, own in zip(tasks[1:], (refined.unrefined, refined), strict=True):
         object.__setattr__(own, "data", Data())
         check_identity(own, task)
 

@@ -116,6 +116,22 @@ def test_kept_results_have_the_same_bytes(kept: Kept, tmp_path: Path):
     assert max(map(len, dumps(kept).splitlines())) < 1000  # a line a list, so that changes can be read
 
 
+def test_words_of_kept_results_stay_as_they_are(kept: Kept, tmp_path: Path):
+    """Spaces and brackets in the names of clips, and in flags, are no layout."""
+    word = "Subject 1  take [ 2 ]\u2028"
+    runs = {
+        label: {seed: replace(run, clips={f"{clip}{word}": rows for clip, rows in run.clips.items()})
+                for seed, run in of_arm.items()}
+        for label, of_arm in kept.runs.items()
+    }  # fmt: skip
+    save(tmp_path / "kept.json", replace(kept, runs=runs, flags=(word, "two  spaces")))
+    read = load_kept(tmp_path / "kept.json")
+    assert read.flags == (word, "two  spaces")
+    assert [set(run.clips) for run in read.every] == [
+        {f"{clip}{word}" for clip in run.clips} for run in kept.every
+    ]
+
+
 def test_results_of_several_machines_add_up(sweep: Sweep, kept: Kept, tmp_path: Path):
     """Arms and seeds of both are there. A cell that both have is the newer one's; the other run is gone."""
     one = {label: {0: runs[0]} for label, runs in kept.runs.items()}

@@ -74,6 +74,8 @@ def test_arms_without_a_sources_clips_are_left_out_and_named(tmp_path: Path):
     part = on_source(sweep, runs, "new")
     assert (list(part.runs), part.sweep.control) == (["both", "more"], "both")
     assert part.flags == ("no test clip of new, so left out: 'one'",)
+    waiting = on_source(sweep, runs | {"both": {}}, "new")  # an arm without a run is nothing to compare with
+    assert (list(waiting.runs), waiting.sweep.control) == (["both", "more"], "more")
     table = collect(part.sweep, part.runs)
     assert [row.label for row in table.rows] == ["both", "more"]
     assert not any("missing" in flag for flag in table.flags)

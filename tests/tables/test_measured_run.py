@@ -38,6 +38,17 @@ def test_what_an_evaluation_ran_on_counts_too(sweep: Sweep, tmp_path: Path):
     assert "uncommitted changes: 'by position'" in said
 
 
+def test_a_refined_network_saw_its_own_frames_and_the_refiners(tmp_path: Path):
+    optim = {"steps": 10, "batch": 2}
+    network = fake_run(tmp_path, "network", config={"optim": optim, "model": {"frames": 7}, "refiner": None})
+    config = {"optim": {"steps": 5, "batch": 4}, "model": {"frames": 7}, "refiner": {"frames": 30}}
+    refined = fake_run(tmp_path, "refined", config=config, origin={"upstream": network.id})
+    seen = [load(run.folder).training.get("frames") for run in (network, refined)]
+    assert seen == [140, 140 + 600]
+    orphan = fake_run(tmp_path, "orphan", config=config, origin={"upstream": "0" * 16})
+    assert "frames" not in load(orphan.folder).training  # what came before is not known
+
+
 def test_damaged_results_are_one_line(tmp_path: Path, sweep: Sweep):
     find = fake_sweep(tmp_path, sweep)
     run = find(sweep.arms[3], 1)

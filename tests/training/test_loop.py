@@ -81,6 +81,31 @@ def test_a_resumed_run_is_the_same_run(make, tmp_path):
     assert [m.values for m in whole.metrics()] == [m.values for m in broken.metrics()]
 
 
+def test_the_seconds_of_a_killed_training_are_those_of_all_its_steps(monkeypatch, tmp_path):
+    """A step takes a second here. It is killed in its eighth step, of which its checkpoint has five."""
+    clock, run = iter(range(1000)), Run(tmp_path)
+    now = mock.Mock(monotonic=lambda: now.seconds, seconds=0)
+    monkeypatch.setattr(loop, "time", now)
+
+    def task(killed_at: int | None):
+        made = motion_task()
+        step = made.step
+
+        def timed(number: int):
+            if number == killed_at:
+                raise Kill
+            now.seconds = next(clock)
+            return step(number)
+
+        made.step = timed
+        return made
+
+    with pytest.raises(Kill):
+        train(task(7), OPTIM, run, 0, "killed")
+    train(task(None), OPTIM, run, 0, "again")
+    assert run.manifest["seconds"] == {"train": OPTIM.steps - 1}
+
+
 def test_what_is_drawn_after_training_is_the_same_after_a_resume_at_its_end(tmp_path):
     """An evaluation with memory.blend=sampled draws then; draws within a step are seeded by the step."""
     drawn = []

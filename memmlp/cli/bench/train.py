@@ -32,7 +32,7 @@ WARM_UP = 3  # steps of each that are taken before any is timed
     default=50,
     show_default=True,
     type=click.IntRange(1),
-    help="Steps between validations, and of each when it is its turn.",
+    help="Steps between validations, after which the other training has its turn.",
 )
 @click.option(
     "--times",

@@ -47,7 +47,7 @@ NAME = 36  # characters of a run's name in a line
 @click.option("--columns", help="Show these keys, separated by commas.  [default: config keys that differ]")
 @outputs_option
 def list_runs(every: bool, where: str | None, sort: str | None, columns: str | None, outputs: Path) -> None:
-    """List the runs, the newest first, without the finished ones that others build upon.
+    """List the runs, the newest first, without finished VQ-VAEs and parts of networks.
 
     Shown are their names and data, what differs between their configs, the MPJPE of the rotation branch in
     both modes, Jitter, and the latency of a frame. Keys are those of the config (`memory`, `optim.lr`),
@@ -83,7 +83,7 @@ def list_runs(every: bool, where: str | None, sort: str | None, columns: str | N
 
 
 def is_finished_upstream(run: Run) -> bool:
-    """Whether it is a finished run that others build upon, which has none of the results that are listed."""
+    """Whether it is a finished VQ-VAE or part of a network, which has none of the results that are listed."""
     return run.manifest.get("kind") not in (None, NETWORK) and run.done
 
 

@@ -32,6 +32,9 @@ from memmlp.config.schema.training import (
 )
 from memmlp.runs.identity import SLOTS
 
+WITHOUT_STREAM = ("naive", "off")
+"""The values of `export.graph` with which no streaming graph is exported."""
+
 
 def check(cfg: DictConfig) -> None:
     """Check a composed config.
@@ -135,6 +138,7 @@ def _check_combinations(cfg: DictConfig) -> None:
         given = f"vqvae.epochs={cfg.vqvae.epochs}, vqvae.steps={cfg.vqvae.steps}"
         raise InputError(f"{given}: allowed is one of them, and null for the other")
     _check_sources(cfg.data)
+    _check_export(cfg)
     split = cfg.data.split
     held_out = split.val + (split.test if isinstance(split.get("test"), float) else 0)
     if held_out >= 1:
@@ -157,6 +161,17 @@ def _check_sources(data: DictConfig) -> None:
         raise InputError(
             "data.split.groups_file: allowed for one folder; a source has data.sources.NAME.groups_file"
         )
+
+
+def _check_export(cfg: DictConfig) -> None:
+    """Check that a file of less precision has the streaming graph that it is made of."""
+    precision = f"export.precision={cfg.export.precision}: is made of the streaming graph, and"
+    if cfg.export.precision != "fp32" and cfg.export.graph in WITHOUT_STREAM:
+        raise InputError(
+            f"{precision} export.graph={cfg.export.graph} has none: allowed is auto or streaming"
+        )
+    if cfg.export.precision != "fp32" and cfg.memory is not None and cfg.memory.get("history") == "latest":
+        raise InputError(f"{precision} memory.history=latest has none: allowed is memory.history=first")
 
 
 def _is(node: DictConfig, schema: type) -> bool:

@@ -7,6 +7,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from memmlp.config.schema.checks import WITHOUT_STREAM
 from memmlp.config.schema.config import DATA, GROUPS, SCHEMAS, Config, TrackerConfig
 from memmlp.config.schema.data import SynthDataConfig
 from memmlp.runs.identity import chosen
@@ -25,6 +26,8 @@ def restored(config: Mapping[str, Any]) -> DictConfig:
     cfg = OmegaConf.structured(Config)
     for group, content in ((RENAMED.get(name, name), content) for name, content in config.items()):
         cfg[group] = _restored(group, content) if isinstance(content, Mapping) else content
+    if cfg.export.graph in WITHOUT_STREAM:
+        cfg.export.precision = "fp32"  # until version 0.2 another was allowed, and no file was made of it
     return cfg
 
 

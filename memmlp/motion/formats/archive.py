@@ -70,7 +70,7 @@ class Npz:
         info = self._zip.getinfo(f"{name}.npy")
         if info.compress_type not in METHODS:
             raise InputError(
-                f"{self.path}: {name} is packed by method {info.compress_type}; allowed: deflate"
+                f"{self.path}: {name} is packed by method {info.compress_type}; allowed: stored, deflate"
             )
         with self._zip.open(info) as entry:
             header = _parse_header(entry.read(MAX_HEADER))

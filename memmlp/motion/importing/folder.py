@@ -1,4 +1,4 @@
-"""Imports a folder of BVH files as AMASS npz, with a record of what came from what, or nothing at all."""
+"""Imports a folder of recordings as AMASS npz, with a record of what came from what, or nothing at all."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def _check_import(files: Mapping[Path, Path], out: Path, how: ImportSettings) ->
     """Raise InputError for two sources of one clip, foreign clips in `out`, wrong takes or rates."""
     npz, count = Counter(_npz(relative) for relative in files).most_common(1)[0]
     if count > 1:
-        raise InputError(f"{npz.with_suffix('').as_posix()}: {count} BVH files of this name; allowed: one")
+        raise InputError(f"{npz.with_suffix('').as_posix()}: {count} recordings of this name; allowed: one")
     foreign = sorted({path.relative_to(out) for path in out.rglob("*.npz")} - {_npz(path) for path in files})
     if foreign or (out.exists() and not out.is_dir()):
         wrong = f"has other clips, such as {foreign[0].as_posix()}" if foreign else "is a file"

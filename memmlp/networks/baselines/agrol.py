@@ -1,7 +1,7 @@
 """AGRoL (Du et al., CVPR 2023): the MLP, and the diffusion model whose denoiser is that MLP.
 
 Both take a window of inputs and predict the rotations of all its frames; a live stream keeps the last frame.
-Their papers' sizes are T = 196, d = 512 and 12 blocks, each the pre-norm pair of
+The paper's sizes are T = 196, d = 512 and 12 blocks, each the pre-norm pair of
 `memmlp.networks.layers.MLPBlock`.
 """
 

@@ -27,8 +27,9 @@ def head(width: int, size: int) -> nn.Module:
 class OwnWindows(MotionModel):
     """The base of networks that make every frame from its own window (`rotations`).
 
-    Both evaluation modes give the same numbers, except for the shifted tail window: there the buffer does not
-    hold the frames of its overlap.
+    Both evaluation modes give the same numbers, except for the last window of a clip, which is shifted to its
+    end: the buffer ends with frames that the window begins with, so that these stand in a frame's own window
+    twice, and those before them are missing.
     """
 
     def rotations(self, encoded: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.encoder import EncoderLayer
 from memmlp.networks.layers import in_float32
 from memmlp.networks.memory import State
-from memmlp.networks.stream_model import StreamModel
+from memmlp.networks.windowless_model import WindowlessModel
 
 HANDS, OTHERS = 2, 3  # tokens of hands in the head's frame, and of the sensors that there are none of
 TOKENS = len(TRACKED) + HANDS + OTHERS
@@ -152,7 +152,7 @@ class Block(nn.Module):
         return h.view(tokens.shape), hidden, cell
 
 
-class HMDPoser(StreamModel):
+class HMDPoser(WindowlessModel):
     """Tokens of trackers, blocks of LSTMs and encoder layers, and a head on all tokens of a frame.
 
     It has 17,444,484 parameters at the paper's sizes, 528,656 of them the head of the body's shape, and

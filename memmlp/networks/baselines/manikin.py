@@ -274,8 +274,8 @@ class ManikinS(Manikin, AvatarPoser):
     def own_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
         """Return the losses of the parts, weighted as by its authors, of outputs (B, 1, 86).
 
-        Swivels are counted from the predicted shoulders and hips; of middles and swivels it is the sum over
-        the limbs.
+        Swivels are counted from the predicted shoulders and hips; the losses of middles and of
+        swivels are sums over the limbs.
         """
         parts = Parts.of(made, self.normalizer)
         _, turned, joints = parts.body(self.normalizer.rest)

@@ -16,7 +16,7 @@ from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.encoder import Attention, EncoderLayer
 from memmlp.networks.memory import State
-from memmlp.networks.stream_model import StreamModel
+from memmlp.networks.windowless_model import WindowlessModel
 
 FRESH = 0.25  # of the training windows begin as a live stream does, without a past
 
@@ -30,11 +30,11 @@ def sines(length: int, width: int) -> Tensor:
 
 def freedom(horizon: int) -> Tensor:
     """Return how far each of the W predicted frames (W, 1) may change at a step, from almost 0 to 1."""
-    nearness = torch.arange(1, horizon + 1) / horizon
-    return (1 - (nearness * math.pi / 2).cos())[:, None]
+    distance = torch.arange(1, horizon + 1) / horizon
+    return (1 - (distance * math.pi / 2).cos())[:, None]
 
 
-class RPM(StreamModel):
+class RPM(WindowlessModel):
     """Cross-attention from past and future motion to the newest inputs, then encoder layers.
 
     It has 9,626,756 parameters at the paper's sizes; the released code has a further layer of 262,656 that
@@ -80,11 +80,14 @@ class RPM(StreamModel):
             EncoderLayer(width, heads, feedforward, dropout, F.gelu) for _ in range(depth)
         )
         self.head = nn.Linear(width, ROTATION.stop)
-        self.register_buffer("places", sines(context + max(horizon, 1), width), persistent=False)
+        self.register_buffer("places", sines(context + horizon, width), persistent=False)
         self.register_buffer("freedom", freedom(horizon), persistent=False)
 
     def initial_state(self, batch: int = 1) -> State:
-        """Return the state of a fresh start, zeros; the last two say whether there is any of the others."""
+        """Return the state of a fresh start, zeros.
+
+        `started` and `predicted` are 1 as soon as `sparse` and `prediction` hold frames.
+        """
         sizes = {
             "sparse": (self.context, SPARSE_DIM),
             "motion": (self.context, ROTATION.stop),

@@ -2,8 +2,8 @@
 
 There is no code of its authors; sizes are those of the one re-implementation that is public. Its two stages,
 the autoencoder and then the encoder from the trackers over its frozen decoder, are trained side by side here:
-of each batch half the windows go through the one and half through the other, whose gradients stop at the
-decoder.
+about half of a batch's windows are encoded from their true poses, and train the autoencoder; the others are
+encoded from the trackers, and train that encoder through the decoder, whose weights they leave as they are.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import Dropout
 from memmlp.networks.memory import State
-from memmlp.networks.stream_model import StreamModel
+from memmlp.networks.windowless_model import WindowlessModel
 
 POSES = (SPARSE_ROTATION, SPARSE_POSITION)
 TRACKERS = sum(part.stop - part.start for part in POSES)  # no velocities
@@ -84,7 +84,7 @@ def drawn(latent: Tensor) -> Tensor:
     return mean + (0.5 * log_variance).exp() * distributed.drawn(torch.randn_like, mean)
 
 
-class VAEHMD(StreamModel):
+class VAEHMD(WindowlessModel):
     """An encoder of a frame's trackers to a latent, whose mean is decoded to the rotations of that frame.
 
     It has 853,958 parameters at the sizes of its re-implementation. The encoder of whole poses, which

@@ -25,8 +25,8 @@ from memmlp.networks.baselines.vae_hmd import VAEHMD
 from memmlp.networks.layers import MLPBlock
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import MotionModel
-from memmlp.networks.stream_model import StreamModel
 from memmlp.networks.streaming.graph import StreamingGraph, filled, slid
+from memmlp.networks.windowless_model import WindowlessModel
 
 
 class AvatarPoserStream(StreamingGraph):
@@ -219,11 +219,11 @@ class AGRoLDiffusionStream(AGRoLStream):
 class FrameStream(StreamingGraph):
     """The streaming graph of a network without a window: the network as it is, one frame a step."""
 
-    model: StreamModel
+    model: WindowlessModel
 
     def build(self, model: MotionModel) -> None:
         """Make the graph's parts from a copy of the network."""
-        assert isinstance(model, StreamModel)
+        assert isinstance(model, WindowlessModel)
         self.model = model
 
     def windows(self) -> State:

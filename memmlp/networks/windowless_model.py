@@ -8,7 +8,7 @@ from memmlp.networks.memory import State
 from memmlp.networks.motion_model import MotionModel
 
 
-class StreamModel(MotionModel):
+class WindowlessModel(MotionModel):
     """A network that carries all it knows of the past in its state; a live step takes the same work for ever.
 
     `frames` is how many frames a training call takes in, from a fresh start. In both evaluation modes the
