@@ -13,8 +13,8 @@ from golden_numbers import Numbers, summary
 from memmlp.deploy import latency
 from memmlp.deploy.deployment import lower
 from memmlp.deploy.export import export
+from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import streamed
-from memmlp.deploy.session import OnnxStream
 from memmlp.networks.streaming import streaming
 
 GRAPHS: dict[str, Callable] = {"graph.streaming": streaming, "graph.naive": lambda network: network}

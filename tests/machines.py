@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from memmlp.common import claims, fences, files, lease, liveness
+from memmlp.common import fences, files, lease, lease_claims, liveness
 from memmlp.common.liveness import Changes
 
 
@@ -115,7 +115,7 @@ class Scheduler:
         calls = {name: self._stepping(getattr(os, name)) for name in self.CALLS}
         plain = {name: getattr(os, name) for name in dir(os) if not name.startswith("_")}
         proxy = SimpleNamespace(**{**plain, **calls, "fsync": lambda handle: None})
-        for module in (claims, lease, fences, files):
+        for module in (lease_claims, lease, fences, files):
             monkeypatch.setattr(module, "os", proxy)
         monkeypatch.setattr(Path, "unlink", self._stepping(Path.unlink))
         monkeypatch.setattr(files, "sync_folder", lambda folder: None)

@@ -118,7 +118,7 @@ def run_training(cfg: DictConfig) -> Outcome | None:
 
     from memmlp.cli.train_summary import show
     from memmlp.config.build import build_experiment
-    from memmlp.pipeline.distributed import run_distributed
+    from memmlp.pipeline.run_distributed import run_distributed
 
     check(cfg)
     if cfg.threads:

@@ -23,14 +23,13 @@ from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming import StreamingGraph, has_stream, streaming
 from memmlp.runs.deployment_folder import DeploymentFolder
 
-# What is exported of a network, by the graph's name; "auto" is "streaming" where there is such a graph.
 GRAPHS: dict[str, Callable[[MotionModel], MotionModel | StreamingGraph]] = {
     "naive": lambda model: model,
     "streaming": streaming,
     "auto": lambda model: streaming(model) if has_stream(model) else model,
 }
-"""`streaming` computes each frame's own share once, `naive` is the network as it was trained, `auto` the
-first of them that there is."""
+"""What is exported of a network. `streaming` computes each frame's own share once, `naive` is the network as
+it was trained, and `auto` is `streaming` where there is such a graph."""
 
 
 @dataclass(frozen=True)

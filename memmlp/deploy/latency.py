@@ -17,7 +17,7 @@ import torch
 from onnx import TensorProto, helper
 from torch.utils.flop_counter import FlopCounterMode
 
-from memmlp.deploy.session import OnnxStream
+from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming import StreamingGraph

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.common.progress import progress_bar
-from memmlp.deploy.session import OnnxStream
+from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.networks.memory import Blend
 from memmlp.networks.motion_model import MotionModel

@@ -10,8 +10,8 @@ import numpy as np
 from torch import Tensor
 
 from memmlp.common.progress import progress_bar
+from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import streamed
-from memmlp.deploy.session import OnnxStream
 from memmlp.evaluation.modes import rotations_report
 from memmlp.motion.normalizer import Normalizer
 

@@ -19,7 +19,7 @@ from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantTy
 from torch import Tensor
 
 from memmlp.common.fences import publish, temporary
-from memmlp.deploy.session import OnnxStream
+from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.motion.body import SPARSE_DIM
 
 CALIBRATION_CLIPS, CALIBRATION_FRAMES, CALIBRATION_EVERY = 40, 400, 20

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.deploy.session import OnnxStream
+from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.live.rotations import BodyTree
 from memmlp.motion.body import FEATURES
 

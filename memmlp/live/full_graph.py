@@ -23,9 +23,9 @@ from torch import Tensor, nn
 
 from memmlp.common.errors import InputError
 from memmlp.deploy.export import metadata, save
+from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import NATIVE
 from memmlp.deploy.parity import in_torch
-from memmlp.deploy.session import OnnxStream
 from memmlp.live.rotations import BodyTree, quaternion_to_matrix
 from memmlp.live.spaces import Space, space_of
 from memmlp.motion.body import (

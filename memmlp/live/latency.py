@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from memmlp.deploy.latency import SETTLING
-from memmlp.deploy.session import OnnxStream
+from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.live.rotations import quaternion_to_matrix
 from memmlp.live.stream import Stream
 from memmlp.motion.body import SPARSE_DIM

@@ -205,7 +205,7 @@ def train_upstream(
     run.write_manifest({"partial": partial_words(experiment, data)})
     tell(f"{training.told} (run {run.id})")
     weights = upstream.weights() if upstream else None
-    distributed.of_first(training.kind)
+    distributed.of_first(training.kind)  # tells the others what is trained now
     errors = training.train(experiment.architecture, data, weights, run, experiment.device)
     write_json(run.results_path, {"val": errors})
     run.finish(("model.safetensors", "results.json"))
@@ -245,7 +245,7 @@ def train_run(
     run.write_manifest({"body": data.manifest.body, "partial": partial_words(experiment, data)})
     run.clear_stages()
     weights = upstream.weights() if upstream else None
-    distributed.of_first(NETWORK)
+    distributed.of_first(NETWORK)  # tells the others what is trained now
     experiment.training.train(experiment.architecture, data, weights, run, experiment.device, watch)
     run.finish(("model.safetensors",))
 

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from memmlp.common.files import atomic_write
 from memmlp.motion.importing.names import without_namespace
 from memmlp.motion.importing.skeleton import Z_UP
-from memmlp.motion.importing.stance import Stance
+from memmlp.motion.importing.stance_of_file import Stance
 from memmlp.motion.limbs import RADII
 from memmlp.render.raster import Camera, draw
 from memmlp.render.sheet import DPI, FAINT, INK, Sheet, png

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from memmlp.deploy.block_quantization import BLOCK, LEVELS, ZERO, blocks, quantise_blocks
 from memmlp.deploy.deployment import lower
 from memmlp.deploy.export import export
+from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import streamed
-from memmlp.deploy.session import OnnxStream
 from memmlp.motion.coordinates import Heading
 from memmlp.networks.streaming import streaming
 

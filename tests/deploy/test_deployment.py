@@ -17,9 +17,9 @@ import memmlp as package
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.deploy.deployment import GRAPHS, Deployment
+from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import streamed
 from memmlp.deploy.quantization import quantise
-from memmlp.deploy.session import OnnxStream
 from memmlp.networks.memory import CodeMemory
 from memmlp.networks.streaming import StreamingGraph, streaming
 from memmlp.runs.deployment_folder import DeploymentFolder

@@ -11,8 +11,8 @@ import torch
 
 from memmlp.deploy import latency
 from memmlp.deploy.export import export, save
+from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import TOLERANCE, in_torch, parity, streamed
-from memmlp.deploy.session import OnnxStream
 from memmlp.motion.body import JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.coordinates import Heading
 from memmlp.networks.memory import NoMemory

@@ -14,9 +14,9 @@ from onnx import TensorProto, numpy_helper
 from memmlp.common.errors import InputError
 from memmlp.deploy.export import export
 from memmlp.deploy.half import halve, halved
+from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import streamed
 from memmlp.deploy.quantization import inner_layers
-from memmlp.deploy.session import OnnxStream
 from memmlp.networks.streaming import streaming
 
 pytestmark = pytest.mark.slow

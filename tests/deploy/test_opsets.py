@@ -14,9 +14,9 @@ from onnx import ModelProto, TensorProto, helper, numpy_helper
 
 from memmlp.common.errors import InputError
 from memmlp.config.schema.config import ExportConfig
+from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import NATIVE, OPSETS, converted
 from memmlp.deploy.parity import TOLERANCE, streamed
-from memmlp.deploy.session import OnnxStream
 
 CLIP = tiny.clip(20)
 

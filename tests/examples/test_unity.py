@@ -20,7 +20,7 @@ from engine_clips import EXAMPLES, PERSON, Played, trackers
 from processes import started
 from scipy.spatial.transform import Rotation
 
-from memmlp.deploy.session import open_session
+from memmlp.deploy.onnx_stream import open_session
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream

@@ -14,9 +14,9 @@ import torch
 import wearer
 
 from memmlp.common.errors import InputError
+from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import OPSETS, converted
 from memmlp.deploy.parity import TOLERANCE
-from memmlp.deploy.session import OnnxStream
 from memmlp.live.full_graph import export_full, full_parity, quaternions, trackers_of
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES

@@ -12,8 +12,8 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from memmlp.common.errors import InputError
+from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import parity
-from memmlp.deploy.session import OnnxStream
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.coordinates import Heading, HeadRelative, World
 from memmlp.networks.memory import CodeMemory, GRUMemory, JointCodeMemory, LSTMMemory, NoCodesMemory, NoMemory

@@ -13,7 +13,7 @@ from memmlp.config.compose import composed
 from memmlp.config.perform_task import check_identity
 from memmlp.config.plan_sweep import tasks_of
 from memmlp.networks.refiner import Refined
-from memmlp.pipeline.distributed import run_distributed
+from memmlp.pipeline.run_distributed import run_distributed
 from memmlp.runs.lookup import list_runs
 
 SHORT = [

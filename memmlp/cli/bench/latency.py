@@ -143,7 +143,7 @@ def exported(models: list[str], overrides: tuple[str, ...], folder: Path) -> Ite
 
 def exported_independently(overrides: tuple[str, ...], path: Path) -> Path:
     """Export AvatarPoser of torch's own layers in the config's sizes, and return the file."""
-    from memmlp.cli.bench.independent import TorchAvatarPoser, export_plainly
+    from memmlp.cli.bench.torch_avatar_poser import TorchAvatarPoser, export_plainly
     from memmlp.config.compose import composed
 
     sizes = composed(["profile=paper", *overrides, *MODELS[CHECK[0]]]).model

@@ -53,7 +53,7 @@ def live_frame(
 
     import numpy as np
 
-    from memmlp.deploy.session import OnnxStream
+    from memmlp.deploy.onnx_stream import OnnxStream
     from memmlp.live.latency import alternate
     from memmlp.live.stream import Stream
     from memmlp.runs.lookup import find_run

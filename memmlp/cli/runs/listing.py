@@ -111,7 +111,7 @@ def wanted(columns: str | None, records: Mapping[str, Record], listed: Sequence[
         for key in keys:
             check_key(key, records.values(), "--columns")
         return keys
-    networks = [run for run in listed if records[run.id].get("kind") == "memmlp"]
+    networks = [run for run in listed if records[run.id].get("kind") == NETWORK]
     data = [str(records[run.id].get("data_digest")) for run in networks]
     return differing([run.config for run in networks], data) if len(networks) > 1 else []
 

@@ -25,7 +25,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_file
 from memmlp.motion.body import N_JOINTS
 from memmlp.motion.clip import FRAME_RATE_RANGE, Clip
-from memmlp.motion.formats.archive import Npz, brief, open_npz
+from memmlp.motion.formats.bounded_npz import Npz, brief, open_npz
 
 SMPLH_POSE_DIM = 156
 BODY_DIM = 3 * N_JOINTS
@@ -45,7 +45,7 @@ class NoMotion(InputError):
 
 
 def read_clip(path: Path, name: str) -> Clip:
-    """Read a clip of the SMPL family, without ever unpickling, in bounded memory (`formats.archive`).
+    """Read a clip of the SMPL family, without ever unpickling, in bounded memory (`formats.bounded_npz`).
 
     Args:
         path: the file.

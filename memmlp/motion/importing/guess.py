@@ -19,10 +19,10 @@ from memmlp.motion.body import JOINTS, load_rest_joints
 from memmlp.motion.importing.anatomy import CHAINS, unit
 from memmlp.motion.importing.axes import settle
 from memmlp.motion.importing.convert import convert
+from memmlp.motion.importing.limbs_by_shape import Limbs, Pair, Tree, find_limbs, middle, read_tree
 from memmlp.motion.importing.names import Words, without_namespace, words
 from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.skeleton import SkeletonMap
-from memmlp.motion.importing.tree import Limbs, Pair, Tree, find_limbs, middle, read_tree
 
 Found = dict[str, int | None]  # joint -> node; None where no node stands for it
 

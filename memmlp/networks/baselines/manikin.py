@@ -154,11 +154,6 @@ class Truth:
         return self.joints[..., list(others), :] - self.joints[..., list(joints), :]
 
 
-def off(made: Tensor, true: Tensor) -> Tensor:
-    """Return the mean absolute error."""
-    return (made - true).abs().mean()
-
-
 class Manikin(MotionModel):
     """What both networks have in common: limbs that are solved, and how they are trained.
 
@@ -285,12 +280,12 @@ class ManikinS(Manikin, AvatarPoser):
         rooted = (true.joints - true.joints[..., ROOT : ROOT + 1, :])[..., PLACED, :]
         limbs = len(BASES)
         return {
-            "trunk_rotation": off(parts.sixd[..., 1:, :], true.sixd[..., list(KEPT), :]),
-            "trunk_position": 5 * off(joints[..., PLACED, :], rooted),
-            "swivel": 0.1 * 2 * limbs * off(parts.swivel, swivels(base, middle, end, up)),
-            "middle": limbs * off(middle_at(base, end, up, angle, *lengths), middle),
-            "ankle": 5 * off(parts.ankle, true.between((HEAD,), ANKLES)),
-            "toe": 0.3 * off(parts.toe, true.between(ANKLES, TOES)),
+            "trunk_rotation": F.l1_loss(parts.sixd[..., 1:, :], true.sixd[..., list(KEPT), :]),
+            "trunk_position": 5 * F.l1_loss(joints[..., PLACED, :], rooted),
+            "swivel": 0.1 * 2 * limbs * F.l1_loss(parts.swivel, swivels(base, middle, end, up)),
+            "middle": limbs * F.l1_loss(middle_at(base, end, up, angle, *lengths), middle),
+            "ankle": 5 * F.l1_loss(parts.ankle, true.between((HEAD,), ANKLES)),
+            "toe": 0.3 * F.l1_loss(parts.toe, true.between(ANKLES, TOES)),
         }
 
 
@@ -371,9 +366,9 @@ class ManikinL(Manikin, AvatarJLM):
         (x, y), (cosine, sine) = parts.swivel.unbind(-1), wanted.unbind(-1)
         toe = true.between((HEAD,), TOES)
         return {
-            "trunk_rotation": 2 * off(parts.sixd[..., 1:, :], true.sixd[..., list(KEPT), :]),
+            "trunk_rotation": 2 * F.l1_loss(parts.sixd[..., 1:, :], true.sixd[..., list(KEPT), :]),
             "swivel": 0.1 * torch.atan2(y * cosine - x * sine, x * cosine + y * sine).abs().mean(),
-            "ankle": 5 * off(parts.ankle, true.between((HEAD,), ANKLES)),
-            "toe": 5 * off(parts.ankle + parts.toe, toe),
-            "auxiliary": 2 * off(made[..., PREDICTED:], true.sixd[..., 1:, :].flatten(-2)),
+            "ankle": 5 * F.l1_loss(parts.ankle, true.between((HEAD,), ANKLES)),
+            "toe": 5 * F.l1_loss(parts.ankle + parts.toe, toe),
+            "auxiliary": 2 * F.l1_loss(made[..., PREDICTED:], true.sixd[..., 1:, :].flatten(-2)),
         }

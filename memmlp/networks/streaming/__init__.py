@@ -65,9 +65,10 @@ def streaming(model: MotionModel) -> StreamingGraph:
 
     Raises:
         InputError: if the network has none: where estimates of past frames change at each step
-            (`memory.history=latest`), nothing can be carried, and a part of one's own may have no graph.
+            (`memory.history=latest`), nothing can be carried; frames made with later ones are no stream;
+            and a part of one's own may have no graph.
     """
-    if getattr(getattr(model, "memory", None), "history", None) == "latest":
+    if not model.settled:
         raise InputError(
             "memory.history=latest: its estimates change at each step, which no streaming graph can carry; "
             "allowed is export.graph=naive, or memory.history=first"

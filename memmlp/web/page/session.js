@@ -1,4 +1,4 @@
-// An exported step in ONNX Runtime (memmlp.deploy.session.OnnxStream), whatever build of it `ort` is.
+// An exported step in ONNX Runtime (memmlp.deploy.onnx_stream.OnnxStream), whatever build of it `ort` is.
 //
 // The inputs `state.*` are fed by the outputs `state.*.next` of the step before, zeros at first.
 

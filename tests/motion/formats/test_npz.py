@@ -11,7 +11,7 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.motion.clip import Clip
-from memmlp.motion.formats import archive
+from memmlp.motion.formats import bounded_npz
 from memmlp.motion.formats.npz import NoMotion, read_clip, write_clip
 
 
@@ -69,7 +69,7 @@ def parted(root: str, body: str, trans: str, width: int) -> dict[str, np.ndarray
 )  # fmt: skip
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_every_layout_gives_the_same_clip(values, save, tmp_path, monkeypatch):
-    monkeypatch.setattr(archive, "BLOCK", 15_000)  # several blocks an array
+    monkeypatch.setattr(bounded_npz, "BLOCK", 15_000)  # several blocks an array
     save(tmp_path / "a.npz", **values)
     clip = read_clip(tmp_path / "a.npz", "a")
     np.testing.assert_array_equal(clip.poses.reshape(20, 66), arrays()["poses"][:, :66])
@@ -249,7 +249,7 @@ def peak_of_refusal(path: Path, match: str) -> int:
 @pytest.mark.parametrize("shape", [(5000, 156), (100, 8000)])
 def test_a_small_file_that_unpacks_to_much_is_refused_before_it_does(shape, tmp_path, monkeypatch):
     """It says so itself; the bound is lowered, so that the test need not pack gigabytes."""
-    monkeypatch.setattr(archive, "MAX_ROWS", 500)
+    monkeypatch.setattr(bounded_npz, "MAX_ROWS", 500)
     path = tmp_path / "a.npz"
     np.savez_compressed(path, **(arrays() | {"poses": np.zeros(shape)}))
     assert path.stat().st_size < 100_000
@@ -268,7 +268,7 @@ def test_a_file_that_unpacks_to_more_than_it_says_is_refused(tmp_path):
 
 
 def test_a_huge_directory_is_not_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(archive, "BLOCK", 5000)
+    monkeypatch.setattr(bounded_npz, "BLOCK", 5000)
     path = tmp_path / "a.npz"
     path.write_bytes(npz(**arrays(), **{f"x{i}": np.zeros(1) for i in range(200)}))
     assert peak_of_refusal(path, "a part of more than") < 500_000

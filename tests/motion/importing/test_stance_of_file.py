@@ -12,7 +12,7 @@ from skeleton_families import walking
 from memmlp.motion.body import JOINTS, builtin_rest_joints
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.importing.skeleton import find_skeleton
-from memmlp.motion.importing.stance import Stance, find_stance
+from memmlp.motion.importing.stance_of_file import Stance, find_stance
 
 REST = builtin_rest_joints()
 

@@ -9,8 +9,8 @@ import pytest
 from bvh_samples import Sample
 from skeleton_families import FAMILIES, family
 
+from memmlp.motion.importing.limbs_by_shape import find_limbs, middle, read_tree
 from memmlp.motion.importing.skeleton import load_skeleton
-from memmlp.motion.importing.tree import find_limbs, middle, read_tree
 
 
 def tree(sample: Sample):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from memmlp.common.claims import Claims
+from memmlp.common.lease_claims import Claims
 from memmlp.common.liveness import myself
 
 ME = {**myself(), "since": "now"}
@@ -58,7 +58,7 @@ def test_nobody_sees_a_claim_before_its_owner_stands_in_it(claims: Claims, monke
             assert claims.make(1, OTHER)
         return write(handle, text)
 
-    monkeypatch.setattr("memmlp.common.claims.os.write", frozen)
+    monkeypatch.setattr("memmlp.common.lease_claims.os.write", frozen)
     assert not claims.make(1, ME)
     assert seen == [None]
     assert claims.last().owner == OTHER
@@ -72,7 +72,7 @@ def test_a_link_whose_answer_was_lost_counts(claims: Claims, monkeypatch):
         link(draft, path)
         raise FileExistsError
 
-    monkeypatch.setattr("memmlp.common.claims.os.link", lost)
+    monkeypatch.setattr("memmlp.common.lease_claims.os.link", lost)
     assert claims.make(1, ME)
     assert claims.last().owner == ME
 
@@ -81,7 +81,7 @@ def test_file_systems_without_links_will_do(claims: Claims, monkeypatch):
     def refuse(*_: object) -> None:
         raise OSError(errno.EPERM, os.strerror(errno.EPERM))
 
-    monkeypatch.setattr("memmlp.common.claims.os.link", refuse)
+    monkeypatch.setattr("memmlp.common.lease_claims.os.link", refuse)
     assert claims.make(1, ME)
     assert not claims.make(1, OTHER)
     assert claims.last().owner == ME
