@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from memmlp.motion.body import MOTION_DIM, N_JOINTS, POSITION, ROTATION
-from memmlp.motion.normalizer import Normalizer
+from memmlp.motion.normalizer import Change, Normalizer
 from memmlp.networks.motion_model import MotionModel
 
 Model = TypeVar("Model", bound=MotionModel)
@@ -42,7 +42,7 @@ class NoConversion(Normalizer):
         """Return the rotations (..., 132) as motion (..., 198) whose positions are zeros."""
         return F.pad(rotation, (0, MOTION_DIM - ROTATION.stop))
 
-    def posed_globally(self, rotations: Tensor, sparse: Tensor) -> Tensor:
+    def posed_globally(self, rotations: Tensor, sparse: Tensor, change: Change | None = None) -> Tensor:
         """Return the rotations (..., 132) as motion (..., 198) whose positions are zeros."""
         return self.posed(rotations, sparse)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -18,6 +20,10 @@ from memmlp.motion.body import (
 )
 from memmlp.motion.coordinates import World
 from memmlp.motion.geometry import bone_chains, forward_kinematics, matrix_to_sixd, sixd_to_matrix
+
+Change = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Maps a pose in the world, global rotations (..., 22, 3, 3) and joints (..., 22, 3), to another one. It is
+given the inputs (..., 54) and the rest joints (22, 3), too."""
 
 
 class Normalizer(nn.Module):
@@ -111,17 +117,20 @@ class Normalizer(nn.Module):
         positions = self.pose(world.detach(), sparse).flatten(-2)
         return torch.cat([world[..., ROTATION], positions], -1)
 
-    def posed_globally(self, rotations: Tensor, sparse: Tensor) -> Tensor:
+    def posed_globally(self, rotations: Tensor, sparse: Tensor, change: Change | None = None) -> Tensor:
         """Make world motion (..., 198) from global rotations (..., 132), 6D, at world inputs (..., 54).
 
         The rotations are in the coordinates of the inputs' origin. The positions are sums of turned
-        bones, without gradient, the head on its tracker.
+        bones, without gradient, the head on its tracker. A change is made of the pose in the world.
         """
         sixd = self.rotations_out(rotations, self.origin(sparse))
         matrices = sixd_to_matrix(sixd.unflatten(-1, (N_JOINTS, 6)))
         parents = matrices[..., list(PARENTS[1:]), :, :]
-        local = parents.transpose(-1, -2) @ matrices[..., 1:, :, :]
         offsets = self.rest[1:] - self.rest[list(PARENTS[1:])]
         bones = (parents.detach() @ offsets[..., None])[..., 0]
         positions = self.chains @ bones + sparse[..., SPARSE_POSITION][..., None, :3]
+        if change:
+            matrices, positions = change(matrices, positions, sparse, self.rest)
+            parents = matrices[..., list(PARENTS[1:]), :, :]
+        local = parents.transpose(-1, -2) @ matrices[..., 1:, :, :]
         return torch.cat([sixd[..., :6], matrix_to_sixd(local).flatten(-2), positions.flatten(-2)], -1)

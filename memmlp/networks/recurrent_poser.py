@@ -14,6 +14,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.cells import CELLS, Cell
 from memmlp.networks.layers import in_float32
 from memmlp.networks.memory import State
+from memmlp.networks.reaching import reached
 from memmlp.networks.windowless_model import WindowlessModel
 
 
@@ -61,6 +62,10 @@ class Output(nn.Module):
         """Map rotations (..., 132), as they are made, to world motion (..., 198) at inputs (..., 54)."""
         raise NotImplementedError
 
+    def learned(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+        """Map rotations to the motion whose errors are learned from; by default as in `posed`."""
+        return self.posed(made, sparse, normalizer)
+
 
 class LocalRotations(Output):
     """Each joint's rotation in its parent's frame."""
@@ -88,6 +93,30 @@ class GlobalRotations(Output):
             return normalizer.posed_globally(made.to(sparse.dtype), sparse)
 
 
+class ReachingArms(GlobalRotations):
+    """Global rotations, and arms that reach to the hands' trackers (`reached`).
+
+    What is learned is the arms before they reach: learned through, rotations and positions err more.
+    """
+
+    def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+        """Map rotations (..., 132), as they are made, to world motion (..., 198) at inputs (..., 54)."""
+        with in_float32(made.device):
+            return normalizer.posed_globally(made.to(sparse.dtype), sparse, reached)
+
+    def learned(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+        """Map rotations (..., 132) to world motion whose arms are as they are made."""
+        return super().posed(made, sparse, normalizer)
+
+
+OUTPUTS: dict[str, type[Output]] = {
+    "local": LocalRotations,
+    "global": GlobalRotations,
+    "reaching": ReachingArms,
+}
+"""What the rotations may stand for, by the names that the config knows."""
+
+
 def mean_pose(normalizer: Normalizer) -> Tensor:
     """Return the global rotations (132,), 6D, of the mean pose in the network's coordinates.
 
@@ -96,10 +125,6 @@ def mean_pose(normalizer: Normalizer) -> Tensor:
     local = sixd_to_matrix(normalizer.mean[SPARSE_DIM:][ROTATION].unflatten(-1, (N_JOINTS, 6)))
     rotations, _ = forward_kinematics(local, torch.zeros_like(normalizer.rest[0]), normalizer.rest)
     return matrix_to_sixd(rotations).flatten()
-
-
-OUTPUTS: dict[str, type[Output]] = {"local": LocalRotations, "global": GlobalRotations}
-"""What the rotations may stand for, by the names that the config knows."""
 
 
 class Member(nn.Module):
@@ -218,7 +243,8 @@ class RecurrentPoser(WindowlessModel):
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
         """Make a training call; the motion is that of each member (members B, T, 198), in turn."""
         made, kept = self.made(sparse, state, sparse.shape[1])
-        return self.posed(made, sparse.expand(len(made), -1, -1, -1)).flatten(0, 1), kept
+        motion = self.output.learned(made, sparse.expand(len(made), -1, -1, -1), self.normalizer)
+        return motion.flatten(0, 1), kept
 
     def step(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
         """Take in one frame of world inputs (B, 54), as `advance` does, in plain layers.

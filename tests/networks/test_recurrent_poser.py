@@ -12,7 +12,7 @@ from memmlp.deploy.export import export
 from memmlp.deploy.parity import TOLERANCE, parity
 from memmlp.deploy.quantization import quantise
 from memmlp.evaluation import modes as evaluation
-from memmlp.motion.body import ROTATION, SPARSE_DIM
+from memmlp.motion.body import HANDS, POSITION, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.coordinates import Heading
 from memmlp.networks import checkpoint
 from memmlp.networks.cells import CELLS
@@ -23,7 +23,7 @@ CLIP = tiny.clip(40)
 SPARSE = CLIP[None, :, :SPARSE_DIM]
 
 
-FORMS = [*({"cell": cell} for cell in CELLS), {"output": "global"}, {"output": "global", "members": 2}]
+FORMS = [*({"cell": cell} for cell in CELLS), {"output": "global"}, {"output": "reaching", "members": 2}]
 
 
 @pytest.mark.parametrize("form", FORMS, ids=str)
@@ -66,6 +66,21 @@ def test_each_member_learns_by_itself_and_live_they_are_averaged():
     one += 0.1
     two -= 0.1
     torch.testing.assert_close(model.advance(sparse, model.initial_state(2))[0], before, atol=1e-5, rtol=0)
+
+
+@torch.no_grad()
+def test_arms_reach_where_a_pose_is_made_and_not_where_it_is_learned():
+    """So that training is that of global rotations."""
+    models = [tiny.recurrent_poser(Heading(), output=output) for output in ("global", "reaching")]
+    learned = [model.learn(SPARSE, model.initial_state(), CLIP[None])[0] for model in models]
+    assert torch.equal(*learned)
+    made = [model.advance(SPARSE, model.initial_state())[0] for model in models]
+    hands = SPARSE[..., SPARSE_POSITION].unflatten(-1, (3, 3))[..., 1:, :]
+    wrists = [motion[..., POSITION].unflatten(-1, (22, 3))[..., list(HANDS), :] for motion in made]
+    assert torch.equal(made[0], learned[0])
+    before, after = ((found - hands).norm(dim=-1) for found in wrists)
+    assert (after <= before + 1e-5).all()
+    assert after.mean() < 0.8 * before.mean()
 
 
 @torch.no_grad()

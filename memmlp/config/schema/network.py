@@ -137,7 +137,7 @@ class RecurrentPoserConfig(BaselineConfig):
     name: str = called("recurrent_poser")
     _target_: str = target("memmlp.networks.recurrent_poser.RecurrentPoser")
     cell: str = one_of("gru", "lstm", "mingru", "lru")
-    output: str = standing("local", OneOf(("local", "global")))
+    output: str = standing("local", OneOf(("local", "global", "reaching")))
     expansion: int = at_least(1)
     members: int = at_least(1)
 
