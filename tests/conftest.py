@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import os
 import re
 import shutil
@@ -97,6 +98,8 @@ def clean(monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("COLUMNS", "80")
+    # How far work is, is said every so many seconds: never, however slow the machine is.
+    monkeypatch.setattr("memmlp.common.progress.EVERY", math.inf)
 
 
 @pytest.fixture(autouse=True)

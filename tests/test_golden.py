@@ -34,6 +34,13 @@ def test_numbers_are_recorded_only_under_another_recipe(monkeypatch, tmp_path):
     with pytest.raises(SystemExit, match=r"raise the number of hand\.off"):
         golden.record()
     assert golden.stored()["hand.off"]["numbers"] == {"a": 1.0}
+    monkeypatch.setattr(golden, "CASES", {"hand.off": lambda: {"b": 1.0}})
+    with pytest.raises(SystemExit, match=r"raise the number of hand\.off"):
+        golden.record()
+    monkeypatch.setattr(golden, "CASES", {"hand.off": lambda: {"a": 1.0000001, "b": 2.0}})
+    golden.record()
+    assert golden.stored()["hand.off"]["numbers"] == {"a": 1.0, "b": 2.0}  # what is new is no change
+    monkeypatch.setattr(golden, "CASES", {"hand.off": lambda: {"a": 1.001}})
     monkeypatch.setitem(RECIPES, "hand.off", 99)
     golden.record()
     assert golden.stored()["hand.off"] == {"recipe": 99, "numbers": {"a": 1.001}}

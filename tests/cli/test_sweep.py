@@ -242,6 +242,7 @@ def test_bad_input_is_one_line(tmp_path: Path, words: list[str], line: str):
     assert said.count("\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (memmlp[ray])")
 def test_a_sweep_on_a_local_ray(tmp_path: Path):
     write(tmp_path, {"none": ["memory=none"]})
