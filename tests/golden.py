@@ -22,7 +22,7 @@ from torch import Tensor
 
 from memmlp.evaluation import metrics
 from memmlp.evaluation import modes as evaluation
-from memmlp.evaluation.ik import LBFGS
+from memmlp.evaluation.ik import IK, LBFGS, Arms
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.coordinates import Heading, HeadRelative, World
 from memmlp.motion.dataset import WindowSampler
@@ -193,11 +193,11 @@ def mode(name: str) -> Numbers:
     return found | {key: mean[key] for key in ("MPJPE", "Jitter")}
 
 
-def ik() -> Numbers:
-    """A few frames brought to the position branch."""
+def ik(solver: IK) -> Numbers:
+    """A few frames brought to the position branch, or hands to their trackers."""
     predicted, true = tiny.clip(6, 1), tiny.clip(6, 5)
     motion = torch.cat([predicted[:, SPARSE_DIM:][:, :132], true[:, SPARSE_DIM:][:, 132:]], 1)
-    (solved,) = LBFGS(4).solutions(tiny.normalizer(World()), motion, true[:, :SPARSE_DIM]).values()
+    (solved,) = solver.solutions(tiny.normalizer(World()), motion, true[:, :SPARSE_DIM]).values()
     return summary("solved", solved)
 
 
@@ -275,7 +275,8 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "metrics": measured,
     "mode.stream": partial(mode, "stream"),
     "mode.window": partial(mode, "window"),
-    "ik.lbfgs": ik,
+    "ik.lbfgs": partial(ik, LBFGS(4)),
+    "ik.arms": partial(ik, Arms()),
     "graph.streaming": partial(deployed, "graph.streaming"),
     "graph.naive": partial(deployed, "graph.naive"),
     **{precision: partial(lowered, precision) for precision in ("int8", "int8_blocks", "fp16")},

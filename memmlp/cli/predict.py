@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 @format_option
 @click.option("--mode", default="stream", show_default=True, type=click.Choice(["stream", "window"]))
 @click.option(
-    "--ik", type=click.Choice(["off", "lbfgs"]), help="Inverse kinematics.  [default: as in the evaluation]"
+    "--ik",
+    type=click.Choice(["off", "lbfgs", "arms"]),
+    help="Inverse kinematics.  [default: as in the evaluation]",
 )
 @click.option(
     "--branch", type=click.Choice(["rotation", "combined", "truth"]),
@@ -89,7 +91,7 @@ def chosen_branch(evaluation: Evaluation, branch: str | None) -> str:
     solved = not isinstance(evaluation.ik, NoIK)
     if branch == "combined" and not solved:
         raise InputError(
-            "--branch combined: the run's evaluation has no such result; allowed: with --ik lbfgs"
+            "--branch combined: the run's evaluation has no such result; allowed: with --ik lbfgs or arms"
         )
     return branch or ("combined" if solved else "rotation")
 

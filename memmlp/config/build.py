@@ -25,7 +25,7 @@ from memmlp.config.readable_name import readable_name
 from memmlp.config.schema import check, restored
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
-from memmlp.evaluation.ik import IK, LBFGS, NoIK
+from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK
 from memmlp.evaluation.metrics import OwnMetric
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.coordinates import Heading, HeadRelative, World
@@ -226,11 +226,15 @@ def build_deployment(cfg: DictConfig) -> Deployment | None:
     return None if cfg.export.graph == "off" else Deployment(**cfg.export)
 
 
+SOLVERS: dict[str, type[NoIK | Arms]] = {"off": NoIK, "arms": Arms}
+"""The inverse kinematics without settings, by their names in the config."""
+
+
 def build_ik(cfg: DictConfig) -> IK:
     """Build the inverse kinematics of a checked config."""
-    if cfg.evaluation.ik == "off":
-        return NoIK()
-    return LBFGS(cfg.evaluation.ik_iterations)
+    return (
+        LBFGS(cfg.evaluation.ik_iterations) if cfg.evaluation.ik == "lbfgs" else SOLVERS[cfg.evaluation.ik]()
+    )
 
 
 def build_vqvae_optim(cfg: DictConfig, frames: int) -> Optim:

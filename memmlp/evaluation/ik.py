@@ -1,4 +1,5 @@
-"""The inverse-kinematics slot: finds local rotations that bring the pose to the position branch (App. A).
+"""The inverse-kinematics slot: finds local rotations that bring the pose to the position branch (App. A), or
+hands to their trackers.
 
 The paper runs L-BFGS for at most 15 iterations from the rotation branch's pose (Table 6, reading 11).
 """
@@ -15,8 +16,15 @@ from torch import Tensor
 from torch.autograd.functional import jacobian
 
 from memmlp.motion.body import HEAD, N_JOINTS, POSITION, ROTATION, SPARSE_POSITION
-from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics, matrix_to_sixd, sixd_to_matrix
+from memmlp.motion.geometry import (
+    axis_angle_to_matrix,
+    forward_kinematics,
+    matrix_to_sixd,
+    relative_rotations,
+    sixd_to_matrix,
+)
 from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.reaching import reached
 
 Objective = Callable[[Tensor, Tensor], Tensor]
 
@@ -75,7 +83,31 @@ class LBFGS:
         return matrix_to_sixd(distance.turned(increment)).flatten(1).to(motion.dtype)
 
 
-IK = NoIK | LBFGS
+class Arms:
+    """The arms alone, in closed form: wrists at their trackers (`memmlp.networks.reaching`).
+
+    It needs no positions, and so goes with every network.
+    """
+
+    def solutions(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
+        """Return the motion (N, 198) with the rotations of arms that reach, under the name "combined".
+
+        Args:
+            normalizer: its rest pose is used.
+            motion: predicted motion (N, 198), world.
+            sparse: inputs (N, 54), world.
+        """
+        local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6)))
+        rotations, _ = forward_kinematics(local, torch.zeros_like(sparse[:, :3]), normalizer.rest)
+        turned, _ = reached(rotations, normalizer.pose(motion, sparse), sparse, normalizer.rest)
+        return {
+            "combined": torch.cat(
+                [matrix_to_sixd(relative_rotations(turned)).flatten(1), motion[:, POSITION]], -1
+            )
+        }
+
+
+IK = NoIK | LBFGS | Arms
 
 
 LEVER = 0.1  # m^2, bounds the unit of a joint whose turn moves little

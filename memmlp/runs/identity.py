@@ -146,7 +146,7 @@ def evaluation_settings(config: Mapping[str, Any], mode: str, grouped: str | Non
     """
     group = config.get("evaluation", {})
     ik = group.get("ik", "off")
-    solver = {"ik": ik} | ({"ik_iterations": group.get("ik_iterations")} if ik != "off" else {})
+    solver = {"ik": ik} | ({"ik_iterations": group.get("ik_iterations")} if ik == "lbfgs" else {})
     groups = _groups(config.get("data") or {}) | ({"groups_file": grouped} if grouped else {})
     drawn = {"batch": group.get("batch")} if inference(config).get("memory.blend") == "sampled" else {}
     measured = {"metrics": own} if (own := _own_metrics(group.get("metrics") or ())) else {}

@@ -76,6 +76,7 @@ RECIPES: dict[str, int] = {
     "mode.stream": 1,
     "mode.window": 1,
     "ik.lbfgs": 1,
+    "ik.arms": 1,
     # how they are deployed (memmlp.deploy, memmlp.networks.streaming)
     "export": 1,
     "graph.streaming": 1,

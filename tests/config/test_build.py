@@ -60,7 +60,7 @@ TRAINED: dict[str, tuple[list[str], list[list[str]]]] = {
     "hand": (SMALL, [["hand=position"], ["hand=fk"], ["hand=off"]]),
     "frame.coordinates": (SMALL, [[f"frame.coordinates={n}"] for n in ("heading", "head_relative", "world")]),
     "frame.normalize": (SMALL, [["frame.normalize=true"], ["frame.normalize=false"]]),
-    "evaluation.ik": (SMALL, [["evaluation.ik=off"], ["evaluation.ik=lbfgs"]]),
+    "evaluation.ik": (SMALL, [["evaluation.ik=off"], ["evaluation.ik=lbfgs"], ["evaluation.ik=arms"]]),
     "evaluation.modes": (SMALL, [[f"evaluation.modes=[{n}]"] for n in ("window,stream", "stream", "window")]),
     "history": (
         SMALL,
@@ -246,7 +246,7 @@ GROUPS: dict[str, list[str]] = {
     "loss": ["uncertainty", "manual"],
     "hand": ["position", "fk", "off"],
     "frame.coordinates": ["heading", "head_relative", "world"],
-    "evaluation.ik": ["off", "lbfgs"],
+    "evaluation.ik": ["off", "lbfgs", "arms"],
     "vqvae.codebook": ["ema", "gradient"],
     "tracking": ["mlflow", "none", "tensorboard", "wandb", "all"],
 }

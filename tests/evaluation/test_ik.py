@@ -7,10 +7,11 @@ import torch
 from torch import Tensor
 
 from memmlp.evaluation import metrics
-from memmlp.evaluation.ik import LBFGS, JointDistance, NoIK, minimise
+from memmlp.evaluation.ik import LBFGS, Arms, JointDistance, NoIK, minimise
 from memmlp.evaluation.modes import clip_report, evaluate, local_rotations, stream
 from memmlp.evaluation.predictions import prediction_arrays
 from memmlp.motion.body import HEAD, N_JOINTS, POSITION, ROTATION, SPARSE_DIM
+from memmlp.motion.coordinates import Heading
 from memmlp.motion.geometry import axis_angle_to_matrix, matrix_to_sixd
 
 NORMALIZER = tiny.normalizer()
@@ -161,6 +162,21 @@ def test_the_combined_report_is_of_the_solved_rotations():
     assert report["combined"]["MPJPE"] == float(metrics.position_error(positions, truth))
     torch.testing.assert_close(positions[:, HEAD], truth[:, HEAD], atol=1e-5, rtol=0)
     assert ROTATION.stop == 132
+
+
+@torch.no_grad()
+def test_arms_reach_as_those_of_a_network_that_reaches():
+    """They need no positions, and leave all but head, arms and hands as they are."""
+    models = [tiny.recurrent_poser(Heading(), output=output) for output in ("global", "reaching")]
+    plain, reaching = (stream(model, [TRUTH])[0] for model in models)
+    normalizer = tiny.normalizer(Heading())
+    solved = Arms().solutions(normalizer, plain, TRUTH[:, :SPARSE_DIM])["combined"]
+    before, found, expected = map(local_rotations, (plain, solved, reaching))
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
+    torch.testing.assert_close(found[:, :12], before[:, :12])  # legs, hips and spine
+    assert torch.equal(solved[:, POSITION], plain[:, POSITION])
+    report = clip_report(normalizer, plain, TRUTH, Arms())
+    assert report["combined"]["Hand PE"] < 0.8 * report["rotation"]["Hand PE"]
 
 
 def test_prediction_files_hold_the_solved_pose():

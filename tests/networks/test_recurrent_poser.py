@@ -172,12 +172,14 @@ def test_a_training_window_is_all_that_a_step_moves_by():
     assert (model.frames, model.stride, model.length) == (9, 9, 0)
 
 
-@pytest.mark.parametrize(("profile", "width", "depth"), [("small", 128, 4), ("paper", 144, 3)])
-def test_parameters(profile, width, depth):
+@pytest.mark.parametrize(
+    ("profile", "members", "width", "depth"), [("small", 3, 128, 4), ("paper", 2, 144, 3)]
+)
+def test_parameters(profile, members, width, depth):
     """A block's GRU is 6 d d + 6 d, its MLP of d hidden units 2 d d + 2 d, its two norms 4 d."""
     model = untrained(["model=recurrent_poser", f"profile={profile}"])
     ends = 54 * width + width + 2 * width + 132 * width + 132
-    assert model.count_parameters() == 2 * (depth * (8 * width**2 + 12 * width) + ends)
+    assert model.count_parameters() == members * (depth * (8 * width**2 + 12 * width) + ends)
     assert model.count_parameters() < 4_200_000
 
 

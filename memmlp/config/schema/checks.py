@@ -196,10 +196,9 @@ def _check_baseline(cfg: DictConfig) -> None:
     carries = _is(cfg.model, RecurrentPoserConfig) and _is(cfg.rollout, StreamsConfig)
     if not (_is(cfg.rollout, TeacherForcingConfig) or carries):
         raise InputError(f"rollout: {name} has no history of its own; allowed is rollout=teacher_forcing")
-    if cfg.evaluation.ik != "off":
+    if cfg.evaluation.ik == "lbfgs":
         raise InputError(
-            f"evaluation.ik={cfg.evaluation.ik} needs positions, and {name} has rotations alone: "
-            "allowed is evaluation.ik=off"
+            f"evaluation.ik=lbfgs needs positions, and {name} has rotations alone: allowed is off or arms"
         )
     for heads, width in (("heads", "width"), ("code_heads", "code_width")):
         if heads in cfg.model and cfg.model[width] % cfg.model[heads]:
@@ -266,8 +265,7 @@ def _check_slots(cfg: DictConfig) -> None:
             "predictor with memory blocks needs a memory, and memory=none is none: "
             "allowed is another memory, predictor=two_branch or predictor=rotation_only"
         )
-    if cfg.evaluation.ik != "off" and predictor.startswith("RotationOnly"):
+    if cfg.evaluation.ik == "lbfgs" and predictor.startswith("RotationOnly"):
         raise InputError(
-            f"evaluation.ik={cfg.evaluation.ik} needs the positions of predictor=two_branch: "
-            "allowed is evaluation.ik=off"
+            "evaluation.ik=lbfgs needs the positions of predictor=two_branch: allowed is off or arms"
         )

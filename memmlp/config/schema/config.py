@@ -138,7 +138,7 @@ class ProfileConfig:
     latency_steps: int = at_least(1)
     memory_shift: str = one_of("frame", "window")
     memory_history: str = one_of("first", "latest")
-    ik: str = one_of("off", "lbfgs")
+    ik: str = one_of("off", "lbfgs", "arms")
     agrol_frames: int = at_least(2)
     avatar_poser_frames: int = at_least(2)
     avatar_poser_width: int = at_least(1)
@@ -193,7 +193,7 @@ class EvaluationConfig:
 
     modes: list[str] = key(EachOf(OneOf(("window", "stream"))))
     batch: int = at_least(1)
-    ik: str = one_of("off", "lbfgs")
+    ik: str = one_of("off", "lbfgs", "arms")
     ik_iterations: int = at_least(1)
     metrics: list[str] = own(EachOf(Registered(METRICS), empty=True))
 
