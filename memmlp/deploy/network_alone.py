@@ -42,7 +42,7 @@ class NoConversion(Normalizer):
         """Return the rotations (..., 132) as motion (..., 198) whose positions are zeros."""
         return F.pad(rotation, (0, MOTION_DIM - ROTATION.stop))
 
-    def posed_globally(self, rotations: Tensor, sparse: Tensor, change: Change | None = None) -> Tensor:
+    def posed_in_world(self, rotations: Tensor, sparse: Tensor, change: Change | None = None) -> Tensor:
         """Return the rotations (..., 132) as motion (..., 198) whose positions are zeros."""
         return self.posed(rotations, sparse)
 

@@ -20,11 +20,10 @@ from memmlp.motion.geometry import (
     axis_angle_to_matrix,
     forward_kinematics,
     matrix_to_sixd,
-    relative_rotations,
     sixd_to_matrix,
 )
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.reaching import reached
+from memmlp.networks.reaching import reached, tracked
 
 Objective = Callable[[Tensor, Tensor], Tensor]
 
@@ -99,12 +98,9 @@ class Arms:
         """
         local = sixd_to_matrix(motion[:, ROTATION].unflatten(-1, (N_JOINTS, 6)))
         rotations, _ = forward_kinematics(local, torch.zeros_like(sparse[:, :3]), normalizer.rest)
-        turned, _ = reached(rotations, normalizer.pose(motion, sparse), sparse, normalizer.rest)
-        return {
-            "combined": torch.cat(
-                [matrix_to_sixd(relative_rotations(turned)).flatten(1), motion[:, POSITION]], -1
-            )
-        }
+        turned = tracked(matrix_to_sixd(rotations).flatten(1), sparse)
+        solved = normalizer.posed_in_world(turned, sparse, reached)
+        return {"combined": torch.cat([solved[:, ROTATION], motion[:, POSITION]], -1)}
 
 
 IK = NoIK | LBFGS | Arms

@@ -106,12 +106,6 @@ def forward_kinematics(local: Tensor, root: Tensor, rest: Tensor) -> tuple[Tenso
     return torch.cat(rotations, -3), torch.cat(positions, -3)[..., 0]
 
 
-def relative_rotations(rotations: Tensor) -> Tensor:
-    """Return joints' local rotations (..., 22, 3, 3), the root's global, from their global ones."""
-    parents = rotations[..., list(PARENTS[1:]), :, :]
-    return torch.cat([rotations[..., :1, :, :], parents.mT @ rotations[..., 1:, :, :]], -3)
-
-
 def bone_chains() -> Tensor:
     """Return the matrix (22, 21) that adds turned bones up to joints as they are seen from the head.
 

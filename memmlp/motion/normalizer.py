@@ -117,14 +117,12 @@ class Normalizer(nn.Module):
         positions = self.pose(world.detach(), sparse).flatten(-2)
         return torch.cat([world[..., ROTATION], positions], -1)
 
-    def posed_globally(self, rotations: Tensor, sparse: Tensor, change: Change | None = None) -> Tensor:
-        """Make world motion (..., 198) from global rotations (..., 132), 6D, at world inputs (..., 54).
+    def posed_in_world(self, rotations: Tensor, sparse: Tensor, change: Change | None = None) -> Tensor:
+        """Make world motion (..., 198) from its global rotations (..., 132), 6D, at world inputs (..., 54).
 
-        The rotations are in the coordinates of the inputs' origin. The positions are sums of turned
-        bones, without gradient, the head on its tracker. A change is made of the pose in the world.
+        The positions are sums of turned bones, without gradient, the head on its tracker.
         """
-        sixd = self.rotations_out(rotations, self.origin(sparse))
-        matrices = sixd_to_matrix(sixd.unflatten(-1, (N_JOINTS, 6)))
+        matrices = sixd_to_matrix(rotations.unflatten(-1, (N_JOINTS, 6)))
         parents = matrices[..., list(PARENTS[1:]), :, :]
         offsets = self.rest[1:] - self.rest[list(PARENTS[1:])]
         bones = (parents.detach() @ offsets[..., None])[..., 0]
@@ -133,4 +131,4 @@ class Normalizer(nn.Module):
             matrices, positions = change(matrices, positions, sparse, self.rest)
             parents = matrices[..., list(PARENTS[1:]), :, :]
         local = parents.transpose(-1, -2) @ matrices[..., 1:, :, :]
-        return torch.cat([sixd[..., :6], matrix_to_sixd(local).flatten(-2), positions.flatten(-2)], -1)
+        return torch.cat([rotations[..., :6], matrix_to_sixd(local).flatten(-2), positions.flatten(-2)], -1)

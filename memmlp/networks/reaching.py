@@ -11,18 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from memmlp.motion.body import HEAD, SPARSE_POSITION, SPARSE_ROTATION
-from memmlp.motion.geometry import sixd_to_matrix
-from memmlp.networks.baselines.limb_solver import (
-    BASES,
-    ENDS,
-    FLEXION,
-    MIDDLES,
-    OFFSET,
-    aligning,
-    applied,
-    cross,
-    dot,
-)
+from memmlp.networks.baselines.limb_solver import BASES, ENDS, MIDDLES, OFFSET, aligning, dot
 
 SHOULDERS, ELBOWS, WRISTS = (slice(left, right + 1) for left, right, *_ in (BASES, MIDDLES, ENDS))
 """The joints of both arms, which are the body's last ones, and follow each other."""
@@ -31,12 +20,25 @@ BEGINNING, ENDING = slice(SHOULDERS.start, ELBOWS.stop), slice(ELBOWS.start, WRI
 SLACK = 1e-3  # the part of its reach by which an arm is never quite straight, nor folded: so it has a side
 
 
+def tracked(rotations: Tensor, sparse: Tensor) -> Tensor:
+    """Turn head and wrists as their trackers are.
+
+    Args:
+        rotations: global rotations (..., 132), 6D, world.
+        sparse: inputs (..., 54), world.
+    """
+    seen = sparse[..., SPARSE_ROTATION]
+    head, wrists = 6 * HEAD, 6 * WRISTS.start
+    return torch.cat(
+        [rotations[..., :head], seen[..., :6], rotations[..., head + 6 : wrists], seen[..., 6:]], -1
+    )
+
+
 def reached(rotations: Tensor, joints: Tensor, sparse: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
     """Bend the arms of a body so that its wrists come to their trackers, as far as the arms reach.
 
-    The elbows stay on that side of the line from shoulder to hand on which they are; of a straight arm the
-    elbow's axis of flexion tells the side. The bones are turned the least way, and head and wrists as their
-    trackers are.
+    The elbows stay on that side of the line from shoulder to hand on which they are; those of straight arms
+    go to the upper arm's back. The bones are turned the least way.
 
     Args:
         rotations: global rotations (..., 22, 3, 3), world.
@@ -47,29 +49,25 @@ def reached(rotations: Tensor, joints: Tensor, sparse: Tensor, rest: Tensor) -> 
     Returns:
         Rotations and positions of the body with its arms bent.
     """
-    tracked = sixd_to_matrix(sparse[..., SPARSE_ROTATION].unflatten(-1, (3, 6)))
     hands = sparse[..., SPARSE_POSITION].unflatten(-1, (3, 3))[..., 1:, :]
-    shoulder, elbow = (joints[..., part, :] for part in (SHOULDERS, ELBOWS))
+    shoulder, arms = joints[..., SHOULDERS, :], rotations[..., BEGINNING, :, :]
+    bones = joints[..., ENDING, :] - joints[..., BEGINNING, :]
     lengths = (rest[ENDING] - rest[BEGINNING]).norm(dim=-1, keepdim=True)
-    side = applied(rotations[..., SHOULDERS, :, :], rest.new_tensor(FLEXION[:2]))
-    bent, end = bent_to(hands - shoulder, elbow - shoulder, side, *lengths.split(2))
-    before = (joints[..., ENDING, :] - joints[..., BEGINNING, :]) / lengths
-    after = torch.cat([bent, end - bent], -2) / lengths
-    arms = aligning(before, after) @ rotations[..., BEGINNING, :, :]
-    turned = [rotations[..., :HEAD, :, :], tracked[..., :1, :, :], arms, tracked[..., 1:, :, :]]
-    placed = [joints[..., : ELBOWS.start, :], shoulder + bent, shoulder + end]
+    side = bones[..., :2, :] - OFFSET * arms[..., :2, :, 2]  # the upper arms' third axes point to the front
+    elbow, wrist = bent_to(hands - shoulder, side, *lengths.split(2))
+    bent = torch.cat([elbow, wrist - elbow], -2)
+    arms = aligning(bones / lengths, bent / lengths) @ arms
+    turned = [rotations[..., : BEGINNING.start, :, :], arms, rotations[..., BEGINNING.stop :, :, :]]
+    placed = [joints[..., : ENDING.start, :], shoulder + elbow, shoulder + wrist]
     return torch.cat(turned, -3), torch.cat(placed, -2)
 
 
-def bent_to(
-    goal: Tensor, elbow: Tensor, flexion: Tensor, upper: Tensor, lower: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return where elbows and ends of arms are that reach to a goal, all seen from the shoulders.
+def bent_to(goal: Tensor, side: Tensor, upper: Tensor, lower: Tensor) -> tuple[Tensor, Tensor]:
+    """Return where the elbows and wrists are of arms that reach to a goal, all seen from the shoulders.
 
     Args:
-        goal: where the ends should be (..., 2, 3), metres.
-        elbow: where the elbows are (..., 2, 3).
-        flexion: unit axes of flexion (..., 2, 3), which tell an elbow's side where it has none.
+        goal: where the wrists should be (..., 2, 3), metres.
+        side: to which side of the goal the elbows are (..., 2, 3).
         upper: lengths of the upper bones (2, 1).
         lower: lengths of the lower ones (2, 1).
     """
@@ -77,7 +75,7 @@ def bent_to(
     axis = goal / distance
     most, least = (upper + lower) * (1 - SLACK), (upper - lower).abs() + upper * SLACK
     reach = distance.minimum(most).maximum(least)
-    cosine = (upper.square() + reach.square() - lower.square()) / (2 * upper * reach)
-    sine = ((1 - cosine) * (1 + cosine)).clamp_min(1e-9).sqrt()
-    side = F.normalize(elbow - dot(elbow, axis) * axis + OFFSET * cross(axis, flexion), dim=-1)
-    return upper * (cosine * axis + sine * side), reach * axis
+    cosine = reach / (2 * upper) + (upper.square() - lower.square()) / (2 * upper) / reach
+    sine = (1 - cosine.square()).clamp_min(1e-9).sqrt()
+    out = F.normalize(side - dot(side, axis) * axis, dim=-1)
+    return upper * (cosine * axis + sine * out), reach * axis

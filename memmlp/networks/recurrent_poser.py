@@ -14,7 +14,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.cells import CELLS, Cell
 from memmlp.networks.layers import in_float32
 from memmlp.networks.memory import State
-from memmlp.networks.reaching import reached
+from memmlp.networks.reaching import reached, tracked
 from memmlp.networks.windowless_model import WindowlessModel
 
 
@@ -90,7 +90,11 @@ class GlobalRotations(Output):
     def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
         """Map rotations (..., 132), as they are made, to world motion (..., 198) at inputs (..., 54)."""
         with in_float32(made.device):
-            return normalizer.posed_globally(made.to(sparse.dtype), sparse)
+            return normalizer.posed_in_world(self.in_world(made, sparse, normalizer), sparse)
+
+    def in_world(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
+        """Turn rotations (..., 132), as they are made at inputs (..., 54), to those of the world."""
+        return normalizer.rotations_out(made.to(sparse.dtype), normalizer.origin(sparse))
 
 
 class ReachingArms(GlobalRotations):
@@ -102,7 +106,8 @@ class ReachingArms(GlobalRotations):
     def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
         """Map rotations (..., 132), as they are made, to world motion (..., 198) at inputs (..., 54)."""
         with in_float32(made.device):
-            return normalizer.posed_globally(made.to(sparse.dtype), sparse, reached)
+            rotations = tracked(self.in_world(made, sparse, normalizer), sparse)
+            return normalizer.posed_in_world(rotations, sparse, reached)
 
     def learned(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
         """Map rotations (..., 132) to world motion whose arms are as they are made."""

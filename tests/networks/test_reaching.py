@@ -8,7 +8,7 @@ from memmlp.motion.body import HANDS, HEAD, N_JOINTS, POSITION, ROTATION, SPARSE
 from memmlp.motion.body import SPARSE_POSITION as PLACES
 from memmlp.motion.body import SPARSE_ROTATION as TURNS
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
-from memmlp.networks.reaching import ELBOWS, SHOULDERS, SLACK, WRISTS, reached
+from memmlp.networks.reaching import ELBOWS, SHOULDERS, SLACK, WRISTS, reached, tracked
 
 REST = tiny.REST.double()
 LENGTHS = [
@@ -76,11 +76,15 @@ def test_the_elbow_stays_on_its_side_of_the_way_to_the_hand():
 def test_head_and_wrists_turn_as_their_trackers_and_the_rest_stays():
     rotations, joints = body()
     sparse = inputs(joints, within_reach(joints, 0.7))
-    turned, placed = reached(rotations, joints, sparse, REST)
+    seen = sixd_to_matrix(tracked(matrix_to_sixd(rotations).flatten(1), sparse).unflatten(-1, (N_JOINTS, 6)))
     torch.testing.assert_close(
-        turned[:, [HEAD, *HANDS]], sixd_to_matrix(sparse[:, TURNS].unflatten(-1, (3, 6)))
+        seen[:, [HEAD, *HANDS]], sixd_to_matrix(sparse[:, TURNS].unflatten(-1, (3, 6)))
     )
-    assert torch.equal(turned[:, :HEAD], rotations[:, :HEAD])
+    others = [joint for joint in range(N_JOINTS) if joint not in (HEAD, *HANDS)]
+    torch.testing.assert_close(seen[:, others], rotations[:, others])
+    turned, placed = reached(seen, joints, sparse, REST)
+    kept = [joint for joint in range(N_JOINTS) if not SHOULDERS.start <= joint < ELBOWS.stop]
+    assert torch.equal(turned[:, kept], seen[:, kept])
     assert torch.equal(placed[:, : ELBOWS.start], joints[:, : ELBOWS.start])
 
 
