@@ -74,7 +74,7 @@ def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | N
     path = out / f"{stem or sweep.name}.json"
     merged = _merged(path, load_kept(path), kept) if path.exists() else kept
     save(path, merged)
-    click.echo(f"{path}: {len(merged.every)} runs, {len(kept.every)} of them from here")
+    click.echo(f"{path}: {merged.count} runs, {kept.count} of them from here")
 
 
 @results.command("docs")

@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -56,9 +57,33 @@ class Kept:
 
     @property
     def every(self) -> list[Measured]:
-        """The runs, each once, in the order of their ids."""
-        found = {run.id: run for runs in self.runs.values() for run in runs.values()}
-        return [found[name] for name in sorted(found)]
+        """The runs, each once for each of its evaluations that arms show, in the order of their names."""
+        return [run for _, run in sorted(self.named.items())]
+
+    @property
+    def count(self) -> int:
+        """The number of runs."""
+        return len({run.id for run in self.every})
+
+    @cached_property
+    def named(self) -> dict[str, Measured]:
+        """The runs by their names in the file.
+
+        That is the id; where arms show several evaluations of one run, such as inverse kinematics of two
+        kinds, it is the id and a digest of the errors.
+        """
+        found: dict[str, dict[str, Measured]] = {}
+        for run in (run for runs in self.runs.values() for run in runs.values()):
+            found.setdefault(run.id, {})[_errors_key(run)] = run
+        return {
+            run.id if len(same) == 1 else f"{run.id}/{key}": run
+            for same in found.values()
+            for key, run in same.items()
+        }
+
+    def name(self, run: Measured) -> str:
+        """Return a run's name in the file."""
+        return run.id if run.id in self.named else f"{run.id}/{_errors_key(run)}"
 
     def merged(self, other: Kept) -> Kept:
         """Return the results with another's runs added; where both have a cell, the other's stands.
@@ -144,11 +169,11 @@ def dumps(kept: Kept) -> str:
         **({"predicted_flops": dict(kept.predicted)} if kept.predicted else {}),
         "clips": dict(sorted(clips.items())),
         "cells": {
-            label: {str(seed): runs[seed].id for seed in sorted(runs)}
+            label: {str(seed): kept.name(runs[seed]) for seed in sorted(runs)}
             for label, runs in sorted(kept.runs.items())
             if runs
         },
-        "runs": {run.id: _record(run) for run in kept.every},
+        "runs": {kept.name(run): _record(run) for run in kept.every},
     }
     content["digest"] = _digest(content)
     text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
@@ -186,10 +211,10 @@ def _digest(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _record(run: Measured) -> dict[str, Any]:
-    """Return what is kept of a run."""
+def _errors(run: Measured) -> dict[str, Any]:
+    """Return each metric of every test clip by mode and branch, to six digits."""
     names = list(run.clips)
-    errors = {
+    return {
         mode: {
             branch: {
                 metric: [_short(float(value)) for value in run.by_clip(names, mode, branch, metric)]
@@ -199,6 +224,14 @@ def _record(run: Measured) -> dict[str, Any]:
         }
         for mode, branches in run.means.items()
     }
+
+
+def _errors_key(run: Measured) -> str:
+    return hashlib.sha256(json.dumps(_errors(run), sort_keys=True).encode()).hexdigest()[:8]
+
+
+def _record(run: Measured) -> dict[str, Any]:
+    """Return what is kept of a run."""
     costs = {name: _short(cost) for name, cost in run.costs.items()}
     origin = plain(asdict(run.origin))
     for name in ("partial", "processes", "offline"):  # files from before there were these have none
@@ -206,7 +239,7 @@ def _record(run: Measured) -> dict[str, Any]:
             del origin[name]
     training = {"training": {name: _short(number) for name, number in run.training.items()}}
     record = {"origin": origin, "clips": _clips_key(run), "costs": costs}
-    return record | (training if run.training else {}) | {"errors": errors}
+    return record | (training if run.training else {}) | {"errors": _errors(run)}
 
 
 def _clips(run: Measured) -> list[list[str]]:
@@ -225,7 +258,7 @@ def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str
     if any(len(values) != len(names) for values in _every(errors)):
         raise ValueError(f"run {name} has not as many errors as clips")
     return Measured(
-        id=name,
+        id=name.partition("/")[0],
         means=_each(errors, _mean),
         clips={clip: _each(errors, lambda values, i=i: values[i]) for i, clip in enumerate(names)},
         groups={clip: group for clip, group, *_ in clips},

@@ -92,7 +92,7 @@ def _table_page(source: KeptTable) -> str:
 
 def origin_words(kept: Kept) -> str:
     """Say where the runs come from, and which command makes them again."""
-    parts = [f"{len(kept.every)} runs"]
+    parts = [f"{kept.count} runs"]
     for attribute, what in ORIGIN.items():
         values = {str(getattr(run.origin, attribute)) for run in kept.every}
         # A run that other code went on with has several commits; each of all is named once.

@@ -99,9 +99,16 @@ def effects(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dic
 
 
 def one_and_the_same(arm: Arm, other: Arm, ours: Runs, theirs: Runs) -> bool:
-    """Return whether two arms show the same branch of the same run, so that there is nothing to compare."""
-    same = any(ours[seed].id == theirs[seed].id for seed in ours.keys() & theirs.keys())
-    return same and arm.branch == other.branch
+    """Return whether two arms show the same errors of the same run, so that there is nothing to compare.
+
+    One run may have several, such as those after inverse kinematics of two kinds.
+    """
+
+    def same(one: Measured, two: Measured) -> bool:
+        return one.id == two.id and str(one.shown(arm.branch)) == str(two.shown(other.branch))  # NaN is NaN
+
+    shared = any(same(ours[seed], theirs[seed]) for seed in ours.keys() & theirs.keys())
+    return shared and arm.branch == other.branch
 
 
 def _compared(sweep: Sweep) -> Iterator[tuple[Arm, Arm]]:
@@ -215,11 +222,15 @@ def or_nan(number: float | None) -> float:
 
 
 def with_existing_branches(sweep: Sweep, runs: Mapping[str, Runs]) -> Sweep:
-    """Return the sweep with the rotation branch for arms whose networks have no position branch."""
+    """Return the sweep with the rotation branch for arms whose networks have no other.
+
+    A network without a position branch may still have been evaluated after inverse kinematics.
+    """
 
     def single(arm: Arm) -> bool:
         found = runs.get(arm.label, {}).values()
-        return bool(found) and all(run.one_head for run in found)
+        solved = arm.branch == "combined" and all(run.has("combined") for run in found)
+        return bool(found) and not solved and all(run.one_head for run in found)
 
     arms = tuple(replace(arm, branch="rotation") if single(arm) else arm for arm in sweep.arms)
     return replace(sweep, arms=arms)

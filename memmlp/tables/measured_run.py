@@ -128,6 +128,10 @@ class Measured:
         """Return whether the run was evaluated in that branch."""
         return any(branch in branches for branches in self.means.values())
 
+    def shown(self, branch: str) -> dict[str, Any]:
+        """Return the means of that branch by mode."""
+        return {mode: branches.get(branch) for mode, branches in self.means.items()}
+
     @property
     def one_head(self) -> bool:
         """Whether the network predicts rotations alone.

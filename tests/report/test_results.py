@@ -132,6 +132,28 @@ def test_words_of_kept_results_stay_as_they_are(kept: Kept, tmp_path: Path):
     ]
 
 
+def test_two_evaluations_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp_path: Path):
+    """Arms may show inverse kinematics of two kinds of one training."""
+    one, two = list(kept.runs)[:2]
+    solved = {
+        seed: replace(run, id=kept.runs[one][seed].id, sources={}) for seed, run in kept.runs[two].items()
+    }
+    save(tmp_path / "kept.json", replace(kept, runs=kept.runs | {two: solved}))
+    read = load_kept(tmp_path / "kept.json")
+    for label in (one, two):
+        for seed, run in kept.runs[label].items():
+            found = read.runs[label][seed]
+            assert found.id == kept.runs[one][seed].id
+            assert found.value("stream", "combined", "MPJPE") == pytest.approx(
+                run.value("stream", "combined", "MPJPE"), rel=1e-5
+            )
+    assert read.count == len({run.id for runs in read.runs.values() for run in runs.values()})
+    assert len(read.every) == read.count + len(solved)
+    assert dumps(read) == (tmp_path / "kept.json").read_text()
+    table = collect(sweep, read.of(sweep))
+    assert not any("are one run" in flag and two in flag for flag in table.flags)
+
+
 def test_results_of_several_machines_add_up(sweep: Sweep, kept: Kept, tmp_path: Path):
     """Arms and seeds of both are there. A cell that both have is the newer one's; the other run is gone."""
     one = {label: {0: runs[0]} for label, runs in kept.runs.items()}
