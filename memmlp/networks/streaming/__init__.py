@@ -70,8 +70,9 @@ def streaming(model: MotionModel) -> StreamingGraph:
     """
     if not model.settled:
         raise InputError(
-            "memory.history=latest: its estimates change at each step, which no streaming graph can carry; "
-            "allowed is export.graph=naive, or memory.history=first"
+            "export.graph=streaming: estimates of past frames change at each step (memory.history=latest, or a "
+            "memory of one's own), which no such graph can carry; allowed is export.graph=naive, or "
+            "memory.history=first"
         )
     if not model.streams:
         raise InputError("model.offline=true: makes frames with later ones; allowed is model.offline=false")

@@ -176,7 +176,7 @@ def test_two_files_of_one_clip_are_refused(source: Path, tmp_path: Path) -> None
     write(source, person("cmu_daz", 3, 0).text(), "salsa/01.BVH")
     if len(list((source / "salsa").iterdir())) == 2:
         pytest.skip("the file system does not tell 01.bvh from 01.BVH")
-    with refuse("salsa/01", "2 BVH files"):
+    with refuse("salsa/01", "2 recordings"):
         import_folder(source, tmp_path / "out")
 
 
