@@ -70,8 +70,8 @@ def streaming(model: MotionModel) -> StreamingGraph:
     """
     if not model.settled:
         raise InputError(
-            "export.graph=streaming: estimates of past frames change at each step (memory.history=latest, or a "
-            "memory of one's own), which no such graph can carry; allowed is export.graph=naive, or "
+            "export.graph=streaming: estimates of past frames change at each step (memory.history=latest, or "
+            "a memory of one's own), which no such graph can carry; allowed is export.graph=naive, or "
             "memory.history=first"
         )
     if not model.streams:
