@@ -18,9 +18,8 @@ if TYPE_CHECKING:
 TARGETS = ("onnxruntime", "web", "wasm", "webgpu", "webnn", "unity", "tensorrt", "coreml", "qnn")
 """Those of memmlp.deploy.targets, without importing ONNX Runtime for the help."""
 
-FULL_TOLERANCE = (
-    0.1  # metres, and of rotation matrices: what fp16 changes is far less, what is broken far more
-)
+FULL_TOLERANCE = 0.1
+"""In metres and in entries of rotation matrices: what fp16 changes is far less, what is broken far more."""
 
 
 class Form(NamedTuple):

@@ -226,15 +226,10 @@ def build_deployment(cfg: DictConfig) -> Deployment | None:
     return None if cfg.export.graph == "off" else Deployment(**cfg.export)
 
 
-SOLVERS: dict[str, type[NoIK | Arms]] = {"off": NoIK, "arms": Arms}
-"""The inverse kinematics without settings, by their names in the config."""
-
-
 def build_ik(cfg: DictConfig) -> IK:
     """Build the inverse kinematics of a checked config."""
-    return (
-        LBFGS(cfg.evaluation.ik_iterations) if cfg.evaluation.ik == "lbfgs" else SOLVERS[cfg.evaluation.ik]()
-    )
+    solvers: dict[str, IK] = {"off": NoIK(), "lbfgs": LBFGS(cfg.evaluation.ik_iterations), "arms": Arms()}
+    return solvers[cfg.evaluation.ik]
 
 
 def build_vqvae_optim(cfg: DictConfig, frames: int) -> Optim:

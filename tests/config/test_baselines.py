@@ -191,6 +191,7 @@ REFUSED = [
     (["model=agrol_mlp", "loss=terms", "loss.jerk=-1"], "loss.jerk=-1"),
     (["model=agrol_mlp", "loss=terms", "loss.jerks=1"], "loss.jerks"),
     (["model=agrol_mlp", "export.precision=int8", "export.graph=naive"], "allowed is auto or streaming"),
+    (["model=recurrent_poser", "evaluation.ik=arms"], "model.output=reaching has such arms already"),
 ]
 
 
