@@ -21,6 +21,8 @@ from hypothesis import HealthCheck, settings
 from own_package import on_path  # noqa: F401
 from remembered import keep_exports, remember
 
+from memmlp.common.collecting import collect_seldom
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest files first, the others as they were; what needs a trained run is slow."""
@@ -36,10 +38,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT))
 
 
+collect_seldom()
+
+
 def pytest_collection_finish() -> None:
-    """What is imported by now stays: the garbage collector need not go through it, nor look so often."""
+    """What is imported by now stays: the garbage collector need not go through it."""
     gc.freeze()
-    gc.set_threshold(20_000, 20, 20)
 
 
 @pytest.hookimpl(trylast=True)

@@ -14,6 +14,7 @@ import click
 
 import memmlp
 from memmlp.common import distributed
+from memmlp.common.collecting import collect_seldom
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.common.progress import telling
 
@@ -107,6 +108,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     With MEMMLP_TRACEBACK=1 in the environment the error is raised, to show where it came from.
     """
+    if argv is None:  # a process of its own
+        collect_seldom()
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         _run(arguments)

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
+from memmlp.common.collecting import collect_seldom
 from memmlp.common.errors import InputError
 from memmlp.sweep.executors.executor import Work
 
@@ -23,7 +24,8 @@ class Requeued:
         self.work = work
 
     def __call__(self) -> str | None:
-        """Do the work."""
+        """Do the work, in the process that submitit started for it."""
+        collect_seldom()
         return self.work()
 
     def checkpoint(self) -> Any:
