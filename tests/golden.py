@@ -89,8 +89,7 @@ def network(model: MotionModel) -> Numbers:
     torch.manual_seed(7)
     model.train()
     past, new = clip[:, : model.length], clip[:, model.length : model.length + model.frames]
-    motion, _ = model.learn(new[..., :SPARSE_DIM], model.true_state(past), new)
-    terms = model.auxiliary_losses(new)
+    motion, _, terms = model.learn(new[..., :SPARSE_DIM], model.true_state(past), new)
     (motion.square().mean() + sum(terms.values(), torch.zeros(()))).backward()
     slopes = torch.cat([p.grad.flatten() for p in model.parameters() if p.grad is not None])
     found = summary("learned", motion) | summary("slopes", slopes)

@@ -14,7 +14,7 @@ from memmlp.motion.coordinates import World
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import State
-from memmlp.networks.motion_model import MotionModel
+from memmlp.networks.motion_model import Learned, MotionModel
 from memmlp.networks.refiner import SAGERefiner
 from memmlp.networks.vqvae import VQVAE
 from memmlp.training.loop import seed_step, train_step
@@ -68,8 +68,8 @@ class Line(MotionModel):
         inputs, kept = self.taken_in(sparse, state)
         return self.map(inputs[:, -(newest or self.frames) :]), kept
 
-    def auxiliary_losses(self, truth: Tensor) -> Terms:
-        return {"own": self.map.bias.square().sum()}
+    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
+        return Learned(*self.advance(sparse, state), {"own": self.map.bias.square().sum()})
 
 
 class Squares(Loss):

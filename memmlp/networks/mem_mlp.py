@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import Memory, State
-from memmlp.networks.motion_model import MotionModel
+from memmlp.networks.motion_model import Learned, MotionModel
 from memmlp.networks.predictor import Predictor
 
 
@@ -90,6 +90,7 @@ class MemMLP(MotionModel):
         kept |= self.memory.remember(motion, past, state, new)
         return self.normalizer.decode_motion(motion[:, -wanted:], origin[:, -wanted:]), kept
 
-    def auxiliary_losses(self, truth: Tensor) -> dict[str, Tensor]:
-        """Return the memory's own losses; only a VQ-VAE that is trained with the network has any."""
-        return self.memory.auxiliary_losses(truth, self.normalizer)
+    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
+        """Make a training call. A memory whose VQ-VAE trains with the network brings losses of its own."""
+        motion, kept = self.advance(sparse, state)
+        return Learned(motion, kept, self.memory.auxiliary_losses(truth, self.normalizer))

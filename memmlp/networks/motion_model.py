@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor, nn
 
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import State
+
+
+class Learned(NamedTuple):
+    """What a training call makes.
+
+    Attributes:
+        motion: (B, n, 198) in the world, that is to be the true one of the window's last n frames. A network
+            of members that each learn by themselves makes that of all, in turn: (members B, n, 198).
+        state: the new state.
+        losses: the network's own further losses, weighted, which are added to the motion's.
+    """
+
+    motion: Tensor
+    state: State
+    losses: dict[str, Tensor]
 
 
 class MotionModel(nn.Module):
@@ -114,23 +131,15 @@ class MotionModel(nn.Module):
         """Map the world inputs (N, 54) of a clip, N >= T, to its world motion (N, 198); see `joint`."""
         raise NotImplementedError
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
+    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
         """Make a training call; by default this is `advance`.
 
         Args:
             sparse: see `advance`.
             state: see `advance`.
             truth: world frames [X | Theta] (B, T, 252) of the window.
-
-        Returns:
-            Motion (B, n, 198) that is to be the true one, and the new state. A network of members that
-            each learn by themselves returns the motion of all, in turn: (members B, n, 198).
         """
-        return self.advance(sparse, state)
-
-    def auxiliary_losses(self, truth: Tensor) -> dict[str, Tensor]:
-        """Return the network's own further losses at true world frames (B, T, 252), added to the motion's."""
-        return {}
+        return Learned(*self.advance(sparse, state), {})
 
     def count_parameters(self) -> int:
         """Count the trainable parameters, which the tables call #Params.

@@ -14,6 +14,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.cells import CELLS, Cell
 from memmlp.networks.layers import in_float32
 from memmlp.networks.memory import State
+from memmlp.networks.motion_model import Learned
 from memmlp.networks.reaching import reached, tracked
 from memmlp.networks.windowless_model import WindowlessModel
 
@@ -245,11 +246,11 @@ class RecurrentPoser(WindowlessModel):
         made, kept = self.made(sparse, state, wanted)
         return self.posed(made.mean(0), sparse[:, sparse.shape[1] - wanted :]), kept
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
+    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
         """Make a training call; the motion is that of each member (members B, T, 198), in turn."""
         made, kept = self.made(sparse, state, sparse.shape[1])
         motion = self.output.learned(made, sparse.expand(len(made), -1, -1, -1), self.normalizer)
-        return motion.flatten(0, 1), kept
+        return Learned(motion.flatten(0, 1), kept, {})
 
     def step(self, sparse: Tensor, state: State) -> tuple[Tensor, State]:
         """Take in one frame of world inputs (B, 54), as `advance` does, in plain layers.

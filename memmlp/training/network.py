@@ -135,12 +135,11 @@ class MotionTask:
         """Compute the loss of one training call."""
         with record_function(SAMPLING):
             call = self.rollout.draw(self.model, self.dataset, self.sampler, step)
-        motion, state = self.learn(call.sparse, call.state, call.truth)
+        motion, state, own = self.learn(call.sparse, call.state, call.truth)
         self.rollout.keep(state)
         times = len(motion) // len(call.truth)  # each of a network's members may have learned them
         true = call.truth[:, -motion.shape[1] :].repeat(times, 1, 1)
         loss, terms = self.loss(motion, true[..., SPARSE_DIM:], true[..., :SPARSE_DIM], self.model.normalizer)
-        own = self.model.auxiliary_losses(call.truth)
         return StepResult(sum(own.values(), loss), terms | own, call.clips)
 
     def report(self) -> dict[str, float]:

@@ -52,7 +52,7 @@ def test_each_member_learns_by_itself_and_live_they_are_averaged():
     model = tiny.recurrent_poser(Heading(), members=2, output="global")
     truth = torch.stack([tiny.clip(7, seed) for seed in (1, 2)])
     sparse = truth[..., :SPARSE_DIM]
-    learned, after = model.learn(sparse, model.initial_state(2), truth)
+    learned, after, _ = model.learn(sparse, model.initial_state(2), truth)
     alone = tiny.recurrent_poser(Heading(), output="global")
     for index, name in enumerate(model.members):
         alone.members["member1"].load_state_dict(model.members[name].state_dict())

@@ -19,7 +19,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.diffusion import Diffusion
 from memmlp.networks.layers import MLPBlock
 from memmlp.networks.memory import State
-from memmlp.networks.motion_model import MotionModel
+from memmlp.networks.motion_model import Learned, MotionModel
 
 
 class WholeWindow(MotionModel):
@@ -174,7 +174,7 @@ class AGRoLDiffusion(WholeWindow):
         noise = self.noise.expand(len(encoded), -1, -1)
         return self.diffusion.sample(lambda noisy, time: self.denoise(noisy, time, encoded), noise)
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
+    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
         """Make a training call: add noise to the truth (B, T, 252), and denoise it in one call.
 
         Each window gets noise of a time that is drawn for it.
@@ -189,4 +189,4 @@ class AGRoLDiffusion(WholeWindow):
         encoded, clean = frames[..., :SPARSE_DIM], frames[..., SPARSE_DIM:][..., ROTATION]
         time = distributed.drawn(self.diffusion.random_times, truth)
         noisy = self.diffusion.noised(clean, time, distributed.drawn(torch.randn_like, clean))
-        return self.normalizer.posed(self.denoise(noisy, time, encoded), window), kept
+        return Learned(self.normalizer.posed(self.denoise(noisy, time, encoded), window), kept, {})

@@ -23,6 +23,8 @@ from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_m
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.agrol import WholeWindow
 from memmlp.networks.baselines.encoder import EncoderLayer
+from memmlp.networks.memory import State
+from memmlp.networks.motion_model import Learned
 
 JOINT_DIM = 18  # features of a joint: rotation, angular velocity, position, velocity
 UNSEEN = 0.01  # stands in all features of joints without a tracker
@@ -158,8 +160,16 @@ class AvatarJLM(WholeWindow):
             h = self.renewed(h, first)
         return self.regressor(h.flatten(-2).flatten(0, 1)).unflatten(0, encoded.shape[:2])
 
-    def auxiliary_losses(self, truth: Tensor) -> dict[str, Tensor]:
-        """Return the mean absolute error of the coarse pose's joints relative to the head, weighted."""
+    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
+        """Make a training call, whose coarse pose has a loss of its own; see MotionModel."""
+        return Learned(*self.advance(sparse, state), self.coarse_loss(truth))
+
+    def coarse_loss(self, truth: Tensor) -> dict[str, Tensor]:
+        """Return the mean absolute error of the coarse pose's joints relative to the head, weighted.
+
+        Args:
+            truth: world frames [X | Theta] (B, T, 252).
+        """
         sparse, motion = truth[..., :SPARSE_DIM], truth[..., SPARSE_DIM:]
         origin = self.normalizer.origin(sparse)
         encoded = self.normalizer.encode_sparse(sparse, origin)

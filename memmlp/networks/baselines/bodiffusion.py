@@ -18,6 +18,7 @@ from memmlp.networks.baselines.agrol import TimeEmbedding, WholeWindow
 from memmlp.networks.baselines.ancestral import AncestralDiffusion, Made
 from memmlp.networks.baselines.encoder import Attention
 from memmlp.networks.memory import State
+from memmlp.networks.motion_model import Learned
 
 SINES = 256  # of the diffusion time
 CHANNELS = SPARSE_DIM // len(TRACKED)  # of the inputs, of which each joint gets a mixture of thirds
@@ -105,7 +106,6 @@ class BoDiffusion(WholeWindow):
         super().__init__(normalizer, frames)
         self.noise_weight, self.bound_weight = noise, bound
         self.noise_seed, self.offline = noise_seed, offline
-        self._call: tuple[Tensor, Tensor, Tensor, Made] | None = None
         self.diffusion = AncestralDiffusion(diffusion_steps, sampling_steps)
         self.time = TimeEmbedding(width, SINES)
         self.spread = nn.Linear(len(TRACKED), N_JOINTS, bias=False)
@@ -192,11 +192,12 @@ class BoDiffusion(WholeWindow):
         rotation = self.diffusion.sample(step, self.drawn(count).to(self.noises))
         return self.normalizer.posed(rotation, sparse)
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
+    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
         """Make a training call: add noise to the truth (B, T, 252), and denoise it in one call.
 
         Each window gets noise of a time that is drawn for it. The motion is that of the rotations which the
-        predicted noise leaves, kept within their limits as in sampling.
+        predicted noise leaves, kept within their limits as in sampling; the losses are those of the noise and
+        of its variances.
 
         Args:
             sparse: world inputs (B, n, 54) of the newest frames.
@@ -210,14 +211,7 @@ class BoDiffusion(WholeWindow):
         noise = distributed.drawn(torch.randn_like, clean)
         noisy = self.diffusion.noised(clean, time, noise)
         made = self.denoise(noisy, time, encoded)
-        self._call = clean, noise, time, made
-        found = self.diffusion.clean(noisy, made.noise, time).clamp(*self.limits())
-        return self.normalizer.posed(found, window), kept
-
-    def auxiliary_losses(self, truth: Tensor) -> dict[str, Tensor]:
-        """Return the losses of the last training call's noise and variances, weighted."""
-        if self._call is None:
-            return {}
-        (clean, noise, time, made), self._call = self._call, None
         error, bound = self.diffusion.losses(clean, noise, time, made, self.limits())
-        return {"noise": self.noise_weight * error, "bound": self.bound_weight * bound}
+        found = self.diffusion.clean(noisy, made.noise, time).clamp(*self.limits())
+        losses = {"noise": self.noise_weight * error, "bound": self.bound_weight * bound}
+        return Learned(self.normalizer.posed(found, window), kept, losses)

@@ -26,6 +26,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.encoder import EncoderLayer
 from memmlp.networks.layers import in_float32
 from memmlp.networks.memory import State
+from memmlp.networks.motion_model import Learned
 from memmlp.networks.windowless_model import WindowlessModel
 
 HANDS, OTHERS = 2, 3  # tokens of hands in the head's frame, and of the sensors that there are none of
@@ -196,7 +197,6 @@ class HMDPoser(WindowlessModel):
         self.blocks = nn.ModuleList(Block(width, layers, heads, feedforward, dropout) for _ in range(depth))
         self.pose = self._head(ROTATION.stop)
         self.shape = self._head(SHAPE) if shape else None
-        self._shapes: Tensor | None = None
 
     def _head(self, size: int) -> nn.Module:
         return nn.Sequential(
@@ -242,15 +242,14 @@ class HMDPoser(WindowlessModel):
         wanted = sparse.shape[1] if newest is None else newest
         return self.normalizer.posed(self.pose(features[:, -wanted:]), sparse[:, -wanted:]), kept
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
+    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
         """Make a training call, which predicts the shape too; see MotionModel."""
         features, kept = self.features(sparse, state)
-        self._shapes = self.shape(features) if self.shape is not None else None
-        return self.normalizer.posed(self.pose(features), sparse), kept
+        return Learned(self.normalizer.posed(self.pose(features), sparse), kept, self._shape_loss(features))
 
-    def auxiliary_losses(self, truth: Tensor) -> dict[str, Tensor]:
-        """Return how much the shapes of the last training call differ within their windows, weighted."""
-        if self._shapes is None:
+    def _shape_loss(self, features: Tensor) -> dict[str, Tensor]:
+        """Return how much the shapes that features (B, T, d) give differ within their windows, weighted."""
+        if self.shape is None:
             return {}
-        shapes, self._shapes = self._shapes, None
+        shapes = self.shape(features)
         return {"shape": self.shape_weight * (shapes - shapes.mean(1, keepdim=True)).abs().mean()}

@@ -46,7 +46,7 @@ from memmlp.networks.baselines.limb_solver import (
     swivels,
 )
 from memmlp.networks.memory import State
-from memmlp.networks.motion_model import MotionModel
+from memmlp.networks.motion_model import Learned, MotionModel
 
 KEPT = (1, 2, 3, 6, 9, 12, 13, 14, 16, 17)
 """The joints whose local rotations are predicted, beside the root's: the trunk's, shoulders and hips."""
@@ -167,13 +167,12 @@ class Manikin(MotionModel):
 
     parts: float
     turned: bool
-    _call: tuple[Tensor, Tensor] | None = None
 
     def predicted(self, encoded: Tensor) -> Tensor:
         """Map windows (B, T, 54) in network space to outputs of their last n frames (B, n, 86 or more)."""
         raise NotImplementedError
 
-    def own_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
+    def losses_of_parts(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
         """Return the losses of the parts, weighted as by its authors, of outputs (B, n, 86 or more)."""
         raise NotImplementedError
 
@@ -181,7 +180,7 @@ class Manikin(MotionModel):
         """Map outputs (..., 86 or more) and their frames' inputs (..., 54) to rotations (..., 132)."""
         return Parts.of(made, self.normalizer).posed(encoded, self.normalizer)
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
+    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
         """Make a training call with each window turned by a heading of its own; see MotionModel."""
         inputs, kept = self.taken_in(sparse, state)
         heading, space = self.heading(truth), Heading()
@@ -189,25 +188,23 @@ class Manikin(MotionModel):
         encoded = self.normalizer.encode_sparse(window, self.normalizer.origin(window))
         made = self.predicted(encoded)
         count = made.shape[1]
-        self._call = made, torch.cat([window, space.motion_in(truth[..., SPARSE_DIM:], heading)], -1)
         rotation = self.posed(made, encoded[:, -count:])
-        return space.motion_out(self.normalizer.posed(rotation, window[:, -count:]), heading), kept
+        motion = space.motion_out(self.normalizer.posed(rotation, window[:, -count:]), heading)
+        true = torch.cat([window, space.motion_in(truth[..., SPARSE_DIM:], heading)], -1)
+        return Learned(motion, kept, self.losses(made, true))
 
     def heading(self, truth: Tensor) -> Tensor:
         """Draw a turn about the world's vertical axis for each window, as an origin (B, 1, 5) of Heading."""
         angle = self.turned * 2 * math.pi * distributed.drawn(torch.rand_like, truth[:, :1, :1])
         return torch.cat([torch.zeros_like(truth[:, :1, :3]), angle.cos(), angle.sin()], -1)
 
-    def auxiliary_losses(self, truth: Tensor) -> dict[str, Tensor]:
-        """Return the losses of the parts of the last training call, weighted."""
-        if self._call is None:
-            return super().auxiliary_losses(truth)
-        (made, frames), self._call = self._call, None
+    def losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:
+        """Return the weighted losses of outputs (B, n, 86 or more) at true world frames (B, T, 252)."""
         motion = self.normalizer.coordinates.motion_in(
-            frames[..., SPARSE_DIM:], self.normalizer.origin(frames[..., :SPARSE_DIM])
+            true[..., SPARSE_DIM:], self.normalizer.origin(true[..., :SPARSE_DIM])
         )
-        own = self.own_losses(made, Truth(motion[:, -made.shape[1] :]))
-        return {name: self.parts * term for name, term in own.items()} | super().auxiliary_losses(frames)
+        parts = self.losses_of_parts(made, Truth(motion[:, -made.shape[1] :]))
+        return {name: self.parts * term for name, term in parts.items()}
 
 
 class ManikinS(Manikin, AvatarPoser):
@@ -266,7 +263,7 @@ class ManikinS(Manikin, AvatarPoser):
         """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""
         return self.posed(self.predicted(encoded), encoded[:, -1:])[:, 0]
 
-    def own_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
+    def losses_of_parts(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
         """Return the losses of the parts, weighted as by its authors, of outputs (B, 1, 86).
 
         Swivels are counted from the predicted shoulders and hips; the losses of middles and of
@@ -352,7 +349,11 @@ class ManikinL(Manikin, AvatarJLM):
         """Map inputs (B, T, 54) to rotations (B, T, 132), both in network space."""
         return self.posed(self.predicted(encoded), encoded)
 
-    def own_losses(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
+    def losses(self, made: Tensor, true: Tensor) -> dict[str, Tensor]:
+        """Return the weighted losses of the parts and of the coarse pose; see Manikin."""
+        return super().losses(made, true) | self.coarse_loss(true)
+
+    def losses_of_parts(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
         """Return the losses of the parts, weighted as by its authors, of outputs (B, T, 212).
 
         Swivels are compared as angles, counted from the true shoulders and hips; toes with the head on its

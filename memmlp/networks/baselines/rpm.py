@@ -16,6 +16,7 @@ from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.encoder import Attention, EncoderLayer
 from memmlp.networks.memory import State
+from memmlp.networks.motion_model import Learned
 from memmlp.networks.windowless_model import WindowlessModel
 
 FRESH = 0.25  # of the training windows begin as a live stream does, without a past
@@ -149,7 +150,7 @@ class RPM(WindowlessModel):
         wanted = sparse.shape[1] if newest is None else newest
         return self.normalizer.posed(torch.cat(shown[-wanted:], 1), sparse[:, -wanted:]), state
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
+    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
         """Make a training call: a few frames of free running without gradient, and one step with it.
 
         How many is drawn for each call. The window's last W frames are those that are predicted.
@@ -168,7 +169,7 @@ class RPM(WindowlessModel):
             for index in range(begin, now):
                 _, state = self.rolled(encoded[:, index : index + 1], state)
         made, state = self.rolled(encoded[:, now : now + 1], state)
-        return self.normalizer.posed(made, sparse[:, now:]), state
+        return Learned(self.normalizer.posed(made, sparse[:, now:]), state, {})
 
     def begun(self, fresh: State, encoded: Tensor, truth: Tensor) -> State:
         """Return the state after true frames; a drawn share of the windows gets a fresh start instead.

@@ -13,6 +13,7 @@ from memmlp.networks.baselines.avatar_poser import OwnWindows
 from memmlp.networks.baselines.diffusion import Diffusion
 from memmlp.networks.baselines.sage import LATENT, Decoder, HalfVQVAE, LowerDenoiser, UpperDenoiser
 from memmlp.networks.memory import State
+from memmlp.networks.motion_model import Learned
 
 
 class SAGENet(OwnWindows):
@@ -94,6 +95,6 @@ class SAGENet(OwnWindows):
         upper = self.upper_latent(encoded)
         return self.decoder(upper, self.lower_latent(upper, encoded), encoded)[:, -1]
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
+    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
         """Make a training call through both samplers, of the newest frame alone; see MotionModel."""
-        return self.advance(sparse, state, 1)
+        return Learned(*self.advance(sparse, state, 1), {})

@@ -17,6 +17,7 @@ from memmlp.motion.body import MOTION_DIM, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import Dropout
 from memmlp.networks.memory import State
+from memmlp.networks.motion_model import Learned
 from memmlp.networks.windowless_model import WindowlessModel
 
 POSES = (SPARSE_ROTATION, SPARSE_POSITION)
@@ -116,7 +117,6 @@ class VAEHMD(WindowlessModel):
         self.encoder = Perceptron(TRACKERS, 2 * latent, width, depth, dropout)
         self.decoder = Perceptron(latent, ROTATION.stop, width, depth, dropout)
         self.pose_encoder = Perceptron(MOTION_DIM, 2 * latent, width, depth, dropout)
-        self._latent: Tensor | None = None
 
     def count_parameters(self) -> int:
         """Count the trainable parameters of the network in use, without the encoder of whole poses."""
@@ -135,8 +135,10 @@ class VAEHMD(WindowlessModel):
         seen = sparse if newest is None else sparse[:, -newest:]
         return self.normalizer.posed(self.decoder(self.latent(seen).chunk(2, -1)[0]), seen), state
 
-    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> tuple[Tensor, State]:
+    def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
         """Make a training call: each window is decoded either from its true poses or from its trackers.
+
+        The loss beside the motion's is the latents' KL divergence.
 
         Args:
             sparse: world inputs (B, T, 54).
@@ -145,15 +147,9 @@ class VAEHMD(WindowlessModel):
         """
         posed = (distributed.drawn(torch.rand_like, sparse[:, :1, :1]) < 0.5).to(sparse.dtype)
         of_pose = self.pose_encoder(self.normalizer.encode(truth)[..., SPARSE_DIM:])
-        self._latent = posed * of_pose + (1 - posed) * self.latent(sparse)
-        sample = drawn(self._latent)
+        latent = posed * of_pose + (1 - posed) * self.latent(sparse)
+        sample = drawn(latent)
         frozen = {name: weight.detach() for name, weight in self.decoder.named_parameters()}
         live, still = self.decoder(sample), functional_call(self.decoder, frozen, (sample,))
-        return self.normalizer.posed(posed * live + (1 - posed) * still, sparse), state
-
-    def auxiliary_losses(self, truth: Tensor) -> dict[str, Tensor]:
-        """Return the KL divergence of the last training call's latents, weighted."""
-        if self._latent is None:
-            return {}
-        latent, self._latent = self._latent, None
-        return {"divergence": self.divergence * divergence(latent)}
+        motion = self.normalizer.posed(posed * live + (1 - posed) * still, sparse)
+        return Learned(motion, state, {"divergence": self.divergence * divergence(latent)})

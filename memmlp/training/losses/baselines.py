@@ -90,7 +90,7 @@ class AvatarPoserLoss(Loss):
 
 
 class OwnLoss(Loss):
-    """No loss of the motion: what a network trains with is its own (`MotionModel.auxiliary_losses`)."""
+    """No loss of the motion: what a network trains with is its own (`Learned.losses`)."""
 
     def __init__(self) -> None:
         super().__init__()

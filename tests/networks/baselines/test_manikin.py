@@ -79,7 +79,7 @@ def test_manikin_s_losses_are_an_independent_computation():
     made = (
         outputs()[:, -1:] + 0.1 * torch.randn(2, 1, 86, generator=torch.Generator().manual_seed(1)).double()
     )
-    found = {name: float(term) for name, term in model.own_losses(made, Truth(MOTION[:, -1:])).items()}
+    found = {name: float(term) for name, term in model.losses_of_parts(made, Truth(MOTION[:, -1:])).items()}
     raw = made[:, 0].numpy()
     true = MOTION[:, -1, POSITION].unflatten(-1, (22, 3)).numpy()
     sixd = MOTION[:, -1, ROTATION].unflatten(-1, (22, 6)).numpy()
@@ -117,14 +117,14 @@ def test_manikin_l_losses_are_nothing_for_the_truth_and_count_angles_the_short_w
     auxiliary = MOTION[..., ROTATION][..., 6:]
     made = torch.cat([outputs(), auxiliary], -1)
     true = Truth(MOTION)
-    assert all(float(term) < 1e-5 for term in model.own_losses(made, true).values())
+    assert all(float(term) < 1e-5 for term in model.losses_of_parts(made, true).values())
     turned = made.clone()
     swivel = made[..., 66:74].unflatten(-1, (2, 4))
     angle = torch.atan2(swivel[..., 1, :], swivel[..., 0, :]) + 0.3
     turned[..., 66:74] = 2 * torch.stack([angle.cos(), angle.sin()], -2).flatten(-2)
     turned[..., 74:77] += 0.1
     turned[..., 86:] += 0.05
-    found = {name: float(term) for name, term in model.own_losses(turned, true).items()}
+    found = {name: float(term) for name, term in model.losses_of_parts(turned, true).items()}
     expected = {"trunk_rotation": 0, "swivel": 0.03, "ankle": 0.25, "toe": 0.25, "auxiliary": 0.1}
     assert found == pytest.approx(expected, abs=1e-5)
 
@@ -137,7 +137,7 @@ def test_training_is_on_windows_turned_by_any_heading_and_the_motion_is_turned_b
     monkeypatch.setattr(torch, "rand_like", lambda like: torch.tensor([[[0.1]], [[0.7]]]).double())
     state = model.initial_state(2)
     expected = model.advance(SPARSE, state)[0]
-    motion, _ = model.learn(SPARSE, state, TRUTH)
+    motion, *_ = model.learn(SPARSE, state, TRUTH)
     torch.testing.assert_close(motion, expected[:, -motion.shape[1] :], atol=1e-6, rtol=0)
     world = tiny.baseline(name, World()).double()
     world.normalizer = Normalizer.raw(World(), tiny.REST).double()
@@ -160,10 +160,8 @@ def test_the_losses_of_the_parts_have_a_weight(name):
     found = []
     for weight in (1.0, 0.5):
         model = tiny.baseline(name, parts=weight, turned=False)
-        model.learn(SPARSE.float(), model.initial_state(2), TRUTH.float())
-        found.append(
-            {key: float(term.detach()) for key, term in model.auxiliary_losses(TRUTH.float()).items()}
-        )
+        losses = model.learn(SPARSE.float(), model.initial_state(2), TRUTH.float()).losses
+        found.append({key: float(term.detach()) for key, term in losses.items()})
     parts = found[0].keys() - {"coarse"}
     assert len(parts) == {"manikin_s": 6, "manikin_l": 5}[name]
     assert {key: found[1][key] for key in parts} == pytest.approx(
