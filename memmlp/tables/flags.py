@@ -49,6 +49,8 @@ def flags(
     yield from _unequal_clips(sweep, runs)
     yield from _unequal_groups(every)
     yield from _no_numbers(sweep, runs)
+    if "Jitter" in sweep.metrics:
+        yield from _calmer_than_truth(sweep, runs)
     for attribute, what in ORIGIN.items():
         yield from _differing(what, [(getattr(run.origin, attribute), label) for label, run in every])
     yield from _seen(sweep, runs)
@@ -176,6 +178,25 @@ def _lacking(run: Measured, mode: str, branch: str, metric: str) -> set[str]:
     names = list(run.clips)
     known = np.isfinite(run.by_clip(names, mode, branch, metric))
     return {name for name, there in zip(names, known, strict=True) if not there}
+
+
+def _calmer_than_truth(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+    """Flag arms whose motion is calmer than the true one, as it is where a network hardly follows at all."""
+    calmer: dict[str, list[str]] = defaultdict(list)
+    truths: dict[str, float] = {}
+    for arm in sweep.runnable():
+        found = list(runs[arm.label].values())
+        for mode in sorted({mode for run in found for mode in run.means}):
+            made, true = (
+                [value for run in found if (value := run.value(mode, arm.branch, metric)) is not None]
+                for metric in ("Jitter", "GT Jitter")
+            )
+            if made and true and np.mean(made) < np.mean(true):
+                truths[mode] = float(np.mean(true))
+                calmer[mode].append(f"'{arm.label}' {np.mean(made):.2f}")
+    for mode, arms in calmer.items():
+        less = f"Jitter below the truth's {truths[mode]:.2f} ({mode}): {_listed(arms)}"
+        yield f"{less}; calmer than the motion itself is no better"
 
 
 def _differing(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:

@@ -104,6 +104,23 @@ def test_a_network_that_diverged_on_a_clip_is_said(sweep: Sweep, tmp_path: Path,
     assert [flag for flag in table.flags if "no numbers" in flag] == [line]
 
 
+def test_motion_calmer_than_the_true_one_is_said(sweep: Sweep, tmp_path: Path):
+    """Where a network hardly follows, the best Jitter of a table is its own."""
+    find = fake_sweep(tmp_path, sweep)
+    assert not any("calmer" in flag for flag in table_of(sweep, find).flags)  # nothing is known of the truth
+    for arm in sweep.runnable():
+        for seed in sweep.seeds:
+            path = find(arm, seed).evaluation("stream-0")
+            report = json.loads(path.read_text())
+            of_branch = report["mean"][arm.branch]
+            of_branch["GT Jitter"] = 6.0
+            of_branch["Jitter"] = 7.0 if arm.label != "no | memory" else 5.0 + seed / 2
+            write_report(path, {key: report[key] for key in ("mode", "mean", "clips")})
+    line = "Jitter below the truth's 6.00 (stream): 'no | memory' 5.50"
+    line += "; calmer than the motion itself is no better"
+    assert [flag for flag in table_of(sweep, find).flags if "calmer" in flag] == [line]
+
+
 def test_groups_that_differ_between_runs_are_said(sweep: Sweep, tmp_path: Path):
     find = fake_sweep(tmp_path, sweep, groups={clip: f"take {i // 2}" for i, clip in enumerate(CLIPS)})
     assert not any("data.split.groups" in flag for flag in table_of(sweep, find).flags)
