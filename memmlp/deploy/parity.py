@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from memmlp.common.progress import progress_bar
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.motion.body import ROTATION, SPARSE_DIM
+from memmlp.motion.threads import one_thread
 from memmlp.networks.memory import Blend
 from memmlp.networks.motion_model import MotionModel
 
@@ -58,9 +59,12 @@ def parity(model: MotionModel, path: Path, clip: Tensor) -> float:
 
 @torch.no_grad()
 def in_torch(model: MotionModel, clip: Tensor) -> Tensor:
-    """Return the world motion (N, 198) that the network streams of a clip's inputs (N, 252 or 54)."""
+    """Return the world motion (N, 198) that the network streams of a clip's inputs (N, 252 or 54).
+
+    By one thread: a frame is little work, which several do more slowly, by far where the machine is busy.
+    """
     state, made = model.initial_state(1), []
-    with deterministic(model):
+    with deterministic(model), one_thread():
         for sparse in progress_bar(clip[:, None, None, :SPARSE_DIM], "check"):
             motion, state = model.advance(sparse, state)
             made.append(motion[0, -1])

@@ -24,8 +24,8 @@ COLOURS = {
     "trained": "yellow",
 }  # fmt: skip
 WORDS = {
-    "new": "waiting", "trained": "trained, to be evaluated or exported", "stopped": "waiting, begun",
-    "lost": "lost, to be taken over",
+    "new": "waiting", "trained": "trained, the rest to do: an evaluation or the export",
+    "stopped": "waiting, begun", "lost": "lost, to be taken over",
 }  # fmt: skip
 
 
@@ -114,6 +114,8 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
     below = [_upstream(plan, task, states[task.key]) for task in plan.tasks if task.kind != NETWORK]
     running = [plan.run_of(task) for task in plan.tasks if states[task.key] == "running"]
     below += [Text(_counts(states)), *map(Text, devices(running))]
+    if any(states[task.key] == "done" and result(plan.run_of(task)) for task in plan.tasks):
+        below.append(Text("cm: MPJPE in stream mode of the rotation branch; a table may show another"))
     below += [
         Text(f"{name(plan, task)}: {plan.run_of(task).failure}", style="red")
         for task in plan.tasks

@@ -118,6 +118,7 @@ def test_a_file_of_ones_own_is_not_the_shipped_one(memmlp: Memmlp, planned: None
         (["save", "10"], ("no finished run", "memmlp sweep table10")),
         (["save", "14", "optim.lr=1"], ("table14.json", "memmlp sweep table14 optim.lr=1", "--name")),
         (["save", "14", "--out", "/proc/no"], ("/proc/no",)),
+        (["docs", "--folder", "elsewhere"], ("elsewhere", "no folder data", "--out elsewhere/data")),
     ],
 )
 def test_bad_input_is_one_line(memmlp: Memmlp, planned: None, arguments: list[str], words: tuple[str, ...]):

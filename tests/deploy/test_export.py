@@ -51,6 +51,17 @@ def test_an_export_says_nothing_of_its_own_passes(tmp_path, caplog):
     assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 
 
+def test_parity_takes_one_thread_and_gives_the_others_back():
+    """Several wait for one another at every frame where the machine is busy."""
+    model, seen = tiny.model(), []
+    advance = model.advance
+    model.advance = lambda *given: (seen.append(torch.get_num_threads()), advance(*given))[1]
+    torch.set_num_threads(2)
+    in_torch(model, CLIP[:3])
+    assert seen == [1, 1, 1]
+    assert torch.get_num_threads() == 2
+
+
 def test_parity_sees_a_difference(exported):
     model, path = exported
     with torch.no_grad():

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from memmlp.runs.run import Run
 from memmlp.sweep.board import device_name, progress_text, render
 from memmlp.sweep.plan import Entry, Plan, RunTask
 
@@ -30,6 +31,19 @@ def test_running_runs_are_counted_by_device(plan: Plan, capsys: pytest.CaptureFi
     assert "running on GPU 1 (A card): 2, cpu: 1" in capsys.readouterr().out
     Console(width=200).print(render(plan, dict.fromkeys(states, "done")))
     assert "running on" not in capsys.readouterr().out
+
+
+def test_what_a_finished_cell_shows_is_said_below(
+    plan: Plan, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    states = dict.fromkeys([task.key for task in plan.tasks], "done")
+    Console(width=200).print(render(plan, states))
+    assert "MPJPE" not in capsys.readouterr().out
+    monkeypatch.setattr(Run, "results", {"stream": {"rotation": {"MPJPE": 4.321}}})
+    Console(width=200).print(render(plan, states))
+    said = capsys.readouterr().out
+    assert "done 4.32 cm" in said
+    assert "cm: MPJPE in stream mode of the rotation branch" in said
 
 
 def test_a_run_whose_training_is_over_shows_its_stage(plan: Plan):

@@ -46,8 +46,8 @@ def diff(a: str, b: str, outputs: Path) -> None:
             click.echo(f"{title}: no difference")
             continue
         table = plain_table(title, first.id, second.id, *(["B - A", "unit"] if title == "results" else []))
-        for column in table.columns if title == "results" else table.columns[:1]:
-            column.no_wrap = True  # a number in two lines is none
+        for column in table.columns[1:] if title == "results" else table.columns[:1]:
+            column.no_wrap = True  # a number in two lines is none, and half of one is another
         for row in rows:
             table.add_row(*row)
         console().print(table)
