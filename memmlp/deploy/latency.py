@@ -32,12 +32,14 @@ def measure_step(path: Path, steps: int = 200) -> dict[str, Any]:
     """Time one step of an exported file on one thread: median and 95th percentile, in milliseconds.
 
     The step and the yardstick are timed in turn, step by step, in the same minute, so that their ratio
-    compares machines. At least 200 steps are timed, however few are asked for.
+    compares machines. At least 200 steps are timed, however few are asked for. `core_share` is how much of
+    that time the thread had a core: where that is far less than 1, other work is in all of these times.
     """
     stream, yardstick = OnnxStream(path), yardstick_session()
     sparse = np.zeros((1, SPARSE_DIM), np.float32)
     rows = {"input": np.ones(YARDSTICK_SHAPE[:2], np.float32)}
     ours, theirs = [], []
+    begun, busy = time.perf_counter(), time.thread_time()
     for step in range(WARM_UP + max(steps, 200)):
         start = time.perf_counter()
         stream.step(sparse)
@@ -50,6 +52,7 @@ def measure_step(path: Path, steps: int = 200) -> dict[str, Any]:
         **_milliseconds("", ours),
         **_milliseconds("yardstick_", theirs),
         "ratio_to_yardstick": float(np.median(ours) / np.median(theirs)),
+        "core_share": (time.thread_time() - busy) / (time.perf_counter() - begun),
         "steps": len(ours),
         "threads": 1,
     }

@@ -14,6 +14,9 @@ from memmlp.tables.measured_run import Measured
 
 Say = Callable[[Arm, int], str | None]
 BUILT_IN = "builtin"
+TIMES = {"ms", "network ms", "pose ms", "ratio", "FPS"}
+CORE = 0.9  # how much of a measurement the thread has to have a core for its times to be the network's
+STEADY = 1.25  # how many times the ratio of one seed that of another may be: it does not depend on the seed
 ALIKE = 1.1  # how many times the frames of its control an arm may see in training before a flag says so
 SMPLH = (1, 2, 3)  # the paper's tables on AMASS, on the rest joints of SMPL-H bodies
 ORIGIN = {
@@ -53,6 +56,8 @@ def flags(
         yield from _calmer_than_truth(sweep, runs)
     for attribute, what in ORIGIN.items():
         yield from _differing(what, [(getattr(run.origin, attribute), label) for label, run in every])
+    if TIMES & set(sweep.metrics):
+        yield from _busy(sweep, runs)
     yield from _seen(sweep, runs)
     yield from _partial(every)
     yield from _recipes(every)
@@ -225,6 +230,21 @@ def _seen(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
                 unequal.append(f"'{arm.label}' {own / 1e6:.3g} M to '{other.label}' {controls / 1e6:.3g} M")
     if unequal:
         yield f"number of frames seen in training differs: {_listed(unequal)}"
+
+
+def _busy(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+    """Flag arms that were timed beside other work, which shows in their times."""
+    found = []
+    for arm in sweep.runnable():
+        costs = [run.costs for run in runs[arm.label].values()]
+        shares = [cost["core share"] for cost in costs if "core share" in cost]
+        ratios = [cost["ratio"] for cost in costs if "ratio" in cost]
+        if shares and min(shares) < CORE:
+            found.append(f"'{arm.label}' (had a core for {100 * min(shares):.0f} % of the time)")
+        elif ratios and max(ratios) > STEADY * min(ratios):
+            found.append(f"'{arm.label}' (ratio {min(ratios):.3g} to {max(ratios):.3g} over seeds)")
+    if found:
+        yield f"timed on a busy machine, so that other work is in the times: {_listed(found)}"
 
 
 def _partial(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:

@@ -73,7 +73,8 @@ class Measured:
         clips: the metrics of each clip, by its name.
         groups: the group (take, subject) of each clip; a clip that is not named is a group of its own.
         costs: GFLOP, GMAC and ms of a streaming step, its time over the yardstick's in the same minute,
-            millions of parameters, MB of the ONNX file, and frames a second.
+            millions of parameters, MB of the ONNX file, frames a second, and how much of the time that was
+            measured the thread had a core.
         origin: what the run was made from.
         latency: everything that was measured of its streaming step.
         sources: the source of each clip, where the data has several.
@@ -246,6 +247,7 @@ def _costs(latency: Mapping[str, float]) -> dict[str, float]:
         "pose ms": of("pose_median_ms"),
         "ratio": of("ratio_to_yardstick"),
         "FPS": 1000 / of("median_ms"),
+        "core share": of("core_share"),
     }
     return {name: float(cost) for name, cost in costs.items() if not np.isnan(cost)}
 

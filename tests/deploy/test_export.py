@@ -118,9 +118,16 @@ def test_latency_and_size(exported):
     assert measured["steps"] == 200
     assert 0 < measured["median_ms"] <= measured["p95_ms"]
     assert measured["ratio_to_yardstick"] > 0
+    assert 0 < measured["core_share"] < 1.01
     size = latency.size(model, model, path)
     assert size["flops"] == 2 * size["macs"] > 0
     assert size["onnx_bytes"] == path.stat().st_size
+
+
+def test_a_thread_without_a_core_is_seen(exported, monkeypatch):
+    clock = iter([5.0, 5.0 + 1e-9])
+    monkeypatch.setattr(latency.time, "thread_time", lambda: next(clock))
+    assert latency.measure_step(exported[1], steps=1)["core_share"] < 1e-6
 
 
 def test_macs_are_counted_by_hand():

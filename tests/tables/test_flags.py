@@ -121,6 +121,27 @@ def test_motion_calmer_than_the_true_one_is_said(sweep: Sweep, tmp_path: Path):
     assert [flag for flag in table_of(sweep, find).flags if "calmer" in flag] == [line]
 
 
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"ratio_to_yardstick": 0.8}, "(ratio 0.6 to 0.8 over seeds)"),
+        ({"core_share": 0.52}, "(had a core for 52 % of the time)"),
+        ({"ratio_to_yardstick": 0.7, "core_share": 0.97}, None),
+    ],
+)
+def test_times_of_a_busy_machine_are_said(
+    sweep: Sweep, tmp_path: Path, changed: dict[str, float], said: str | None
+):
+    """The ratio to a network timed in the same minute suffers, too: a long step is interrupted more often."""
+    find = fake_sweep(tmp_path, sweep)
+    path = find(sweep.arms[1], 1).deployment("fp32-0").latency
+    path.write_text(json.dumps(json.loads(path.read_text()) | changed))
+    found = [flag for flag in table_of(sweep, find).flags if "busy" in flag]
+    line = f"timed on a busy machine, so that other work is in the times: 'no | memory' {said}"
+    assert found == ([line] if said else [])
+    assert not [flag for flag in table_of(replace(sweep, metrics=("MPJPE",)), find).flags if "busy" in flag]
+
+
 def test_groups_that_differ_between_runs_are_said(sweep: Sweep, tmp_path: Path):
     find = fake_sweep(tmp_path, sweep, groups={clip: f"take {i // 2}" for i, clip in enumerate(CLIPS)})
     assert not any("data.split.groups" in flag for flag in table_of(sweep, find).flags)
