@@ -160,9 +160,11 @@ def show_forecast(chosen: Sweep, plan: Plan, workers: int) -> None:
     besides = ", and the VQ-VAEs that they need" if later else ""
     line = f"{len(left) + later} of {len(plan.tasks) + later} runs to do{besides}, {workers} at once"
     if not later and (found := forecast(plan)):
-        line += f": about {found.seconds / workers / 60:.0f} min, by {found.finished} finished runs of it"
+        line += (
+            f": about {found.seconds / workers / 60:.0f} min, judged by its {found.finished} finished runs"
+        )
         if found.unlike:
-            line += f" ({found.unlike} are of arms that have none, and are judged by the others)"
+            line += f" ({found.unlike} runs are of arms without one; other arms' times stand for theirs)"
     click.echo(line)
 
 

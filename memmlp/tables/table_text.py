@@ -174,7 +174,10 @@ def _power(table: Table) -> list[str]:
         seen = [(table.detectable(mode, metric), mode) for mode in table.modes]
         words = [f"{number_words(least)} ({mode})" for least, mode in seen if least is not None]
         if words:
-            lines.append(f"{metric}: could have seen {' or '.join(words)} {unit(metric)} with 80 % power")
+            what = f"{' or '.join(words)} {unit(metric)}"
+            lines.append(
+                f"{metric}: in every arm {what} would have been found, with 80 % power"
+            )
     return lines
 
 
