@@ -175,9 +175,7 @@ def _power(table: Table) -> list[str]:
         words = [f"{number_words(least)} ({mode})" for least, mode in seen if least is not None]
         if words:
             what = f"{' or '.join(words)} {unit(metric)}"
-            lines.append(
-                f"{metric}: in every arm {what} would have been found, with 80 % power"
-            )
+            lines.append(f"{metric}: in every arm {what} would have been found, with 80 % power")
     return lines
 
 
