@@ -120,11 +120,11 @@ def sources(folder: Path) -> dict[str, KeptTable]:
     from memmlp.report.markdown import KeptTable
     from memmlp.tables.build_table import titled
 
-    found = {}
     if not (folder / "data").is_dir():
         raise InputError(
             f"{folder}: has no folder data, into which memmlp results save --out {folder}/data writes"
         )
+    found = {}
     for path in sorted((folder / "data").glob("*.json")):
         kept = load_kept(path)
         # Verdicts of rounds are those of all clips together, and of no source alone.
