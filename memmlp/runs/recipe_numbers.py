@@ -30,7 +30,7 @@ RECIPES: dict[str, int] = {
     "model.avatar_jlm": 1,
     "model.recurrent_poser": 3,
     "model.sage": 1,
-    "model.manikin_s": 1,
+    "model.manikin_s": 2,
     "model.manikin_l": 1,
     "memory.vq": 1,
     "memory.vq_joint": 1,

@@ -266,13 +266,14 @@ class ManikinS(Manikin, AvatarPoser):
     def losses_of_parts(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
         """Return the losses of the parts, weighted as by its authors, of outputs (B, 1, 86).
 
-        Swivels are counted from the predicted shoulders and hips; the losses of middles and of
-        swivels are sums over the limbs.
+        Swivels are counted from the predicted shoulders and hips, which learn nothing by that: where a limb is
+        nearly along the axis that it is counted from, as a standing leg is, that gradient has no bound, and
+        trainings fell apart. The losses of middles and of swivels are sums over the limbs.
         """
         parts = Parts.of(made, self.normalizer)
         _, turned, joints = parts.body(self.normalizer.rest)
         base, middle, end = true.limbs()
-        up, angle = turned[..., list(BASES), :, 1], F.normalize(parts.swivel, dim=-1)
+        up, angle = turned[..., list(BASES), :, 1].detach(), F.normalize(parts.swivel, dim=-1)
         lengths = [(one - other).norm(dim=-1, keepdim=True) for one, other in ((base, middle), (middle, end))]
         rooted = (true.joints - true.joints[..., ROOT : ROOT + 1, :])[..., PLACED, :]
         limbs = len(BASES)

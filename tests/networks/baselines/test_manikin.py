@@ -9,7 +9,7 @@ from plain_body import posed
 from memmlp.common.errors import InputError
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
-from memmlp.motion.body import PARENTS, POSITION, ROTATION, SPARSE_DIM
+from memmlp.motion.body import N_JOINTS, PARENTS, POSITION, ROTATION, SPARSE_DIM
 from memmlp.motion.coordinates import Heading, World
 from memmlp.motion.geometry import forward_kinematics, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
@@ -109,6 +109,27 @@ def test_manikin_s_losses_are_an_independent_computation():
         "middle": middle, "ankle": 5 * np.mean(ankles), "toe": 0.3 * np.mean(toes),
     }  # fmt: skip
     assert found == pytest.approx(expected, rel=1e-3)
+
+
+def test_manikin_s_standing_legs_teach_without_bound_nothing():
+    """The axis that a swivel is counted from is nearly along a standing leg: nothing is learned through it."""
+    model = tiny.baseline("manikin_s", World())
+    made = model.predicted(torch.zeros(1, model.frames, SPARSE_DIM)).detach()
+    mean, std = (
+        part[SPARSE_DIM:][ROTATION].unflatten(0, (N_JOINTS, 6))[[0, *KEPT]].flatten()
+        for part in (model.normalizer.mean, model.normalizer.std)
+    )
+    made[..., : len(mean)] = (torch.tensor([1.0, 0, 0, 0, 1, 0]).repeat(1 + len(KEPT)) - mean) / std
+    made.requires_grad_()
+    joints = model.normalizer.rest.new_zeros(1, 1, N_JOINTS, 3)
+    for base, middle, end in zip(BASES, MIDDLES, ENDS, strict=True):
+        joints[..., middle, :] = torch.tensor([0.01, -0.4, 0.02])
+        joints[..., end, :] = torch.tensor([1e-3, -0.8, 5e-4])
+        joints[..., base, :] = 0
+    sixd = torch.tensor([1.0, 0, 0, 0, 1, 0]).repeat(N_JOINTS)
+    motion = torch.cat([sixd.expand(1, 1, -1), joints.flatten(-2)], -1)
+    sum(model.losses_of_parts(made, Truth(motion)).values()).backward()
+    assert made.grad.abs().max() < 10
 
 
 def test_manikin_l_losses_are_nothing_for_the_truth_and_count_angles_the_short_way():
