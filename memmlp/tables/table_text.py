@@ -171,12 +171,23 @@ def _power(table: Table) -> list[str]:
     """Say what this table could have seen, a line for each metric."""
     lines = []
     for metric in table.measured_metrics:
-        seen = [(table.detectable(mode, metric), mode) for mode in table.modes]
-        words = [f"{number_words(least)} ({mode})" for least, mode in seen if least is not None]
+        seen = {mode: least for mode in table.modes if (least := table.detectable(mode, metric)) is not None}
+        words = [
+            f"{number_words(least)} ({mode})"
+            for mode, least in seen.items()
+            if least <= _largest(table, mode, metric)
+        ]
         if words:
             what = f"{' or '.join(words)} {unit(metric)}"
             lines.append(f"{metric}: in every arm {what} would have been found, with 80 % power")
+        elif seen:
+            lines.append(f"{metric}: too few seeds to have found even a difference as large as the values")
     return lines
+
+
+def _largest(table: Table, mode: str, metric: str) -> float:
+    """Return the largest mean of a metric among the arms that are compared."""
+    return max(cell.mean or 0.0 for _, name, cell, _ in table.effects(mode) if name == metric)
 
 
 def _agreement(table: Table) -> str:

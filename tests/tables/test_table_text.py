@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from fake_runs import fake_sweep, table_of
 from fake_table import SHIPPED, printed
 
 from memmlp.sweep.parsing import load_sweep
+from memmlp.tables.table import Table
 from memmlp.tables.table_text import heading
 
 
@@ -23,3 +25,12 @@ def test_costs_show_how_many_times_the_controls_they_are(tmp_path: Path):
 
 def test_heads_tell_unit_and_direction():
     assert [heading(name) for name in ("Jitter", "ms", "FPS")] == ["Jitter [10² m/s³] ↓", "ms ↓", "FPS ↑"]
+
+
+def test_a_power_beyond_the_values_themselves_is_no_number(table: Table, monkeypatch: pytest.MonkeyPatch):
+    """With two seeds that differ, MPJREs of 901 degrees would have been found."""
+    assert "too few seeds" not in printed(table, 100)
+    monkeypatch.setattr(Table, "detectable", lambda *_: 901.0)
+    said = " ".join(printed(table, 100).split())
+    assert "901" not in said
+    assert "MPJRE: too few seeds to have found even a difference as large as the values" in said

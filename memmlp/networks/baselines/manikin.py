@@ -266,8 +266,8 @@ class ManikinS(Manikin, AvatarPoser):
     def losses_of_parts(self, made: Tensor, true: Truth) -> dict[str, Tensor]:
         """Return the losses of the parts, weighted as by its authors, of outputs (B, 1, 86).
 
-        Swivels are counted from the predicted shoulders and hips, which learn nothing by that: where a limb is
-        nearly along the axis that it is counted from, as a standing leg is, that gradient has no bound, and
+        Swivels are counted from the predicted shoulders and hips, which learn nothing by that: the gradient
+        has no bound where a limb is nearly along the axis that it is counted from, as a standing leg is, and
         trainings fell apart. The losses of middles and of swivels are sums over the limbs.
         """
         parts = Parts.of(made, self.normalizer)
