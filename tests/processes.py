@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from forked_workers import address, fork_workers
+
 T = TypeVar("T")
 
 MARK = "MEMMLP_TESTS"
@@ -81,7 +83,7 @@ def started(line: Sequence[str], **options: Any) -> Iterator[subprocess.Popen]:
 
 PRELOADED = [
     "memmlp.config.build", "memmlp.pipeline.run_stages", "memmlp.deploy.export", "memmlp.motion.synthetic",
-    "memmlp.render.figure", "torch.onnx", "torch._dynamo",
+    "memmlp.render.figure", "torch.onnx", "torch._dynamo", "submitit.local.local",
 ]  # fmt: skip
 """What a training imports, its optimiser, its export and its picture included."""
 
@@ -98,7 +100,7 @@ class Forked:
     ):
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload(PRELOADED)
-        self._process = context.Process(target=_saying, args=(said, environment, work, arguments))
+        self._process = context.Process(target=_saying, args=(address(), said, environment, work, arguments))
         self._process.start()
 
     @property
@@ -126,8 +128,9 @@ class Forked:
 
 
 def _saying(
-    said: str, environment: dict[str, str], work: Callable[..., object], arguments: Sequence[Any]
+    server: str, said: str, environment: dict[str, str], work: Callable[..., object], arguments: Sequence[Any]
 ) -> None:
+    fork_workers(server)
     os.environ.update(environment)
     file = os.open(said, os.O_WRONLY | os.O_APPEND)
     for stream in (1, 2):
