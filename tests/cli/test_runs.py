@@ -201,7 +201,9 @@ def test_list_shows_what_differs_as_far_as_there_is_room(
     assert heads(seen["70"]) == {"run", "status", "name", "seed", "memory.", "layers", "MPJPE", "stream"}
     assert "too:" not in seen["70"]
     assert heads(seen["120"]) == heads(seen["70"]) | {"window", "Jitter", "age", "ms"}
-    assert "MPJPE [cm]" in seen["120"]
+    for said in ("MPJPE [cm]", "Jitter [", "ms: a frame"):  # a legend of the columns that are shown
+        assert said in seen["120"]
+        assert (said in seen["70"]) == (said == "MPJPE [cm]")
 
 
 def test_no_word_of_the_columns_that_were_asked_for_is_broken(memmlp: Memmlp, outputs: Path):

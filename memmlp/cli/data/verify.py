@@ -9,7 +9,6 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from memmlp.cli.data.texts import MOST_NAMED
 from memmlp.cli.options import PATH
 
 
@@ -43,10 +42,11 @@ def verify(source: Path, skeleton: str | None, body: str, every: bool) -> None:
         worst = max(worst[0], row.mm.value), max(worst[1], row.degrees.value)
         sound += not row.faults
         bad += [f"{row.name}: {fault}" for fault in row.faults]
-        if every or row.faults or sound + len(bad) <= MOST_NAMED:
+        if every or row.faults:
             numbers = (str(row.frames), f"{row.mm.value:.4f}", f"{row.degrees.value:.4f}")
             table.add_row(row.name, row.skeleton, *numbers, f"{row.mm}\n{row.degrees}")
-    Console(highlight=False).print(table)
+    if table.row_count:
+        Console(highlight=False).print(table)
     for line in bad:
         click.echo(line)
     click.echo(f"{sound} files without a fault; worst {worst[0]:.4f} mm, {worst[1]:.4f} degrees")

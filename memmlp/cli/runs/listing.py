@@ -30,7 +30,12 @@ SHOWN = {
     "Jitter": "stream.rotation.Jitter",
     "ms": "latency.median_ms",
 }
-LEGEND = f"MPJPE [{UNITS['MPJPE']}], Jitter [{UNITS['Jitter']}]: rotation branch. ms: a frame on one core."
+LEGEND = {
+    # the beginning of a column's head -> what its numbers are
+    "MPJPE": f"MPJPE [{UNITS['MPJPE']}]: rotation branch",
+    "Jitter": f"Jitter [{UNITS['Jitter']}]: rotation branch",
+    "ms": "ms: a frame on one core",
+}
 SPARED = ("ms", "age", "Jitter", "MPJPE\nwindow")  # what a narrow screen has no room for, first
 FOLD = 12  # characters of a value in a line, where it can be broken
 NAME = 36  # characters of a run's name in a line
@@ -176,12 +181,18 @@ def _lines(columns: Sequence[Column]) -> Table:
     table = plain_table()
     table.padding, table.show_edge = (0, 0), False
     table.caption_justify, table.caption_style = "left", ""
-    table.caption = LEGEND if any(column.number for column in columns) else None
+    table.caption = _legend([column.name for column in columns if column.number])
     for column in columns:
         table.add_column(_folded(column.name), justify="right" if column.number else "left", no_wrap=True)
     for cells in zip(*(column.cells for column in columns), strict=True):
         table.add_row(*cells)
     return table
+
+
+def _legend(names: Sequence[str]) -> str | None:
+    """Return what the numbers of some columns are, None where there is none."""
+    words = [said for head, said in LEGEND.items() if any(name.startswith(head) for name in names)]
+    return "; ".join(words) or None
 
 
 def _width(columns: Sequence[Column]) -> int:
