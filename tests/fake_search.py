@@ -31,7 +31,7 @@ def search(**changes: Any) -> Search:
 
 
 def open_study(folder: Path, **changes: Any) -> Study:
-    return Study.own(search(**changes), "mine", folder)
+    return Study.opened(search(**changes), "mine", folder)
 
 
 def compose(values: Mapping[str, Value], seeds: int = 1) -> list[list[RunTask]]:

@@ -58,7 +58,7 @@ def tune(
         if not mine:
             raise InputError(f"search {setup.folder.name}: another process is at it; --status shows it")
         write_json(setup.folder / "search.json", asdict(setup.search))
-        study = Study.own(setup.search, setup.folder.name, setup.folder)
+        study = Study.opened(setup.search, setup.folder.name, setup.folder)
         search(setup, study, workers)
         leave(setup, study)
     summary(setup, study)

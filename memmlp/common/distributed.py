@@ -95,7 +95,7 @@ def shared() -> bool:
     return _Step.shared
 
 
-def own(batch: Tensor) -> Tensor:
+def own_rows(batch: Tensor) -> Tensor:
     """Return this process' rows of a whole batch (B, ...), whose B the number of processes divides."""
     return batch.chunk(size())[rank()] if _Step.shared else batch
 
@@ -121,7 +121,7 @@ def drawn(draw: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
     """
     if not _Step.shared:
         return draw(like)
-    return own(draw(like.detach().repeat(size(), *[1] * (like.dim() - 1))))
+    return own_rows(draw(like.detach().repeat(size(), *[1] * (like.dim() - 1))))
 
 
 def mean(values: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 EVERY = 30.0  # seconds between two lines about how far the same work is
 
-_STAGE: ContextVar[str] = ContextVar("what the work is part of", default="")
+_DURING: ContextVar[str] = ContextVar("what the work is part of", default="")
 
 _SAY: ContextVar[Callable[[str], None] | None] = ContextVar("what is told of work", default=None)
 
@@ -44,13 +44,13 @@ def tell(line: str) -> None:
 
 
 @contextmanager
-def stage(name: str) -> Iterator[None]:
+def during(name: str) -> Iterator[None]:
     """Name what the work in this context is part of, such as a validation, wherever it is counted."""
-    token = _STAGE.set(name)
+    token = _DURING.set(name)
     try:
         yield
     finally:
-        _STAGE.reset(token)
+        _DURING.reset(token)
 
 
 class Count:
@@ -123,7 +123,7 @@ def counting(
         console=console,
         disable=not (shown and console.is_terminal),
     )
-    label = ", ".join(filter(None, (_STAGE.get(), description)))
+    label = ", ".join(filter(None, (_DURING.get(), description)))
     with display:
         yield Count(display, display.add_task(label, total=total, completed=done, note=""), unit)
 

@@ -68,5 +68,5 @@ def predicted_flops(sweep: Sweep) -> dict[str, float]:
     if not words:
         return {}
     control = next(arm for arm in sweep.arms if arm.label == sweep.control)
-    elsewhere = replace(control, overrides=(*control.own, *words))
+    elsewhere = replace(control, overrides=(*control.own_overrides, *words))
     return {" ".join(words): float(flops_of(composed(list(sweep.overrides(elsewhere)))))}

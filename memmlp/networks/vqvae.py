@@ -101,7 +101,7 @@ class EMACodebook(Codebook):
         self.sums.lerp_(chosen.T @ latent, 1 - self.decay)
         self._restart(self.counts < self.DEAD, latent)
         self.vectors.copy_(self.sums / self.counts[:, None])
-        return distributed.own(codes), distributed.own(index)
+        return distributed.own_rows(codes), distributed.own_rows(index)
 
     def _restart(self, dead: Tensor, latent: Tensor) -> None:
         """Put the codes that are `dead` (K,) onto random latents of the batch (B, width)."""

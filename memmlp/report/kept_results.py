@@ -26,6 +26,7 @@ from memmlp.tables.measured_run import Errors, Measured, Origin, known_mean
 
 DIGITS = 6
 FLAT_LIST = re.compile(r"\[\n([^\[\]{}]*?)\n *\]")  # of plain values; no string has a line's end in it
+OLDER_NAMES = {"vqvae": "upstream"}  # what the origins of older files call otherwise
 
 
 @dataclass(frozen=True)
@@ -257,6 +258,7 @@ def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str
     names, errors = [clip for clip, *_ in clips], record["errors"]
     if any(len(values) != len(names) for values in _every(errors)):
         raise ValueError(f"run {name} has not as many errors as clips")
+    origin = {OLDER_NAMES.get(key, key): value for key, value in record["origin"].items()}
     return Measured(
         id=name.partition("/")[0],
         means=_each(errors, _mean),
@@ -264,7 +266,7 @@ def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str
         groups={clip: group for clip, group, *_ in clips},
         sources={clip: source[0] for clip, _, *source in clips if source},
         costs=record["costs"],
-        origin=Origin(**record["origin"]),
+        origin=Origin(**origin),
         training=record.get("training", {}),
     )
 

@@ -156,10 +156,10 @@ class Run:
     @property
     def status(self) -> str:
         """One of STATUSES: what a process is doing with the run, or else how far it is."""
-        return self.stage or self.state(self.done and not self.failure)
+        return self.doing or self.state(self.done and not self.failure)
 
     @property
-    def stage(self) -> str | None:
+    def doing(self) -> str | None:
         """What a process is doing with the run, one of STAGE_WORDS; None if none is at it."""
         if not self._lock.held:
             return None

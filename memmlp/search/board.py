@@ -76,13 +76,13 @@ def render(study: Study, outputs: Path) -> Group:
     ranked = sorted((t for t in study.trials if t.state == TrialState.COMPLETE), key=lambda t: t.values)
     for trial in ranked[:SHOWN]:
         row(table, study.search, trial, Text(figures(trial), style="green"))
-    running = (run for _, runs in going for run in runs if run.stage)
+    running = (run for _, runs in going for run in runs if run.doing)
     return Group(table, Text(counts(study)), *map(Text, devices(running)))
 
 
 def _going(trial: FrozenTrial, runs: Sequence[Run]) -> Text:
     """Say how far a trial's runs are."""
-    going = next((run for run in runs if run.stage), None)
+    going = next((run for run in runs if run.doing), None)
     count = sum(run.done for run in runs if run is not going)
     done = f"{count} seeds done, " if count else ""
     if going is None:

@@ -39,7 +39,7 @@ class Study:
         self.search, self.study = search, study
 
     @classmethod
-    def own(cls, search: Search, name: str, folder: Path) -> Study:
+    def opened(cls, search: Search, name: str, folder: Path) -> Study:
         """Return the study of that name, new or as it was left, for its only owner.
 
         Args:

@@ -151,8 +151,8 @@ def total_steps(task: RunTask) -> int:
 
 def progress_text(run: Run, total: int) -> str:
     """Describe a run that somebody is at: of its training the steps, the time left and the loss."""
-    if (stage := run.stage) in ("evaluating", "exporting"):
-        return stage
+    if (doing := run.doing) in ("evaluating", "exporting"):
+        return doing
     log = [entry for entry in run.metrics() if entry.phase == "train"]
     if not log:
         return "starting"

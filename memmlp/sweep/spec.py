@@ -52,7 +52,7 @@ class Arm:
     cell: tuple[str, ...] = ()
 
     @property
-    def own(self) -> tuple[str, ...]:
+    def own_overrides(self) -> tuple[str, ...]:
         """Its overrides without those of its cell."""
         return tuple(word for word in self.overrides or () if word not in self.cell)
 

@@ -283,7 +283,7 @@ def _replicates(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
         yield "each test clip is a group of its own (data.split.groups): right where none share a person"
     if max(groups) == 1:
         yield "one group of test clips: the intervals speak of other seeds, not of other takes or people"
-    shared = [label for label, found in measured.items() if _one_vqvae(found)]
+    shared = [label for label, found in measured.items() if _one_upstream(found)]
     if shared:
         yield f"all seeds share one VQ-VAE, which they so do not replicate: {_quoted(shared)}"
 
@@ -305,8 +305,8 @@ def _single(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
         yield f"one seed, so that the interval speaks of other clips alone, and no star: {_quoted(few)}"
 
 
-def _one_vqvae(found: Sequence[Measured]) -> bool:
-    upstream = {run.origin.vqvae for run in found}
+def _one_upstream(found: Sequence[Measured]) -> bool:
+    upstream = {run.origin.upstream for run in found}
     return len(found) > 1 and len(upstream) == 1 and None not in upstream
 
 

@@ -38,7 +38,7 @@ class Origin:
         precision: the precision of training.
         body: whose rest joints the motion is on: "builtin" or the file of a body model.
         recipes: the recipe number of each component.
-        vqvae: the id of the run upstream: a VQ-VAE's, a part's, or that of the network before a refiner;
+        upstream: the id of the run upstream: a VQ-VAE's, a part's, or that of the network before a refiner;
             None where there is none.
         partial: which part of its protocol's list the data is, in words; None where it is all of it.
         plugins: version and digest of the code of each package of one's own that it uses.
@@ -57,7 +57,7 @@ class Origin:
     precision: str = UNKNOWN
     body: str = UNKNOWN
     recipes: Mapping[str, int] = field(default_factory=dict)
-    vqvae: str | None = None
+    upstream: str | None = None
     partial: str | None = None
     plugins: Mapping[str, str] = field(default_factory=dict)
     offline: bool = False
@@ -274,7 +274,7 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
         precision=of("precision"),
         body=of("body"),
         recipes=manifest.get("recipes") or {},
-        vqvae=manifest.get("upstream"),
+        upstream=manifest.get("upstream"),
         partial=manifest.get("partial"),
         plugins={
             name: f"{one['version'] or 'no version'} ({one['digest']})"

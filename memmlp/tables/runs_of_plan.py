@@ -41,7 +41,7 @@ def states(plan: Plan) -> Say:
         if entry is None:
             return None
         run = plan.run_of(entry)
-        word = run.stage or run.state(plan.complete(entry))
+        word = run.doing or run.state(plan.complete(entry))
         if word == "trained":
             return "trained, an evaluation or export is missing"
         return word if word not in ("new", "done") else None

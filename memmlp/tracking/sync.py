@@ -42,7 +42,7 @@ def sync(tracker: Tracker, runs: Iterable[Run], outputs: Path, say: Say, full: b
 def _one(tracker: Tracker, run: Run, outputs: Path, full: bool) -> str:
     session = Session(tracker, run, ledgers(outputs, tracker))
     try:
-        if run.stage:
+        if run.doing:
             return "live"
         if not full and session.up_to_date():
             return "same"

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, TrainingDiverged
-from memmlp.common.progress import Count, counting, stage
+from memmlp.common.progress import Count, counting, during
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks import checkpoint, layers
 from memmlp.runs.run import Run
@@ -212,7 +212,7 @@ def record(
 def validate(task: TrainingTask, average: Average) -> dict[str, float]:
     """Return the task's validation of the weights that count."""
     task.module.eval()
-    with average.in_place(), stage("validation"):
+    with average.in_place(), during("validation"):
         return task.validate()
 
 

@@ -56,7 +56,7 @@ class TeacherForcing(Rollout):
 
     def draw(self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """Draw the call of a training step."""
-        clips, end = map(distributed.own, sampler.draw(step))
+        clips, end = map(distributed.own_rows, sampler.draw(step))
         past, stride = model.length, model.stride
         segment = dataset.segments(clips, end, past + stride)
         state = model.true_state(segment[:, :past])
@@ -75,7 +75,7 @@ class OwnPredictions(Rollout):
 
     def draw(self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """Draw the call of a training step, after the calls that make its history."""
-        clips, end = map(distributed.own, sampler.draw(step))
+        clips, end = map(distributed.own_rows, sampler.draw(step))
         past, stride = model.length, model.stride
         passes = int(torch.randint(self.max_passes + 1, ())) if model.shift else 0
         segment = dataset.segments(clips, end, past + stride * (passes + 1))
@@ -130,7 +130,7 @@ class PersistentStreams(Rollout):
         self.clip[who] = torch.where(going, self.clip[who], clips)
         self.end[who] = torch.where(going, self.end[who] + model.stride, end)
         self.lives[who] = True
-        self.who, mine, going = who, distributed.own(who), distributed.own(going)
+        self.who, mine, going = who, distributed.own_rows(who), distributed.own_rows(going)
         past, stride = model.length, model.stride
         segment = dataset.segments(self.clip[mine], self.end[mine], past + stride)
         fresh = model.running_state(segment[:, :past, :SPARSE_DIM])

@@ -202,7 +202,7 @@ class Windows:
 
     def draw(self, step: int) -> tuple[Tensor, Tensor]:
         """Return the world frames (B, T, 252) of a step's windows, and their clips (B,)."""
-        clips, end = map(distributed.own, self.sampler.draw(step))
+        clips, end = map(distributed.own_rows, self.sampler.draw(step))
         return self.dataset.segments(clips, end, self.frames), clips
 
 

@@ -130,7 +130,7 @@ class Sweeps:
         if facts["status"] != "done":
             return facts["status"]
         run = plan.run_of(task)
-        return "done" if all(map(run.has, task.stages)) else run.stage or run.state(False)
+        return "done" if all(map(run.has, task.stages)) else run.doing or run.state(False)
 
     def _cell(self, plan: Plan, entry: Entry, states: Mapping[str, str], shown: str) -> dict[str, Any]:
         facts = self.index.runs.get(entry.id, {})

@@ -136,7 +136,7 @@ def test_the_first_failure_ends_the_sweep_where_that_is_wanted(tmp_path: Path):
     assert re.search(r"^failed: run .*: loss is nan", said, re.M)
     runs = list_runs(tmp_path / "outputs")
     assert len(runs) <= 2  # the last arm's was not begun
-    until(lambda: not any(run.stage for run in runs), "the workers end")
+    until(lambda: not any(run.doing for run in runs), "the workers end")
     assert [run.status for run in runs].count("failed") == 1
     assert "0 of 3 runs done" in run_apart(tmp_path, *words, code=1)  # a run that failed before ends it again
     assert len(list_runs(tmp_path / "outputs")) == len(runs)
@@ -203,7 +203,7 @@ def test_an_interrupted_sweep_ends_its_workers_and_goes_on_later(tmp_path: Path)
         begun = lambda: any(run.step for run in list_runs(tmp_path / "outputs"))  # noqa: E731
         until(begun, "the run's first steps", process)
         run = list_runs(tmp_path / "outputs")[0]
-        assert run.stage
+        assert run.doing
         process.send_signal(signal.SIGINT)
         said, _ = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130, said

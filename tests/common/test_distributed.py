@@ -98,14 +98,14 @@ def two(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_rows_and_draws_of_the_second_of_two(two: None):
     batch = torch.arange(8.0).reshape(4, 2)
-    assert torch.equal(distributed.own(batch), batch)  # outside of a step
+    assert torch.equal(distributed.own_rows(batch), batch)  # outside of a step
     with distributed.sharing():
-        assert torch.equal(distributed.own(batch), batch[2:])
+        assert torch.equal(distributed.own_rows(batch), batch[2:])
         torch.manual_seed(3)
         rows = distributed.drawn(torch.rand_like, batch[2:])
     torch.manual_seed(3)
     assert torch.equal(rows, torch.rand_like(batch)[2:])
-    assert torch.equal(distributed.own(batch), batch)
+    assert torch.equal(distributed.own_rows(batch), batch)
 
 
 def test_dropout_is_that_of_the_whole_batch(two: None):
@@ -150,7 +150,7 @@ def test_one_process_shares_nothing(monkeypatch: pytest.MonkeyPatch):
     assert (distributed.size(), distributed.rank(), distributed.first()) == (1, 0, True)
     value = torch.rand(3)
     with distributed.sharing():
-        assert distributed.own(value) is value
+        assert distributed.own_rows(value) is value
         assert distributed.whole(value) is value
         assert distributed.mean(value) is value
     assert distributed.of_first("a") == "a"

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from memmlp.common import progress
-from memmlp.common.progress import counting, progress_bar, stage, tell, telling, to_log
+from memmlp.common.progress import counting, during, progress_bar, tell, telling, to_log
 
 
 @pytest.mark.parametrize(("terminal", "said"), [(True, ""), (False, "data: once\n")])
@@ -56,7 +56,7 @@ def test_a_line_names_the_unit_and_the_stage(monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
     monkeypatch.setattr(progress, "EVERY", 0.0)
     with telling(told.append):
-        with stage("validation"):
+        with during("validation"):
             list(progress_bar(iter("a"), "stream", unit="frames"))
         list(progress_bar(iter("a"), "stream", unit="frames"))
     assert told == ["validation, stream: 1 frames", "stream: 1 frames"]

@@ -232,8 +232,8 @@ def test_the_status_names_the_stage_that_somebody_is_at(tmp_path: Path):
         assert run.status == "done"  # somebody holds it who works on no later stage of it
         for stage, word in (("evaluation", "evaluating"), ("deployment", "exporting")):
             run.attempt(stage)
-            assert (run.stage, run.status, run.state(False)) == (word, word, "running")
-    assert (run.stage, run.status) == (None, "done")
+            assert (run.doing, run.status, run.state(False)) == (word, word, "running")
+    assert (run.doing, run.status) == (None, "done")
     run.fail("the evaluation's memory")
     assert (run.status, run.done) == ("failed", True)
 

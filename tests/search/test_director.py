@@ -300,7 +300,7 @@ def test_validations_of_a_network_used_otherwise_are_no_trials(tmp_path: Path):
     for value, state in ((0.5, "COMPLETE"), (0.1, "FAIL")):
         folder = tmp_path / f"blend {value}"
         folder.mkdir()
-        study = Study.own(search(n_trials=1), folder.name, folder)
+        study = Study.opened(search(n_trials=1), folder.name, folder)
         one = director(study, tmp_path, blended(value))
         while (plan := one.look(1)).tasks:
             finish(plan)

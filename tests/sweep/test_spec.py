@@ -75,7 +75,7 @@ def test_a_list_of_grids_gives_each_of_their_cells_once():
     assert len(sweep.arms) == 6
     assert sweep.arms[4].label == "none, a=2, b=3"
     assert sweep.control_of(sweep.arms[4]) == "full, a=2, b=3"
-    assert (sweep.arms[4].series, sweep.arms[4].own) == ("none", ("memory=none",))
+    assert (sweep.arms[4].series, sweep.arms[4].own_overrides) == ("none", ("memory=none",))
     assert parse_sweep("s", {"arms": arms, "axes": axes[0]}).arms == sweep.arms[:2] + sweep.arms[3:5]
 
 

@@ -61,10 +61,10 @@ from memmlp.config.schema.rules import (
     Within,
     at_least,
     called,
+    empty_list,
     key,
     one_of,
     optional,
-    own,
     positive,
     standing,
     target,
@@ -195,7 +195,7 @@ class EvaluationConfig:
     batch: int = at_least(1)
     ik: str = one_of("off", "lbfgs", "arms")
     ik_iterations: int = at_least(1)
-    metrics: list[str] = own(EachOf(Registered(METRICS), empty=True))
+    metrics: list[str] = empty_list(EachOf(Registered(METRICS), empty=True))
 
 
 @dataclass
@@ -245,7 +245,7 @@ class Config:
     device: str = key(DEVICE)
     threads: int = at_least(0)
     force: bool = key()
-    plugins: list[str] = own(EachOf(empty=True))
+    plugins: list[str] = empty_list(EachOf(empty=True))
     save_predictions: Optional[str] = key()
     paths: PathsConfig = field(default_factory=PathsConfig)
     profile: ProfileConfig = field(default_factory=ProfileConfig)

@@ -181,7 +181,7 @@ def standing(value: object, rule: object = None) -> Any:
     return field(default=value, metadata={"rule": rule})
 
 
-def own(rule: object) -> Any:
+def empty_list(rule: object) -> Any:
     """Declare a list that is empty by default, as it counts for runs recorded before the key existed."""
     return field(default_factory=list, metadata={"rule": rule})
 

@@ -75,7 +75,7 @@ class SharedBlock(Block):
         self.index = index
         self.hidden = block.norm.normalized_shape[0]
 
-    def own(self, layer: nn.Linear) -> nn.Linear:
+    def divided(self, layer: nn.Linear) -> nn.Linear:
         """Split a layer on [h; z] into its parts for h and for z.
 
         Returns:
@@ -90,7 +90,7 @@ class ResidualBlock(SharedBlock):
 
     def __init__(self, block: ResidualFusion, index: int):
         super().__init__(block, index)
-        self.linear = self.own(block.linear)
+        self.linear = self.divided(block.linear)
 
     def channels(self, h: Tensor, contributions: Sequence[Tensor], take: Selection) -> Tensor:
         """Apply the block's second half, which works frame by frame."""
@@ -102,7 +102,7 @@ class PlainBlock(SharedBlock):
 
     def __init__(self, block: PlainFusion, index: int):
         super().__init__(block, index)
-        self.merge = self.own(block.merge)
+        self.merge = self.divided(block.merge)
 
     def channels(self, h: Tensor, contributions: Sequence[Tensor], take: Selection) -> Tensor:
         """Apply the block's second half and the merging layer, which work frame by frame."""
