@@ -128,11 +128,13 @@ def import_folder(source: Path, out: Path, how: ImportSettings | None = None) ->
     takes = Grouping(how.takes).names(dict(zip(sources, sources, strict=True)))
     maps: dict[str, SkeletonMap] = {}
     with _staging(out) as staging, one_thread():
+        folder = Path(staging) / "clips"
+        folder.mkdir()
         for relative, path in progress_bar(files.items(), "import", len(files)):
             try:
                 recording = read_recording(path)
                 skeleton = find_skeleton(recording, chosen)
-                clips.append(_import_file(recording, relative, Path(staging), skeleton, how, rest, source))
+                clips.append(_import_file(recording, relative, folder, skeleton, how, rest, source))
                 maps[skeleton.name] = skeleton
             except InputError as error:
                 if how.strict or len(files) == 1:
@@ -141,9 +143,9 @@ def import_folder(source: Path, out: Path, how: ImportSettings | None = None) ->
         if not clips:
             first = f"the first: {skipped[0].file}: {skipped[0].reason}"
             raise InputError(f"{source}: no usable file of {len(files)}; {first}")
-        clips = _one_floor_a_take(clips, takes, Path(staging))
+        clips = _one_floor_a_take(clips, takes, folder)
         report = ImportReport(tuple(clips), tuple(_notes(clips, maps, how)), tuple(skipped))
-        _publish(Path(staging), out, report, Path(how.body).name)
+        _publish(folder, out, report, Path(how.body).name)
     return report
 
 
@@ -274,10 +276,18 @@ def _rate_notes(clips: Sequence[Imported]) -> Iterator[str]:
 
 
 def _publish(staging: Path, out: Path, report: ImportReport, body: str) -> None:
-    """Move clips and record from staging to `out`, and remove earlier clips of the files skipped now."""
+    """Move clips and record from staging to `out`, and remove earlier clips of the files skipped now.
+
+    A new folder `out` is there with all of them at once. In an earlier import's the record comes last, and
+    its own goes first: a folder without one holds clips of two imports.
+    """
     record = {"body": body, **asdict(report)}
     (staging / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     try:
+        if not out.exists():
+            staging.rename(out)
+            return
+        (out / RECORD).unlink(missing_ok=True)
         for name in [*(clip.clip for clip in report.clips), RECORD]:
             (out / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.move(staging / name, out / name)
