@@ -72,7 +72,8 @@ def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | N
 
         kept = replace(kept, runs=with_flops(found), predicted=predicted_flops(sweep))
     path = out / f"{stem or sweep.name}.json"
-    merged = _merged(path, load_kept(path), kept) if path.exists() else kept
+    ids = {(entry.label, entry.seed): entry.id for entry in known.plan.entries}
+    merged = _merged(path, load_kept(path), kept, ids) if path.exists() else kept
     save(path, merged)
     click.echo(f"{path}: {merged.count} runs, {kept.count} of them from here")
 
@@ -192,11 +193,15 @@ def _outdated(kept: Kept) -> list[str]:
     return [f"made by an earlier recipe: {', '.join(found)}"] if found else []
 
 
-def _merged(path: Path, before: Kept, kept: Kept) -> Kept:
+def _merged(path: Path, before: Kept, kept: Kept, ids: Mapping[tuple[str, int], str]) -> Kept:
+    """Return what a file has with what is kept now, whose cells need not be those that are planned."""
+    planned = {cell: run for cell, run in ids.items() if cell[1] not in kept.runs.get(cell[0], {})}
     try:
-        return before.merged(kept)
+        merged = before.merged(kept)
+        merged.check_runs(planned)
+        return merged
     except InputError as error:
-        raise InputError(f"{path}: {error}; allowed is another --name") from None
+        raise InputError(f"{path}: {error}; allowed is another --name, or a file without them") from None
 
 
 def _templates(folder: Path) -> dict[str, str]:

@@ -104,6 +104,28 @@ class Kept:
         predicted = {**self.predicted, **other.predicted}
         return replace(self, runs=runs, arms=arms, rounds=other.rounds, flags=flags, predicted=predicted)
 
+    def check_runs(self, wanted: Mapping[tuple[str, int], str]) -> None:
+        """Check that the cells hold the runs that a sweep has in them today.
+
+        The words of an arm may be the same while what they stand for has changed: a default or a recipe.
+
+        Args:
+            wanted: the ids of the runs by the arm's label and the seed; other cells are not checked.
+
+        Raises:
+            InputError: where a cell holds another run.
+        """
+        others = {
+            label: sorted(seed for seed, run in runs.items() if wanted.get((label, seed), run.id) != run.id)
+            for label, runs in self.runs.items()
+        }
+        for label, seeds in others.items():
+            if seeds:
+                several = ", ".join(map(str, seeds))
+                raise InputError(
+                    f"arm '{label}' has other runs than today's config, data and code make (seed {several})"
+                )
+
     def check(self, arms: Mapping[str, tuple[str, ...]]) -> None:
         """Check that the arms have the overrides with which their runs were made.
 

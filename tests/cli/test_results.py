@@ -13,6 +13,8 @@ from fake_runs import fake_sweep
 from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.spec import Sweep
+from memmlp.tables.build_table import finished_runs
+from memmlp.tables.effects import Runs
 
 
 @pytest.fixture
@@ -40,6 +42,29 @@ def test_kept_results_become_pages(memmlp: Memmlp, planned: None):
     page = Path("docs/results/table14.md")
     assert page.read_text().count("| 3/3 |") == 8
     assert ", open" in Path("docs/results/README.md").read_text()
+
+
+def test_results_of_an_earlier_default_do_not_stand_beside_todays(
+    memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch
+):
+    memmlp("results", "save", "14")
+    path = Path("docs/results/data/table14.json")
+    content = json.loads(path.read_text())
+    earlier = content["cells"]["2"]["1"]
+    content["cells"]["2"]["1"], content["runs"]["f" * 16] = "f" * 16, content["runs"].pop(earlier)
+    del content["digest"]
+    path.write_text(json.dumps(content))
+
+    def but_one(*given: object) -> dict[str, Runs]:
+        found = finished_runs(*given)
+        return {**found, "2": {seed: run for seed, run in found["2"].items() if seed != 1}}
+
+    with monkeypatch.context() as patched:
+        patched.setattr("memmlp.tables.build_table.finished_runs", but_one)
+        assert one_line(memmlp("results", "save", "14"), "arm '2' has other runs than", "(seed 1)", "--name")
+    assert path.read_text() == json.dumps(content)
+    memmlp("results", "save", "14")
+    assert json.loads(path.read_text())["cells"]["2"]["1"] == earlier
 
 
 @pytest.mark.slow

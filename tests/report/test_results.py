@@ -372,6 +372,15 @@ def test_results_of_an_arm_that_was_another_are_refused(sweep: Sweep, kept: Kept
         kept.merged(replace(kept, arms=overrides_of(other)))
 
 
+def test_runs_that_an_arm_would_not_have_today_are_refused(kept: Kept):
+    """Its words are the same where a default has changed, and its runs are not."""
+    today = {(label, seed): run.id for label, runs in kept.runs.items() for seed, run in runs.items()}
+    kept.check_runs(today)
+    kept.check_runs({("2", 9): "of a seed that is not kept"})
+    with pytest.raises(InputError, match=r"arm '2' has other runs than .* make \(seed 1, 2\)"):
+        kept.check_runs(today | {("2", 2): "f" * 16, ("2", 1): "e" * 16})
+
+
 def test_prose_claims_nothing_by_hand():
     for path in (ROOT / "README.md", *(DOCS / "templates").glob("*.md")):
         assert claims(path.read_text(encoding="utf-8")) == [], path
