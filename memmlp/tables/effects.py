@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import statistics
 from collections import defaultdict
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -208,7 +209,7 @@ def _costs(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dict
 
 def _mean_cost(runs: Runs, metric: str) -> float:
     costs = [run.costs[metric] for run in runs.values() if metric in run.costs]
-    return float(np.mean(costs)) if costs else math.nan
+    return statistics.mean(costs) if costs else math.nan  # equal costs have themselves as their mean
 
 
 def or_none(number: float) -> float | None:

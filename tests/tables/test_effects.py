@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from fake_table import EFFECTS, cell, printed
 from memmlp.runs.evaluation_file import write_report
 from memmlp.statistics import Verdict, holm, paired_effects
 from memmlp.sweep.spec import Sweep
+from memmlp.tables.effects import _mean_cost
 from memmlp.tables.measured_run import load
 from memmlp.tables.table import Table
 
@@ -174,3 +176,11 @@ def test_the_correction_is_the_same_whichever_mode_is_shown(sweep: Sweep, tmp_pa
     assert one.comparisons == both.comparisons
     for label, metric in (("no | memory", "MPJPE"), ("by position", "Jitter")):
         assert cell(one, label, metric).effect == cell(both, label, metric).effect
+
+
+@pytest.mark.parametrize("seeds", range(1, 11))
+def test_equal_costs_differ_by_nothing_however_many_seeds_have_them(seeds: int):
+    """Means in floating point are off by a rounding for some numbers of equal ones."""
+    for size in (1.66427, 0.0016469, 0.357113):
+        runs = {seed: SimpleNamespace(costs={"parameters": size}) for seed in range(seeds)}
+        assert _mean_cost(runs, "parameters") == size
