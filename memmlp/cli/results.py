@@ -39,11 +39,18 @@ def results() -> None:
     show_default=True,
     help="Folder into which the file of results is written.",
 )
+@click.option(
+    "--untrained",
+    is_flag=True,
+    help="Measure networks without a run untrained; for tables of sizes alone (16).",
+)
 @click.option("--name", "stem", help="Name of the file, without its ending.  [default: the sweep's name]")
 @config_dir_option
 @plugins_option
 @outputs_option
-def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | None, outputs: Path) -> None:
+def save_command(
+    name: str, overrides: tuple[str, ...], out: Path, untrained: bool, stem: str | None, outputs: Path
+) -> None:
     """Keep a sweep's results in one small file.
 
     They are the per-clip results of its finished runs. SWEEP and OVERRIDES are those of `memmlp sweep`.
@@ -61,6 +68,11 @@ def save_command(name: str, overrides: tuple[str, ...], out: Path, stem: str | N
     sweep = find_sweep(name, overrides)
     known = sweep_to_show(sweep, overrides, outputs.absolute())
     found = finished_runs(known.sweep, finder(known.plan, functools.cache(load)))
+    if untrained:
+        from memmlp.config.network_sizes import with_sizes
+
+        found, measured = with_sizes(known.sweep, found)
+        known = known._replace(flags=(*known.flags, *measured))
     words = tuple(word for word in overrides if not word.startswith("seed="))
     rounds = plain(as_json(known.rounds)) if known.rounds else None
     source = name if is_path(name) else sweep.name

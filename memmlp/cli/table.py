@@ -65,6 +65,11 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
     help="Show also what a browser measured: a file of the bench of memmlp web. For Table 17; repeatable.",
 )
 @click.option(
+    "--untrained",
+    is_flag=True,
+    help="Measure networks without a run untrained; for tables of sizes alone (16).",
+)
+@click.option(
     "--plan", is_flag=True, help="Show how many seeds it would take to see the paper's effects on this data."
 )
 @config_dir_option
@@ -79,6 +84,7 @@ def table(
     branch: str | None,
     source: str | None,
     add: tuple[Path, ...],
+    untrained: bool,
     plan: bool,
     outputs: Path,
 ) -> None:
@@ -93,7 +99,9 @@ def table(
         raise InputError("--plan: goes to the screen alone, without --format, --out and --add")
     measured = [browser_rows.read(path) for path in add]
     with _uncollected():
-        found = gathered([name], overrides, outputs, SHOWN_MODES[mode], functools.cache(load), branch, source)
+        found = gathered(
+            [name], overrides, outputs, SHOWN_MODES[mode], functools.cache(load), branch, source, untrained
+        )
     if plan:
         plans_on_screen(found, SHOWN_MODES[mode])
         return
@@ -137,6 +145,7 @@ def gathered(
     read: Read,
     branch: str | None = None,
     source: str | None = None,
+    untrained: bool = False,
 ) -> list[SweepTable]:
     """Gather the tables that some names stand for.
 
@@ -151,6 +160,7 @@ def gathered(
         read: reads a run (`memmlp.tables.measured_run.load`).
         branch: shows this branch in place of the arms' own; None for theirs.
         source: shows the test clips of this source alone; None for all.
+        untrained: whether the sizes of networks without a run are measured.
 
     Raises:
         InputError: where none of them can be composed with the command line's overrides.
@@ -161,9 +171,13 @@ def gathered(
     found, failures = [], []
     for sweep, command in chosen(names, overrides):
         sweep = sweep.with_branch(branch) if branch else sweep
+        if untrained:
+            from memmlp.config.network_sizes import check_sizes
+
+            check_sizes(sweep)
         try:
             known = sweep_to_show(sweep, overrides, outputs.absolute())
-            found.append(table_of_plan(known, modes, command, read, source))
+            found.append(table_of_plan(known, modes, command, read, source, untrained))
         except InputError as error:
             failures.append(error)
             table = without_runs(sweep, modes, f"nothing measured: {error}")
@@ -174,9 +188,17 @@ def gathered(
 
 
 def table_of_plan(
-    shown: SweepToShow, modes: Sequence[str], command: str, read: Read, source: str | None = None
+    shown: SweepToShow,
+    modes: Sequence[str],
+    command: str,
+    read: Read,
+    source: str | None = None,
+    untrained: bool = False,
 ) -> SweepTable:
-    """Return a planned sweep's finished runs and its table, of one source's test clips where it is given."""
+    """Return a planned sweep's finished runs and its table, of one source's test clips where it is given.
+
+    With `untrained` networks that have no run are measured as they are before training.
+    """
     from memmlp.tables.build_table import collect, finished_runs, on_source, titled
     from memmlp.tables.runs_of_plan import finder, older, states
 
@@ -184,6 +206,11 @@ def table_of_plan(
     if source and rounds:
         raise InputError(f"--source {source}: allowed for a fixed number of seeds, not for --until-decided")
     runs = finished_runs(sweep, finder(plan, read))
+    if untrained:
+        from memmlp.config.network_sizes import with_sizes
+
+        runs, measured = with_sizes(sweep, runs)
+        flags = (*flags, *measured)
     if source:
         sweep, runs, left_out = on_source(sweep, runs, source)
         flags = (*left_out, *flags)

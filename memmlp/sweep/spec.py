@@ -12,7 +12,9 @@ from memmlp.evaluation.units import SMALLEST
 
 MODES = ("stream", "window")
 BRANCHES = ("rotation", "position", "combined")
-COSTS = ("FLOPs", "MACs", "parameters", "size", "ms", "network ms", "pose ms", "ratio", "FPS")
+SIZES = ("FLOPs", "MACs", "parameters", "size")
+"""The costs that a network has before it is trained, on any machine."""
+COSTS = (*SIZES, "ms", "network ms", "pose ms", "ratio", "FPS")
 """Metrics that are costs and no errors.
 
 Their units: GFLOP, GMAC, millions, MB, ms, multiples of the yardstick's time, and frames a second.

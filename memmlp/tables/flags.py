@@ -46,7 +46,8 @@ def flags(
     yield from _other_data(sweep)
     yield from _missing(sweep, runs, command, state)
     yield from _older(sweep, runs, older)
-    yield from _branches(sweep, asked, runs, command)
+    if set(sweep.metrics) - set(COSTS):
+        yield from _branches(sweep, asked, runs, command)
     yield from _offline(every)
     yield from _same(sweep, runs)
     yield from _unequal_clips(sweep, runs)

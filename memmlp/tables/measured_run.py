@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -184,6 +185,20 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     origin = _evaluated(_origin(manifest), reports)
     training = _training(run, manifest)
     return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run, sources, training)
+
+
+def of_untrained(
+    overrides: Sequence[str], record: Mapping[str, Any], environment: Mapping[str, Any]
+) -> Measured:
+    """Return the sizes of a network that was not trained, whose id is a digest of its overrides.
+
+    Args:
+        overrides: what the network was made with.
+        record: its sizes, as a deployment records them.
+        environment: the code, the packages and the hardware, as a run's manifest has them.
+    """
+    digest = hashlib.sha256("\n".join(["untrained", *overrides]).encode()).hexdigest()[:16]
+    return Measured(digest, {}, {}, {}, _costs(record), _origin(environment), record)
 
 
 def _training(run: Run, manifest: Mapping[str, Any]) -> dict[str, float]:

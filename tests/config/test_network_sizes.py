@@ -1,0 +1,47 @@
+"""Sizes of networks that were not trained, in the place of runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from conftest import Memmlp, one_line
+from fake_runs import fake_run
+
+from memmlp.common.errors import InputError
+from memmlp.config.build import untrained
+from memmlp.config.network_sizes import with_sizes
+from memmlp.sweep.parsing import parse_sweep
+from memmlp.tables.build_table import collect
+from memmlp.tables.measured_run import load
+
+ARMS = {"Mem-MLP": [], "AvatarPoser": ["model=avatar_poser"], "printed alone": {"overrides": None}}
+METRICS = ["FLOPs", "MACs", "size", "parameters"]
+SWEEP = parse_sweep("sizes", {"arms": ARMS, "metrics": METRICS, "base": ["profile=tiny"], "seeds": [3]})
+
+
+@pytest.mark.slow
+def test_networks_without_a_run_are_measured_and_said_to_be_untrained(tmp_path: Path):
+    run = load(fake_run(tmp_path, "mine", 3).folder)
+    runs, flags = with_sizes(SWEEP, {"Mem-MLP": {3: run}, "AvatarPoser": {}})
+    assert runs["Mem-MLP"] == {3: run}
+    assert flags == ("sizes of networks that were not trained: 'AvatarPoser'",)
+    (seed, found), *others = runs["AvatarPoser"].items()
+    assert (seed, others, found.means) == (3, [], {})
+    model = untrained(["profile=tiny", "model=avatar_poser"])
+    numbers = sum(parameter.numel() for parameter in model.parameters())
+    assert found.costs["parameters"] == pytest.approx(numbers / 1e6)
+    assert found.costs["FLOPs"] == pytest.approx(2 * found.costs["MACs"])
+    assert found.costs["size"] > 4 * found.costs["parameters"]
+    table = collect(SWEEP, runs)
+    assert not [flag for flag in table.flags if "not evaluated" in flag or "missing" in flag]
+
+
+def test_what_needs_a_run_is_refused():
+    with pytest.raises(InputError, match="--untrained: sweep t shows MPJPE; allowed are tables of FLOPs"):
+        with_sizes(parse_sweep("t", {"arms": ARMS, "metrics": ["FLOPs", "MPJPE"]}), {})
+
+
+def test_the_command_refuses_it_for_other_tables(memmlp: Memmlp):
+    said = memmlp("table", "5", "--untrained")
+    assert one_line(said, "--untrained: sweep table05 shows MPJRE, MPJPE", "allowed are tables of FLOPs")
