@@ -57,6 +57,11 @@ class Kept:
         return " ".join(["memmlp sweep", self.sweep, *self.overrides])
 
     @property
+    def untrained(self) -> int:
+        """The number of networks whose sizes were measured without a run."""
+        return len({run.id for run in self.every if not run.means})
+
+    @property
     def every(self) -> list[Measured]:
         """The runs, each once for each of its evaluations that arms show, in the order of their names."""
         return [run for _, run in sorted(self.named.items())]

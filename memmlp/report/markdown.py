@@ -92,7 +92,8 @@ def _table_page(source: KeptTable) -> str:
 
 def origin_words(kept: Kept) -> str:
     """Say where the runs come from, and which command makes them again."""
-    parts = [f"{kept.count} runs"]
+    counts = {"run": kept.count - kept.untrained, "untrained network": kept.untrained}
+    parts = [" and ".join(f"{count} {what}{'s' * (count != 1)}" for what, count in counts.items() if count)]
     for attribute, what in ORIGIN.items():
         values = {str(getattr(run.origin, attribute)) for run in kept.every}
         # A run that other code went on with has several commits; each of all is named once.
@@ -101,7 +102,10 @@ def origin_words(kept: Kept) -> str:
     parts += sorted({escaped(run.origin.partial) for run in kept.every if run.origin.partial})
     recipes = _recipes(kept.every)
     parts += [f"recipes {recipes}"] if recipes else []
-    return f"`{kept.command}`: {', '.join(parts)}."
+    command = (
+        f"{kept.command} --untrained".replace("sweep", "table", 1) if not counts["run"] else kept.command
+    )
+    return f"`{command}`: {', '.join(parts)}."
 
 
 def _listed(words: Sequence[str]) -> str:
@@ -189,13 +193,18 @@ class Words:
     def summary(self, name: str, mode: str = "stream") -> str:
         """Return a table with a line for each arm: measured differences, their verdicts, and the paper's.
 
-        Of a sweep with a scale it is a list of what the lines through its cells say.
+        Of a sweep with a scale it is a list of what the lines through its cells say, of a table without
+        errors its costs beside the paper's.
         """
         table = self._table(name)
         if (trends := self.sources[name].trends) is not None:
             return scaling_summary(trends)
         metrics = table.measured_metrics
+        if not metrics:
+            return self._costs(name)
         lines = [
+            f"In {mode} mode:",
+            "",
             f"| arm | compared with | {' | '.join(metrics)} |",
             f"| --- | --- |{' --- |' * len(metrics)}",
         ]
@@ -224,6 +233,21 @@ class Words:
         whole = [_whole(first.cells[mode][metric]) for metric in table.measured_metrics]
         title = f"the whole way, from {escaped(first.label)}"
         return "\n".join([*lines, f"| **{title}** | {' | '.join(map(escaped, whole))} |"])
+
+    def _costs(self, name: str) -> str:
+        table = self._table(name)
+        heads = [f"{metric} [{unit(metric)}]" for metric in table.metrics]
+        lines = [f"| arm | {' | '.join(map(escaped, heads))} |", f"| --- |{' --- |' * len(heads)}"]
+        for row in (row for row in table.rows if row.found):
+            costs = row.cells[table.modes[0]]
+            cells = [self.value(name, row.label, table.modes[0], metric) for metric in table.metrics]
+            papers = [costs[metric].paper for metric in table.metrics]
+            both = [
+                cell if paper is None else f"{cell}; paper {paper:.2f}"
+                for cell, paper in zip(cells, papers, strict=True)
+            ]
+            lines.append(f"| {escaped(row.label)} | {' | '.join(both)} |")
+        return "\n".join(lines)
 
     def _summed(self, name: str, row: Row, mode: str, metric: str) -> str:
         printed = row.cells[mode][metric].paper_effect

@@ -11,6 +11,8 @@ from fake_runs import fake_run
 from memmlp.common.errors import InputError
 from memmlp.config.build import untrained
 from memmlp.config.network_sizes import with_sizes
+from memmlp.report.kept_results import Kept
+from memmlp.report.markdown import origin_words
 from memmlp.sweep.parsing import parse_sweep
 from memmlp.tables.build_table import collect
 from memmlp.tables.measured_run import load
@@ -35,6 +37,10 @@ def test_networks_without_a_run_are_measured_and_said_to_be_untrained(tmp_path: 
     assert found.costs["size"] > 4 * found.costs["parameters"]
     table = collect(SWEEP, runs)
     assert not [flag for flag in table.flags if "not evaluated" in flag or "missing" in flag]
+    said = origin_words(Kept("sizes", ("profile=tiny",), {"AvatarPoser": runs["AvatarPoser"]}, {}))
+    assert said.startswith("`memmlp table sizes profile=tiny --untrained`: 1 untrained network, ")
+    said = origin_words(Kept("sizes", ("profile=tiny",), runs, {}))
+    assert said.startswith("`memmlp sweep sizes profile=tiny`: 1 run and 1 untrained network, ")
 
 
 def test_what_needs_a_run_is_refused():
