@@ -42,7 +42,7 @@ def results() -> None:
 @click.option(
     "--untrained",
     is_flag=True,
-    help="Measure networks without a run untrained; for tables of sizes alone (16).",
+    help="Measure networks without a run untrained; for tables of costs alone (16, 17).",
 )
 @click.option("--name", "stem", help="Name of the file, without its ending.  [default: the sweep's name]")
 @config_dir_option
@@ -69,9 +69,9 @@ def save_command(
     known = sweep_to_show(sweep, overrides, outputs.absolute())
     found = finished_runs(known.sweep, finder(known.plan, functools.cache(load)))
     if untrained:
-        from memmlp.config.network_sizes import with_sizes
+        from memmlp.config.network_costs import with_costs
 
-        found, measured = with_sizes(known.sweep, found)
+        found, measured = with_costs(known.sweep, found)
         known = known._replace(flags=(*known.flags, *measured))
     words = tuple(word for word in overrides if not word.startswith("seed="))
     rounds = plain(as_json(known.rounds)) if known.rounds else None

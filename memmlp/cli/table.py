@@ -67,7 +67,7 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
 @click.option(
     "--untrained",
     is_flag=True,
-    help="Measure networks without a run untrained; for tables of sizes alone (16).",
+    help="Measure networks without a run untrained; for tables of costs alone (16, 17).",
 )
 @click.option(
     "--plan", is_flag=True, help="Show how many seeds it would take to see the paper's effects on this data."
@@ -160,7 +160,7 @@ def gathered(
         read: reads a run (`memmlp.tables.measured_run.load`).
         branch: shows this branch in place of the arms' own; None for theirs.
         source: shows the test clips of this source alone; None for all.
-        untrained: whether the sizes of networks without a run are measured.
+        untrained: whether the costs of networks without a run are measured.
 
     Raises:
         InputError: where none of them can be composed with the command line's overrides.
@@ -172,9 +172,9 @@ def gathered(
     for sweep, command in chosen(names, overrides):
         sweep = sweep.with_branch(branch) if branch else sweep
         if untrained:
-            from memmlp.config.network_sizes import check_sizes
+            from memmlp.config.network_costs import check_costs
 
-            check_sizes(sweep)
+            check_costs(sweep)
         try:
             known = sweep_to_show(sweep, overrides, outputs.absolute())
             found.append(table_of_plan(known, modes, command, read, source, untrained))
@@ -207,9 +207,9 @@ def table_of_plan(
         raise InputError(f"--source {source}: allowed for a fixed number of seeds, not for --until-decided")
     runs = finished_runs(sweep, finder(plan, read))
     if untrained:
-        from memmlp.config.network_sizes import with_sizes
+        from memmlp.config.network_costs import with_costs
 
-        runs, measured = with_sizes(sweep, runs)
+        runs, measured = with_costs(sweep, runs)
         flags = (*flags, *measured)
     if source:
         sweep, runs, left_out = on_source(sweep, runs, source)

@@ -84,21 +84,22 @@ class Deployment:
                 f"{deployed.onnx}: ONNX Runtime differs from torch by {worst:.2e} (> {TOLERANCE:.0e}), "
                 "which is more than rounding explains"
             )
-        record = latency.measure_step(deployed.onnx, self.latency_steps) | latency.size(
-            model, network, deployed.onnx
-        )
+        record = self.times(model, deployed.onnx) | latency.size(model, network, deployed.onnx)
         record |= {
             "graph": "streaming" if isinstance(network, StreamingGraph) else "naive",
             "onnx_parity": worst,
         }
-        if self.alone:
-            record |= self._alone(model)
         if self.precision != "fp32":
             if isinstance(network, StreamingGraph):
                 record[self.precision] = self._less_precise(network, deployed, train, test)
             else:
                 tell(f"export: no file in {self.precision}, as {type(model).__name__} has no streaming graph")
         return record
+
+    def times(self, model: MotionModel, path: Path) -> dict[str, float]:
+        """Time a step of a network's exported file, and the network alone where that is asked for."""
+        record = latency.measure_step(path, self.latency_steps)
+        return record | self._alone(model) if self.alone else record
 
     def _alone(self, model: MotionModel) -> dict[str, float]:
         """Return the times of the network alone, from features to its own outputs; no file is kept."""

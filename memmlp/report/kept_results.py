@@ -58,7 +58,7 @@ class Kept:
 
     @property
     def untrained(self) -> int:
-        """The number of networks whose sizes were measured without a run."""
+        """The number of networks whose costs were measured without a run."""
         return len({run.id for run in self.every if not run.means})
 
     @property

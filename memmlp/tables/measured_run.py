@@ -190,11 +190,11 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
 def of_untrained(
     overrides: Sequence[str], record: Mapping[str, Any], environment: Mapping[str, Any]
 ) -> Measured:
-    """Return the sizes of a network that was not trained, whose id is a digest of its overrides.
+    """Return the costs of a network that was not trained, whose id is a digest of its overrides.
 
     Args:
         overrides: what the network was made with.
-        record: its sizes, as a deployment records them.
+        record: its sizes and times, as a deployment records them.
         environment: the code, the packages and the hardware, as a run's manifest has them.
     """
     digest = hashlib.sha256("\n".join(["untrained", *overrides]).encode()).hexdigest()[:16]

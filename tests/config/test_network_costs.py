@@ -10,7 +10,7 @@ from fake_runs import fake_run
 
 from memmlp.common.errors import InputError
 from memmlp.config.build import untrained
-from memmlp.config.network_sizes import with_sizes
+from memmlp.config.network_costs import with_costs
 from memmlp.report.kept_results import Kept
 from memmlp.report.markdown import origin_words
 from memmlp.sweep.parsing import parse_sweep
@@ -25,9 +25,9 @@ SWEEP = parse_sweep("sizes", {"arms": ARMS, "metrics": METRICS, "base": ["profil
 @pytest.mark.slow
 def test_networks_without_a_run_are_measured_and_said_to_be_untrained(tmp_path: Path):
     run = load(fake_run(tmp_path, "mine", 3).folder)
-    runs, flags = with_sizes(SWEEP, {"Mem-MLP": {3: run}, "AvatarPoser": {}})
+    runs, flags = with_costs(SWEEP, {"Mem-MLP": {3: run}, "AvatarPoser": {}})
     assert runs["Mem-MLP"] == {3: run}
-    assert flags == ("sizes of networks that were not trained: 'AvatarPoser'",)
+    assert flags == ("networks that were not trained, with random weights: 'AvatarPoser'",)
     (seed, found), *others = runs["AvatarPoser"].items()
     assert (seed, others, found.means) == (3, [], {})
     model = untrained(["profile=tiny", "model=avatar_poser"])
@@ -43,9 +43,22 @@ def test_networks_without_a_run_are_measured_and_said_to_be_untrained(tmp_path: 
     assert said.startswith("`memmlp sweep sizes profile=tiny`: 1 run and 1 untrained network, ")
 
 
+@pytest.mark.slow
+def test_times_are_measured_where_the_table_shows_them():
+    timed = {
+        "metrics": ["ms", "network ms", "pose ms", "ratio"],
+        "base": ["profile=tiny", "export.alone=true"],
+    }
+    sweep = parse_sweep("times", {"arms": {"AvatarPoser": ARMS["AvatarPoser"]}, "seeds": [0], **timed})
+    runs, _ = with_costs(sweep, {"AvatarPoser": {}})
+    found = runs["AvatarPoser"][0]
+    assert all(found.costs[metric] > 0 for metric in sweep.metrics)
+    assert (found.latency["steps"], found.latency["threads"]) == (200, 1)
+
+
 def test_what_needs_a_run_is_refused():
     with pytest.raises(InputError, match="--untrained: sweep t shows MPJPE; allowed are tables of FLOPs"):
-        with_sizes(parse_sweep("t", {"arms": ARMS, "metrics": ["FLOPs", "MPJPE"]}), {})
+        with_costs(parse_sweep("t", {"arms": ARMS, "metrics": ["FLOPs", "MPJPE"]}), {})
 
 
 def test_the_command_refuses_it_for_other_tables(memmlp: Memmlp):

@@ -1,0 +1,72 @@
+"""Costs of networks that were not trained, for tables that show nothing else: their sizes and times."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from memmlp.common.errors import InputError
+from memmlp.common.progress import progress_bar
+from memmlp.config.build import build_deployment, untrained
+from memmlp.config.compose import composed
+from memmlp.deploy.deployment import GRAPHS, Deployment
+from memmlp.runs.environment import environment
+from memmlp.sweep.spec import COSTS, SIZES, Sweep
+from memmlp.tables.effects import Runs
+from memmlp.tables.measured_run import Measured, of_untrained
+
+
+def with_costs(sweep: Sweep, runs: Mapping[str, Runs]) -> tuple[dict[str, Runs], tuple[str, ...]]:
+    """Measure untrained networks for a sweep's arms that have no finished run.
+
+    Times are measured where the sweep's table shows some.
+
+    Returns:
+        The runs by arm and seed, those networks among them, and flags that say so.
+
+    Raises:
+        InputError: as `check_costs` does.
+    """
+    check_costs(sweep)
+    timed = not set(sweep.metrics) <= set(SIZES)
+    without = [arm for arm in sweep.runnable() if not runs[arm.label]]
+    costs = {
+        arm.label: {sweep.seeds_of(arm)[0]: measured(sweep.overrides(arm), timed)}
+        for arm in progress_bar(without, "networks", len(without))
+    }
+    names = ", ".join(f"'{label}'" for label in costs)
+    flags = (f"networks that were not trained, with random weights: {names}",) if costs else ()
+    return {label: dict(costs.get(label, found)) for label, found in runs.items()}, flags
+
+
+def check_costs(sweep: Sweep) -> None:
+    """Check that a sweep's table shows costs alone. Raises InputError where it needs runs."""
+    if beyond := [metric for metric in sweep.metrics if metric not in COSTS]:
+        raise InputError(
+            f"--untrained: sweep {sweep.name} shows {', '.join(beyond)}; "
+            f"allowed are tables of {', '.join(COSTS)} alone"
+        )
+
+
+def measured(overrides: tuple[str, ...], timed: bool) -> Measured:
+    """Measure the network of some overrides, with random weights, and the ONNX file of its live step.
+
+    Args:
+        overrides: of the config.
+        timed: whether its steps are timed, too, as a run's deployment times them.
+    """
+    from memmlp.deploy.export import export  # slow to import
+    from memmlp.deploy.latency import size
+    from memmlp.live.latency import measure_pose
+
+    deployment = build_deployment(composed(list(overrides))) or Deployment(latency_steps=1)
+    model = untrained(overrides)
+    network = GRAPHS[deployment.graph](model)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "step.onnx"
+        export(network, path, "untrained")
+        record = size(model, network, path)
+        if timed:
+            record |= deployment.times(model, path) | measure_pose(path, deployment.latency_steps)
+    return of_untrained(overrides, record, environment() | {"device": "cpu", "body": "builtin"})
