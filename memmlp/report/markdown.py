@@ -16,7 +16,16 @@ from memmlp.tables.formats import escaped, markdown
 from memmlp.tables.measured_run import UNKNOWN, Measured
 from memmlp.tables.scaling import Trends
 from memmlp.tables.table import Cell, Row, Table
-from memmlp.tables.table_text import MINUS, MISSING, caption, effect_words, number_words, unit, value_words
+from memmlp.tables.table_text import (
+    MINUS,
+    MISSING,
+    caption,
+    effect_words,
+    number_words,
+    unit,
+    value_words,
+    with_unit,
+)
 
 MARK = "<!-- made by: memmlp results docs -->"
 ORIGIN = {
@@ -236,7 +245,7 @@ class Words:
 
     def _costs(self, name: str) -> str:
         table = self._table(name)
-        heads = [f"{metric} [{unit(metric)}]" for metric in table.metrics]
+        heads = [with_unit(metric) for metric in table.metrics]
         lines = [f"| arm | {' | '.join(map(escaped, heads))} |", f"| --- |{' --- |' * len(heads)}"]
         for row in (row for row in table.rows if row.found):
             costs = row.cells[table.modes[0]]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from memmlp.sweep.spec import COMPUTE
 from memmlp.tables.formats import escaped
 from memmlp.tables.scaling import MODE, Bounds, Change, Slope, Trend, Trends
-from memmlp.tables.table_text import places, signed, unit
+from memmlp.tables.table_text import places, signed, with_unit
 
 SIGNS = {1: "higher", -1: "lower", 0: "open", None: "no verdict"}
 NEAR = 0.5
@@ -124,7 +124,12 @@ def _table(found: Trends, name: str) -> str:
         if name not in trend.slopes:
             continue
         slope = trend.slopes[name]
-        row = [escaped(trend.series), _unit(trend.metric), str(len(trend.points)), bounds_words(slope.change)]
+        row = [
+            escaped(trend.series),
+            escaped(with_unit(trend.metric)),
+            str(len(trend.points)),
+            bounds_words(slope.change),
+        ]
         row += [_verdict(slope), *([bounds_words(trend.at())] if first else [])]
         if ahead and trend.predicted:
             row += [bounds_words(trend.predicted.effect), SIGNS[trend.predicted.sign]]
@@ -133,10 +138,6 @@ def _table(found: Trends, name: str) -> str:
     ends = found.measured(name)
     assert ends is not None
     return f"**Against {escaped(name)}**, from {amount(name, ends[0])} to {amount(name, ends[1])}\n\n{lines}"
-
-
-def _unit(metric: str) -> str:
-    return escaped(f"{metric} [{unit(metric)}]" if unit(metric) else metric)
 
 
 def _verdict(slope: Slope) -> str:

@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator, NullFormatter
 from memmlp.common.files import digest
 from memmlp.sweep.spec import COMPUTE
 from memmlp.tables.scaling import Point, Trend, Trends
-from memmlp.tables.table_text import unit
+from memmlp.tables.table_text import with_unit
 
 INK, LINE, FAINT, AHEAD = "#1f2328", "#0969da", "#d0d7de", "#bc4c00"
 STYLE: Any = {
@@ -77,7 +77,7 @@ def scaling_figure(found: Trends) -> bytes:
     for trend in found.trends:
         _panel(axes[series.index(trend.series), metrics.index(trend.metric)], trend, found)
     for axis, metric in zip(axes[0], metrics, strict=True):
-        axis.set_title(f"{metric} [{unit(metric)}]" if unit(metric) else metric)
+        axis.set_title(with_unit(metric))
     for row, label in zip(axes, series, strict=True):
         row[0].set_ylabel(label)
     figure.supxlabel(_label(found), fontsize=8)

@@ -71,8 +71,12 @@ def grids(table: Table) -> list[Grid]:
 
 def heading(metric: str) -> str:
     """Return a metric's name with its unit and the direction that is better."""
-    words = (metric, f"[{unit(metric)}]" if unit(metric) else "", ARROWS.get(better(metric), ""))
-    return " ".join(word for word in words if word)
+    return f"{with_unit(metric)} {ARROWS.get(better(metric), '')}".rstrip()
+
+
+def with_unit(metric: str) -> str:
+    """Return a metric's name with its unit in brackets; the name alone where it has none."""
+    return f"{metric} [{unit(metric)}]" if unit(metric) else metric
 
 
 def better(metric: str) -> str:
