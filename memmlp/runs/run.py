@@ -231,7 +231,7 @@ class Run:
     def took(self, stage: str, seconds: float) -> None:
         """Record in the manifest how long a stage took, all processes that worked on it in turn together."""
         known = self.manifest.get("seconds", {})
-        self.write_manifest({"seconds": {**known, stage: round(seconds, 1)}})
+        self.write_manifest({"seconds": {**known, stage: round(seconds, 3)}})
 
     def attempt(self, stage: str) -> None:
         """Record that a process begins to work on a stage of the run."""

@@ -30,8 +30,8 @@ def forecast(plan: Plan) -> Forecast | None:
     Returns:
         None where nothing is left, or no run of a kind that is left has finished.
     """
-    left, took = plan.left(), {task.id: seconds(plan.run_of(task)) for task in plan.tasks}
-    took = {name: time for name, time in took.items() if time}
+    left, times = plan.left(), {task.id: seconds(plan.run_of(task)) for task in plan.tasks}
+    took = {name: time for name, time in times.items() if time is not None}
     kinds: dict[str, list[str]] = defaultdict(list)
     for task in plan.tasks:
         if task.id in took:
@@ -47,9 +47,9 @@ def forecast(plan: Plan) -> Forecast | None:
     )
 
 
-def seconds(run: Run) -> float:
-    """Return how long a finished run took, all stages together; 0 for one that has not finished."""
-    found = run.manifest.get("seconds", 0) if run.done else 0
+def seconds(run: Run) -> float | None:
+    """Return how long a finished run took, all stages together; None for one that has not finished."""
+    found = run.manifest.get("seconds") if run.done else None
     return sum(found.values()) if isinstance(found, dict) else found
 
 

@@ -21,7 +21,11 @@ from memmlp.runs.identity import NEUTRAL, flatten
 FOLDERS = packaged("conf").glob("*/")
 GROUPS = {folder.name: sorted(path.stem for path in folder.glob("*.yaml")) for folder in FOLDERS}
 del GROUPS["search"]  # of `memmlp tune`
-OF_TERMS = [path.stem for path in packaged("conf").glob("loss/*.yaml") if "loss_terms" in path.read_text()]
+OF_TERMS = [
+    path.stem
+    for path in packaged("conf").glob("loss/*.yaml")
+    if any(words in path.read_text() for words in ("loss_terms", "- kinematic"))
+]
 OPTIONS = [f"{group}={name}" for group, names in GROUPS.items() for name in names]
 
 

@@ -210,7 +210,7 @@ def test_it_sees_the_world_as_the_head_looks_and_weighs_the_terms_of_its_loss(we
     begun = {name: value for name, value in cfg.loss.items() if name in loss.weighting.weights()}
     assert loss.weighting.weights() == pytest.approx(begun)
     assert set(begun) == {
-        "orientation", "rotation", "angle", "world_position", "velocity", "velocity_3", "velocity_5"
+        "orientation", "rotation", "angle", "world_position", "velocity", "velocity_3", "velocity_5", "jerk"
     }  # fmt: skip
     assert bool(list(loss.weighting.parameters())) == (weighting == "learned")
 

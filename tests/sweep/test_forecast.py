@@ -55,3 +55,10 @@ def test_of_a_finished_plan_nothing_is_foretold(plan: Plan):
     for name in (*CODES, *QUICK, *SLOW):
         finish(plan, name, 1.0)
     assert forecast(plan) is None
+
+
+def test_a_run_too_short_for_the_clock_counts_as_finished(plan: Plan):
+    finish(plan, CODES[0], {"vqvae": 0.0})
+    finish(plan, QUICK[0], {"train": 0.0})
+    finish(plan, SLOW[0], 20.0)
+    assert forecast(plan) == Forecast(20.0, finished=2, unlike=0)
