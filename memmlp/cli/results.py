@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from memmlp.report.kept_results import Kept
     from memmlp.report.markdown import KeptTable
     from memmlp.sweep.spec import Sweep
+    from memmlp.tables.effects import Runs
     from memmlp.tables.scaling import Trends
     from memmlp.tables.table import Table
 
@@ -44,12 +45,24 @@ def results() -> None:
     is_flag=True,
     help="Measure networks without a run untrained; for tables of costs alone (16, 17).",
 )
+@click.option(
+    "--kept",
+    "also_kept",
+    is_flag=True,
+    help="Take runs that the outputs lack from other sweeps' files in --out, if these have the very same.",
+)
 @click.option("--name", "stem", help="Name of the file, without its ending.  [default: the sweep's name]")
 @config_dir_option
 @plugins_option
 @outputs_option
 def save_command(
-    name: str, overrides: tuple[str, ...], out: Path, untrained: bool, stem: str | None, outputs: Path
+    name: str,
+    overrides: tuple[str, ...],
+    out: Path,
+    untrained: bool,
+    also_kept: bool,
+    stem: str | None,
+    outputs: Path,
 ) -> None:
     """Keep a sweep's results in one small file.
 
@@ -67,7 +80,13 @@ def save_command(
 
     sweep = find_sweep(name, overrides)
     known = sweep_to_show(sweep, overrides, outputs.absolute())
-    found = finished_runs(known.sweep, finder(known.plan, functools.cache(load)))
+    found: Mapping[str, Runs] = finished_runs(known.sweep, finder(known.plan, functools.cache(load)))
+    path = out / f"{stem or sweep.name}.json"
+    origins: tuple[str, ...] = ()
+    if also_kept:
+        from memmlp.config.kept_elsewhere import with_kept
+
+        found, origins = with_kept(found, known.plan, sorted(set(out.glob("*.json")) - {path}))
     if untrained:
         from memmlp.config.network_costs import with_costs
 
@@ -83,11 +102,11 @@ def save_command(
         from memmlp.config.count_training import predicted_flops, with_flops
 
         kept = replace(kept, runs=with_flops(found), predicted=predicted_flops(sweep))
-    path = out / f"{stem or sweep.name}.json"
     ids = {(entry.label, entry.seed): entry.id for entry in known.plan.entries}
     merged = _merged(path, load_kept(path), kept, ids) if path.exists() else kept
     save(path, merged)
-    click.echo(f"{path}: {merged.count} runs, {kept.count} of them from here")
+    here = f"from here{''.join(f' and {origin}' for origin in origins)}"
+    click.echo(f"{path}: {merged.count} runs, {kept.count} of them {here}")
 
 
 @results.command("docs")

@@ -1,0 +1,99 @@
+"""Runs taken from other sweeps' kept results: the very same, and no others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from fake_runs import fake_sweep, runs_of
+
+from memmlp.config.kept_elsewhere import with_kept
+from memmlp.report.kept_results import Kept, overrides_of, save
+from memmlp.sweep.parsing import load_sweep
+from memmlp.sweep.plan import Entry, Plan
+from memmlp.tables.effects import Runs
+
+SWEEP = load_sweep(Path(__file__).parents[2] / "sweeps" / "table14.yaml")
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> dict[str, Runs]:
+    return runs_of(SWEEP, fake_sweep(tmp_path / "runs", SWEEP))
+
+
+@pytest.fixture
+def file(runs: dict[str, Runs], tmp_path: Path) -> Path:
+    save(tmp_path / "table14.json", Kept("table14", ("data=mocap",), runs, overrides_of(SWEEP)))
+    return tmp_path / "table14.json"
+
+
+def plan_today(monkeypatch: pytest.MonkeyPatch, runs: dict[str, Runs], **changed: str) -> None:
+    """Plan Table 14 as the kept runs have it; `changed` gives the arm "2" other ids or stages."""
+    entries = [
+        Entry(label, seed, run.id, ("e1",)) for label, one in runs.items() for seed, run in one.items()
+    ]
+    planned = [
+        replace(entry, id=changed.get("id", entry.id), stages=(changed.get("stage", "e1"),))
+        if entry.label == "2"
+        else entry
+        for entry in entries
+    ]
+    monkeypatch.setattr(
+        "memmlp.config.kept_elsewhere.make_plan",
+        lambda sweep, outputs: Plan(sweep.name, outputs, tuple(planned), ()),
+    )
+
+
+def wanted(runs: dict[str, Runs], label: str = "2") -> Plan:
+    """The plan of another sweep, which wants the arm's runs under another name, one of them twice."""
+    entries = [Entry("Mine", seed, run.id, ("e1",)) for seed, run in runs[label].items()]
+    return Plan("mine", Path(), (*entries, replace(entries[0], label="Twin")), ())
+
+
+def test_the_very_same_runs_are_taken(monkeypatch: pytest.MonkeyPatch, runs: dict[str, Runs], file: Path):
+    plan_today(monkeypatch, runs)
+    found, origins = with_kept({"Mine": {}, "Twin": {}}, wanted(runs), [file])
+    assert {seed: run.id for seed, run in found["Mine"].items()} == {
+        seed: run.id for seed, run in runs["2"].items()
+    }
+    assert [run.id for run in found["Twin"].values()] == [runs["2"][0].id]
+    assert origins == ("table14",)
+
+
+def test_runs_of_the_outputs_stay(monkeypatch: pytest.MonkeyPatch, runs: dict[str, Runs], file: Path):
+    plan_today(monkeypatch, runs)
+    own = runs["2, 4"][0]
+    found, _ = with_kept({"Mine": {0: own}}, wanted(runs), [file])
+    assert found["Mine"][0] is own
+    assert sorted(found["Mine"]) == sorted(runs["2"])
+
+
+def test_a_run_of_an_earlier_default_is_not_taken(
+    monkeypatch: pytest.MonkeyPatch, runs: dict[str, Runs], file: Path
+):
+    """Both sweeps have another run in the cell today, and it is the same one in both."""
+    plan_today(monkeypatch, runs, id="f" * 16)
+    other = runs["2, 4"][0].id
+    entries = (Entry("Mine", 0, "f" * 16, ("e1",)), Entry("Other", 0, other, ("e1",)))
+    found, _ = with_kept({"Mine": {}, "Other": {}}, Plan("mine", Path(), entries, ()), [file])
+    assert found["Mine"] == {}
+    assert found["Other"][0].id == other
+
+
+def test_another_evaluation_of_a_run_is_not_taken(
+    monkeypatch: pytest.MonkeyPatch, runs: dict[str, Runs], file: Path
+):
+    plan_today(monkeypatch, runs, stage="e2")
+    assert with_kept({"Mine": {}}, wanted(runs), [file]) == ({"Mine": {}, "Twin": {}}, ())
+
+
+def test_a_file_without_such_runs_is_not_planned(
+    monkeypatch: pytest.MonkeyPatch, runs: dict[str, Runs], file: Path
+):
+    def refused(*given: object) -> Plan:
+        raise AssertionError("planned")
+
+    monkeypatch.setattr("memmlp.config.kept_elsewhere.make_plan", refused)
+    plan = Plan("mine", Path(), (Entry("Mine", 0, "0" * 16, ("e1",)),), ())
+    assert with_kept({"Mine": {}}, plan, [file]) == ({"Mine": {}}, ())
