@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from memmlp.statistics import (
+from memmlp.tables.statistics import (
     holm,
 )
 

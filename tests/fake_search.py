@@ -9,10 +9,10 @@ from typing import Any
 
 from memmlp.runs.identity import run_id
 from memmlp.runs.run import Run
-from memmlp.search.director import Director
-from memmlp.search.spec import Search, Value, parse_search
-from memmlp.search.study import Study
 from memmlp.sweep.plan import Plan, RunTask
+from memmlp.sweep.search.director import Director
+from memmlp.sweep.search.spec import Search, Value, parse_search
+from memmlp.sweep.search.study import Study
 
 STEPS = 30
 SPACE = {

@@ -54,8 +54,8 @@ def current_rounds(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
 
 def check(overrides: Sequence[str], wanted: bool, most: int | None) -> None:
     """Refuse words of the command line that don't go together. Raises InputError."""
-    from memmlp.statistics import looks
     from memmlp.tables.rounds import MOST
+    from memmlp.tables.statistics import looks
 
     if most is not None and not wanted:
         raise InputError("--max-seeds: goes with --until-decided")

@@ -17,9 +17,9 @@ from memmlp.common.lease import Lock
 
 if TYPE_CHECKING:
     from memmlp.pipeline.experiment import Experiment
-    from memmlp.search.spec import Search, Value
-    from memmlp.search.study import Study
     from memmlp.sweep.plan import RunTask
+    from memmlp.sweep.search.spec import Search, Value
+    from memmlp.sweep.search.study import Study
 
 
 @click.command("tune")
@@ -44,7 +44,7 @@ def tune(
     sweep`. Started again, it goes on where it stopped.
     """
     from memmlp.common.files import write_json
-    from memmlp.search.study import Study
+    from memmlp.sweep.search.study import Study
 
     if workers.engine == "debug":  # it would wait within this process for the trials that this one hands out
         raise InputError("executor=debug: allowed of a search is local, slurm, ray or dask")
@@ -97,7 +97,7 @@ def prepare_search(words: Sequence[str], config_dir: Path | None, outputs: Path)
     """
     from memmlp.common.files import digest
     from memmlp.config.plugins import activate, named
-    from memmlp.search.spec import parse_search
+    from memmlp.sweep.search.spec import parse_search
 
     activate(named(words))
     own = [word for word in words if word.lstrip("+~").partition("=")[0].split(".")[0] == "search"]
@@ -184,8 +184,8 @@ def show(setup: Setup) -> None:
     """Print how far the search is."""
     from rich.console import Console
 
-    from memmlp.search.board import render
-    from memmlp.search.study import Study
+    from memmlp.sweep.search.board import render
+    from memmlp.sweep.search.study import Study
 
     study = Study.view(setup.search, setup.folder.name, setup.folder)
     Console(highlight=False).print(render(study, setup.outputs) if study else "not begun")
@@ -193,9 +193,9 @@ def show(setup: Setup) -> None:
 
 def search(setup: Setup, study: Study, workers: Workers) -> None:
     """Bring the study to as many trials as are wanted."""
-    from memmlp.search.board import SearchBoard
-    from memmlp.search.director import Director, direct
     from memmlp.sweep.plan import Plan
+    from memmlp.sweep.search.board import SearchBoard
+    from memmlp.sweep.search.director import Director, direct
 
     plan = Plan(setup.folder.name, setup.outputs, (), (), open=True)
     director = Director(study, partial(_tasks, setup), plan)
@@ -206,7 +206,7 @@ def search(setup: Setup, study: Study, workers: Workers) -> None:
 def leave(setup: Setup, study: Study) -> None:
     """Write what the search found into its folder."""
     from memmlp.config.packaged import packaged
-    from memmlp.search import results
+    from memmlp.sweep.search import results
 
     results.write_trials(study, setup.folder / "trials.csv")
     groups = [path.name for path in packaged("conf").iterdir() if path.is_dir()]
@@ -225,8 +225,8 @@ def summary(setup: Setup, study: Study) -> None:
     from rich.text import Text
 
     from memmlp.pipeline.run_stages import partial_words
-    from memmlp.search.board import counts, figures, row, trials_table
-    from memmlp.search.results import importances
+    from memmlp.sweep.search.board import counts, figures, row, trials_table
+    from memmlp.sweep.search.results import importances
 
     console = Console(highlight=False)
     best = study.best()

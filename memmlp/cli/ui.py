@@ -32,8 +32,8 @@ def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path)
     import webbrowser
 
     from memmlp.common.page_access import check_token
-    from memmlp.ui.answers import Answers
-    from memmlp.ui.server import Server
+    from memmlp.report.ui.answers import Answers
+    from memmlp.report.ui.server import Server
 
     check_token(host, token)
     with (

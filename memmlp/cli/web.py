@@ -11,8 +11,8 @@ from memmlp.cli.options import PATH, Finite, outputs_option, plugins_option
 
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
-    from memmlp.web.clips import SiteClip
-    from memmlp.web.networks import SiteNetwork
+    from memmlp.live.web.clips import SiteClip
+    from memmlp.live.web.networks import SiteNetwork
 
 BASE = ("profile=paper", "model=avatar_poser")
 """What the bench compares with: AvatarPoser of the paper's size, with random weights."""
@@ -59,7 +59,7 @@ def web(
     """
     from memmlp.common.errors import InputError
     from memmlp.config.open_run import open_run
-    from memmlp.web.site import Site, check_place
+    from memmlp.live.web.site import Site, check_place
 
     check_place(out)
     opened = [open_run(outputs, run) for run in dict.fromkeys(runs)]
@@ -81,7 +81,7 @@ def clips_of(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
     """Return the middle of some test clips of a run, evenly spaced among all of them."""
     import numpy as np
 
-    from memmlp.web.clips import packed
+    from memmlp.live.web.clips import packed
 
     test = opened.test
     chosen = np.linspace(0, len(test.names) - 1, min(count, len(test.names))).round().astype(int)
@@ -90,9 +90,9 @@ def clips_of(opened: OpenedRun, count: int, seconds: float) -> list[SiteClip]:
 
 def network_of(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
     """Return a run's network as a site has it."""
+    from memmlp.live.web.networks import SiteNetwork
     from memmlp.runs.identity import flatten
     from memmlp.runs.name import run_name
-    from memmlp.web.networks import SiteNetwork
 
     run, config = opened.run, flatten(opened.run.config)
     name, model = run_name(run.manifest, config).removeprefix("default · "), config["model.name"]
@@ -103,6 +103,6 @@ def network_of(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
 def base() -> SiteNetwork:
     """Return AvatarPoser of the paper's size."""
     from memmlp.config.build import untrained
-    from memmlp.web.networks import SiteNetwork
+    from memmlp.live.web.networks import SiteNetwork
 
     return SiteNetwork("avatar-poser", "AvatarPoser", "random", untrained(BASE))

@@ -12,9 +12,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from memmlp.common.errors import InputError
 from memmlp.config.instantiate import built, located
+from memmlp.motion.motion_source import MotionSource
 from memmlp.motion.preparing.cache import ClipFolder
 from memmlp.motion.preparing.folders import Folders, Root
-from memmlp.motion.preparing.source import MotionSource
 from memmlp.motion.preparing.splits import MixedSplit, SeededSplit, Split
 
 

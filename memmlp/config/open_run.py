@@ -15,7 +15,7 @@ from torch import Tensor
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment, config_of
 from memmlp.motion.dataset import MotionDataset
-from memmlp.motion.preparing.source import Prepared
+from memmlp.motion.motion_source import Prepared
 from memmlp.networks.motion_model import MotionModel
 from memmlp.pipeline.devices import device
 from memmlp.pipeline.experiment import Experiment

@@ -11,7 +11,7 @@ import torch
 
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
-from memmlp.motion.preparing.source import MotionSource, Prepared
+from memmlp.motion.motion_source import MotionSource, Prepared
 from memmlp.networks.architecture import VQVAE_SETTINGS, Architecture
 from memmlp.runs.identity import NETWORK, Identity, deployment_id, evaluation_id
 from memmlp.runs.run import Run

@@ -14,9 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter, ScalarFormatter
 
-from memmlp.statistics import performance_profile
 from memmlp.sweep.spec import COSTS
 from memmlp.tables.distributions import Distribution
+from memmlp.tables.statistics import performance_profile
 from memmlp.tables.table import Cell, Table
 from memmlp.tables.table_text import heading
 

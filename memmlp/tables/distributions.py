@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from memmlp.statistics import interquartile_mean, probability_of_improvement
 from memmlp.sweep.spec import COSTS, Arm, Sweep
 from memmlp.tables.effects import Runs, control_arm, with_existing_branches
+from memmlp.tables.statistics import interquartile_mean, probability_of_improvement
 
 
 class Distribution(NamedTuple):

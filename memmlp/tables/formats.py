@@ -14,7 +14,7 @@ from typing import Any
 from rich.console import Console
 
 from memmlp.common.files import plain
-from memmlp.statistics import Verdict
+from memmlp.tables.statistics import Verdict
 from memmlp.tables.table import Table
 from memmlp.tables.table_text import MINUS, Grid, Line, caption, grids, legend
 

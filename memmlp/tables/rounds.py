@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from memmlp.statistics import Verdict, looks, seeds_needed, sequential, spending, verdict
 from memmlp.sweep.spec import COSTS, MODES, Arm, Sweep
 from memmlp.tables.effects import (
     Runs,
@@ -29,6 +28,7 @@ from memmlp.tables.effects import (
     tested,
     with_existing_branches,
 )
+from memmlp.tables.statistics import Verdict, looks, seeds_needed, sequential, spending, verdict
 from memmlp.tables.table import Effect, Key
 
 MOST = 13  # the largest number of seeds of an arm by default

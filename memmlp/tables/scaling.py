@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from memmlp.statistics import holm, paired_effects
-from memmlp.statistics.effects import LEVEL
-from memmlp.statistics.scaling import Estimate, Line, fit
 from memmlp.sweep.spec import COMPUTE, COSTS, Arm, Sweep
 from memmlp.tables.effects import Paired, Runs, control_arm, paired
+from memmlp.tables.statistics import holm, paired_effects
+from memmlp.tables.statistics.effects import LEVEL
+from memmlp.tables.statistics.scaling import Estimate, Line, fit
 from memmlp.tables.table import Key
 
 MODE = "stream"

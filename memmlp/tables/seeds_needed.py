@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from memmlp.statistics import seeds_needed
 from memmlp.sweep.spec import MODES, Sweep
 from memmlp.tables.effects import Runs, paired, paper_effect, with_existing_branches
+from memmlp.tables.statistics import seeds_needed
 
 
 class Need(NamedTuple):

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from memmlp.statistics import Verdict
 from memmlp.sweep.spec import COSTS
+from memmlp.tables.statistics import Verdict
 
 LEVEL = 0.05
 
@@ -33,7 +33,7 @@ class Effect:
         low, high: its 95 % interval.
         p: its p-value, not corrected.
         holm: its p-value, corrected over the table's comparisons.
-        equal: the corrected p-value of equivalence (see `memmlp.statistics`).
+        equal: the corrected p-value of equivalence (see `memmlp.tables.statistics`).
         verdict: what follows from these.
         detectable: the smallest difference that this comparison would have found with 80 % power.
         seeds, clips, groups: how many were paired.

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from memmlp.evaluation.units import HIGHER, UNITS
-from memmlp.statistics import Verdict
 from memmlp.sweep.spec import COSTS
+from memmlp.tables.statistics import Verdict
 from memmlp.tables.table import Cell, Row, Table
 
 COST_UNITS = {

@@ -16,7 +16,7 @@ from memmlp.evaluation.metrics import OwnMetrics
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.mirror import MirroredDataset
-from memmlp.motion.preparing.source import Prepared
+from memmlp.motion.motion_source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architecture import Architecture
 from memmlp.networks.motion_model import MotionModel

@@ -13,7 +13,7 @@ from memmlp.evaluation import modes
 from memmlp.evaluation.metrics import OwnMetrics
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset, WindowSampler
-from memmlp.motion.preparing.source import Prepared
+from memmlp.motion.motion_source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architecture import Architecture, RefinedArchitecture
 from memmlp.networks.motion_model import MotionModel

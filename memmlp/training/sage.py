@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from memmlp.common import distributed
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.mirror import MirroredDataset
-from memmlp.motion.preparing.source import Prepared
+from memmlp.motion.motion_source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architecture import Architecture, PartedArchitecture
 from memmlp.networks.baselines.sage import LOWER, UPPER

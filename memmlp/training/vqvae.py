@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from memmlp.common import distributed
 from memmlp.motion.dataset import MotionDataset, WindowSampler
+from memmlp.motion.motion_source import Prepared
 from memmlp.motion.normalizer import Normalizer
-from memmlp.motion.preparing.source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architecture import Architecture
 from memmlp.networks.vqvae import VQVAE, rotation_error

@@ -24,7 +24,7 @@ from memmlp.config.schema import restored
 from memmlp.runs.environment import code_digest
 from memmlp.runs.identity import evaluation_id, evaluation_settings
 from memmlp.runs.run import Run
-from memmlp.search.spec import parse_search
+from memmlp.sweep.search.spec import parse_search
 from memmlp.tables.table_text import heading
 
 OWN = [f"plugins=[{PACKAGE}]", "experiment=feet", "profile=tiny"]

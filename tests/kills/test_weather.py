@@ -21,9 +21,9 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
 from memmlp.runs.evaluation_file import intact, write_report
 from memmlp.runs.run import Run
-from memmlp.search.director import objectives
-from memmlp.search.spec import Objective
 from memmlp.sweep.plan import Entry, Plan, RunTask
+from memmlp.sweep.search.director import objectives
+from memmlp.sweep.search.spec import Objective
 from memmlp.sweep.worker import attempt
 from memmlp.tables.measured_run import load
 

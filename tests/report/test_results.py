@@ -16,10 +16,10 @@ from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept, dumps, load_kept, overrides_of, save, without_paths
 from memmlp.report.markdown import KeptTable, Words, origin_words, pages
 from memmlp.report.unbacked_claims import NEVER, WORDS, claims
-from memmlp.statistics import Verdict, holm, paired_effects
 from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.spec import Sweep
 from memmlp.tables.build_table import collect
+from memmlp.tables.statistics import Verdict, holm, paired_effects
 from memmlp.tables.table_text import MINUS
 
 ROOT = Path(__file__).parent.parent.parent

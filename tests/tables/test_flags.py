@@ -13,11 +13,11 @@ from fake_table import cell, printed
 from memmlp.report.kept_results import Kept, dumps, load_kept
 from memmlp.report.markdown import origin_words
 from memmlp.runs.evaluation_file import write_report
-from memmlp.statistics import Verdict
 from memmlp.sweep.spec import Sweep
 from memmlp.tables.build_table import collect
 from memmlp.tables.formats import FORMATS
 from memmlp.tables.measured_run import load
+from memmlp.tables.statistics import Verdict
 from memmlp.tables.table import Table
 
 

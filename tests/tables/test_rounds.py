@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from memmlp.statistics import Verdict
 from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.spec import Sweep
 from memmlp.tables.build_table import collect
@@ -18,6 +17,7 @@ from memmlp.tables.effects import Runs
 from memmlp.tables.formats import markdown
 from memmlp.tables.measured_run import Measured, Origin
 from memmlp.tables.rounds import Rounds, advanced, as_json, begin, of_json, outlook
+from memmlp.tables.statistics import Verdict
 
 ORIGIN = Origin("c", False, "d", "cpu")
 CLIPS = [f"clip {number}" for number in range(10)]

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from fake_cells import STEP, STEPS, cells, steps_of
 
-from memmlp.statistics.scaling import fit
 from memmlp.tables.effects import paired
 from memmlp.tables.scaling import Change, Trend, trends
+from memmlp.tables.statistics.scaling import fit
 from memmlp.tables.table import Key
 
 PAPER = {"profile=paper": STEP * 1e6}

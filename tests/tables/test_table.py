@@ -10,8 +10,8 @@ import pytest
 from fake_table import cell, printed
 
 from memmlp.runs.run import Run
-from memmlp.statistics import Verdict
 from memmlp.sweep.spec import Sweep
+from memmlp.tables.statistics import Verdict
 from memmlp.tables.table import Effect, Table
 
 

@@ -221,7 +221,7 @@ def summary(rows: Sequence[dict[str, Any]], times: float) -> dict[str, Any]:
     """
     import numpy as np
 
-    from memmlp.statistics import seed_effects, verdict
+    from memmlp.tables.statistics import seed_effects, verdict
 
     ratios = [row["today"]["seconds"] / row["recipe"]["seconds"] if row["recipe"] else np.nan for row in rows]
     mean, low, high, p = (float(part[0]) for part in seed_effects(np.log([ratios]) - np.log(times))[:4])

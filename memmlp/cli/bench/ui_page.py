@@ -60,8 +60,8 @@ def first_answer(outputs: Path) -> float:
     """Return the seconds from a new server's start to its answer with all runs."""
     from urllib.request import urlopen
 
-    from memmlp.ui.answers import Answers
-    from memmlp.ui.server import Server
+    from memmlp.report.ui.answers import Answers
+    from memmlp.report.ui.server import Server
 
     began = time.perf_counter()
     with Server(Answers(outputs), 0) as server, urlopen(f"{server.url}api/runs") as answer:
@@ -73,8 +73,8 @@ def first_answer(outputs: Path) -> float:
 
 def in_browser(outputs: Path, browser: str) -> tuple[float, float]:
     """Return the seconds until a browser shows the table, and those of a filter that few runs pass."""
-    from memmlp.ui.answers import Answers
-    from memmlp.ui.server import Server
+    from memmlp.report.ui.answers import Answers
+    from memmlp.report.ui.server import Server
 
     told: dict[str, float] = {}
     heard = threading.Event()

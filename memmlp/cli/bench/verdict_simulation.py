@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from memmlp.statistics.calibration import EFFECT, MARGIN, TABLE, broken, extreme, grid, simulate
-from memmlp.statistics.effects import LEVEL
+from memmlp.tables.statistics.calibration import EFFECT, MARGIN, TABLE, broken, extreme, grid, simulate
+from memmlp.tables.statistics.effects import LEVEL
 
 if TYPE_CHECKING:
     from rich.table import Table

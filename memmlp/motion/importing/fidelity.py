@@ -29,7 +29,7 @@ from memmlp.motion.importing.anatomy import (
     unit,
 )
 from memmlp.motion.importing.axes import LEG
-from memmlp.motion.importing.recording import MappedMotion
+from memmlp.motion.importing.mapped_motion import MappedMotion
 from memmlp.motion.importing.skeleton import Z_UP
 from memmlp.motion.plausible import implausible
 

@@ -19,7 +19,8 @@ from memmlp.motion.body import JOINTS, PARENTS
 from memmlp.motion.clip import Clip
 from memmlp.motion.importing import anatomy
 from memmlp.motion.importing.anatomy import HINGES, HIPS, LEGS, LIMBS, Segment, least_rotation, segments
-from memmlp.motion.importing.recording import MappedMotion, Recording
+from memmlp.motion.importing.mapped_motion import MappedMotion
+from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.rest_pose import RestPose, find_rest_pose
 from memmlp.motion.importing.skeleton import Z_UP, SkeletonMap
 

@@ -9,7 +9,8 @@ import numpy as np
 from memmlp.motion.body import JOINTS, PARENTS
 from memmlp.motion.importing import anatomy
 from memmlp.motion.importing.axes import settle
-from memmlp.motion.importing.recording import MappedMotion, Recording, pick_joints
+from memmlp.motion.importing.mapped_motion import MappedMotion, pick_joints
+from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.rest_pose import RestPose, find_rest_pose
 from memmlp.motion.importing.retarget import fit
 from memmlp.motion.importing.skeleton import SkeletonMap

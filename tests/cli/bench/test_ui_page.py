@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from memmlp.cli.bench import ui_page
-from memmlp.ui.index import Index
+from memmlp.report.ui.index import Index
 
 
 @pytest.mark.slow

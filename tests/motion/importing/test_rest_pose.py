@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh import read_bvh
-from memmlp.motion.importing.recording import pick_joints
+from memmlp.motion.importing.mapped_motion import pick_joints
 from memmlp.motion.importing.rest_pose import RestPose, find_rest_pose
 from memmlp.motion.importing.skeleton import SkeletonMap, load_skeleton
 from memmlp.motion.synthetic import synthesize_clip

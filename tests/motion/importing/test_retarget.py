@@ -17,7 +17,7 @@ from memmlp.motion.formats.bvh import END, Bvh, read_bvh
 from memmlp.motion.geometry import axis_angle_to_matrix, forward_kinematics
 from memmlp.motion.importing.anatomy import segments
 from memmlp.motion.importing.convert import NONE, convert
-from memmlp.motion.importing.recording import pick_joints
+from memmlp.motion.importing.mapped_motion import pick_joints
 from memmlp.motion.importing.retarget import Retargeting, fit
 from memmlp.motion.importing.skeleton import SkeletonMap, find_skeleton, load_skeleton
 from memmlp.motion.synthetic import synthesize_clip

@@ -1,0 +1,174 @@
+"""A site's networks: the graphs that are timed, and the one that is played and worn."""
+
+from __future__ import annotations
+
+import gzip
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from torch import Tensor
+
+from memmlp.common.progress import tell
+from memmlp.deploy.deployment import lower
+from memmlp.deploy.export import export
+from memmlp.live.full_graph import export_full
+from memmlp.live.rotations import BodyTree
+from memmlp.live.spaces import SPACES
+from memmlp.live.wearer import stature
+from memmlp.live.web.weights import without_weights
+from memmlp.motion.body import FPS, JOINTS, PARENTS, TRACKED
+from memmlp.networks.motion_model import MotionModel
+from memmlp.networks.streaming import StreamingGraph, has_stream, streaming
+
+SPACE = SPACES["openxr"]  # of everything on the site
+EYES = 0.936
+"""The height of the eyes over that of the person (Drillis and Contini 1966, in Winter, Biomechanics and Motor
+Control of Human Movement, fig. 4.1), by which a headset tells how tall its wearer is."""
+
+Entry = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class SiteNetwork:
+    """A network of a site.
+
+    Attributes:
+        key: its name in files and on the page's inside.
+        name: its name for people.
+        run: its run's id, "random" for random weights.
+        model: the network as it was trained.
+        clips: the names of its test clips on the site.
+    """
+
+    key: str
+    name: str
+    run: str
+    model: MotionModel
+    clips: tuple[str, ...] = ()
+
+    @property
+    def trained(self) -> bool:
+        """Whether it can be played and worn, and not timed alone."""
+        return self.run != "random"
+
+
+@dataclass(frozen=True)
+class Writer:
+    """Writes networks into a site's folder.
+
+    Attributes:
+        folder: the site's folder.
+        calibration: clips (N, 252) that int8's ranges are found with.
+        bench: whether there are graphs to be timed; if not, only those to be played.
+    """
+
+    folder: Path
+    calibration: Sequence[Tensor]
+    bench: bool = True
+
+    def write(self, network: SiteNetwork) -> Entry:
+        """Write a network's graphs, and return what the page has to know of it."""
+        tell(f"web: export {network.name}")
+        model = network.model.cpu().eval()
+        stream = streaming(model) if has_stream(model) else None
+        with tempfile.TemporaryDirectory() as temporary:
+            made = Path(temporary)
+            played = self._played(network, stream, made) if network.trained else None
+            graphs = self._timed(network, stream, made, played) if self.bench else []
+        return {
+            "key": network.key,
+            "name": network.name,
+            "run": network.run,
+            "frames": model.frames,
+            "fps": FPS,
+            "parameters": model.count_parameters(),
+            "body": body_of(model.normalizer.rest.double().numpy()),
+            "play": played,
+            "graphs": graphs,
+            "clips": list(network.clips),
+        }
+
+    def _played(self, network: SiteNetwork, stream: StreamingGraph | None, made: Path) -> Entry:
+        """Write the full graph with its weights."""
+        path = _whole(made, "streaming" if stream else "naive")
+        export_full(stream or network.model, path, network.run, SPACE.name)
+        return {"file": self._kept(network.key, path.read_bytes()), "weights": []}
+
+    def _timed(
+        self, network: SiteNetwork, stream: StreamingGraph | None, made: Path, played: Entry | None
+    ) -> list[Entry]:
+        """Write the graphs that are timed: as published, as stream, and that in less precision."""
+        rows = [self._pair(network, network.model, "naive", made, None if stream else played)]
+        if stream is not None:
+            rows.append(self._pair(network, stream, "streaming", made, played))
+            rows += [self._less_precise(network, stream, precision, made) for precision in ("int8", "fp16")]
+        return rows
+
+    def _less_precise(
+        self, network: SiteNetwork, stream: StreamingGraph, precision: str, made: Path
+    ) -> Entry:
+        """Write a stream in less precision; of int8 there is no full graph."""
+        path, key, whole = made / "less.onnx", f"{network.key}-{precision}", None
+        if precision == "fp16":
+            lower(precision, _whole(made, "streaming"), path, stream, self.calibration)
+            whole = self.skeleton(f"{key}-whole", onnx.load(path))
+        lower(precision, made / "streaming.onnx", path, stream, self.calibration)
+        step = self.skeleton(key, onnx.load(path))
+        return {"graph": "streaming", "precision": precision, "step": step, "whole": whole}
+
+    def _pair(
+        self,
+        network: SiteNetwork,
+        graph: MotionModel | StreamingGraph,
+        name: str,
+        made: Path,
+        played: Entry | None,
+    ) -> Entry:
+        """Write a graph in float32, alone and as the whole way from trackers to joints."""
+        step, whole = made / f"{name}.onnx", _whole(made, name)
+        export(graph, step, network.run)
+        if played is None:
+            export_full(graph, whole, network.run, SPACE.name)
+            played = self.skeleton(f"{network.key}-{name}-whole", onnx.load(whole))
+        alone = self.skeleton(f"{network.key}-{name}", onnx.load(step))
+        return {"graph": name, "precision": "fp32", "step": alone, "whole": played}
+
+    def skeleton(self, name: str, model: onnx.ModelProto) -> Entry:
+        """Write a graph without its weights, and return where it is and what is to be drawn for it."""
+        drawn = without_weights(model)
+        file = self._kept(name, model.SerializeToString())
+        return {"file": file, "weights": [part._asdict() for part in drawn]}
+
+    def _kept(self, name: str, content: bytes) -> str:
+        """Write a file of the site, compressed, and return its address there."""
+        address = f"networks/{name}.onnx.gz"
+        (self.folder / address).parent.mkdir(exist_ok=True)
+        (self.folder / address).write_bytes(gzip.compress(content, 6, mtime=0))
+        return address
+
+
+def _whole(made: Path, graph: str) -> Path:
+    return made / f"{graph}-whole.onnx"
+
+
+def body_of(rest: np.ndarray) -> Entry:
+    """Return what a stream has to know of a network's body.
+
+    Args:
+        rest: joints in the rest pose (22, 3), metres, SMPL's body frame.
+
+    Returns:
+        Head and wrists in the T-pose and the lowest joint's height, in the site's frame of reference, and the
+        body's height, metres; and EYES.
+    """
+    return {
+        "rest": (rest[list(TRACKED)] * SPACE.body).tolist(),
+        "floor": float(rest[:, 1].min()),
+        "height": stature(BodyTree(JOINTS, PARENTS, rest)),
+        "eyes": EYES,
+    }

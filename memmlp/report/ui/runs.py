@@ -1,0 +1,303 @@
+"""What the pages of runs are told: the table's rows, and everything about a single run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from memmlp.common.errors import InputError
+from memmlp.common.files import read_json
+from memmlp.report.ui.facts import COSTS, read_config
+from memmlp.report.ui.index import Index
+from memmlp.runs.identity import NEUTRAL, flatten, is_data_path
+from memmlp.runs.lookup import is_trained
+from memmlp.runs.run import Run
+from memmlp.sweep.plan import Plan
+from memmlp.tables.measured_run import load
+from memmlp.tables.table_text import better, unit
+
+SHOWN_FILES = (
+    "config.yaml",
+    "manifest.json",
+    "metrics.jsonl",
+    "code.patch",
+    "FAILED",
+    "notes.json",
+    "poses.png",
+)
+"""Files of a run that the page may show as they are."""
+
+MOST_FILES = 200
+
+
+class Rows:
+    """The rows of the table of runs, for a page that has some of them already."""
+
+    def __init__(self, index: Index, places: Callable[[], Mapping[str, Sequence[Mapping[str, Any]]]]):
+        self.index, self.places = index, places
+
+    def since(self, generation: int, heads: str = "") -> dict[str, Any]:
+        """Return the rows that changed after a generation, and which runs are gone.
+
+        `keys` and `metrics` are the heads of each row's `config` and `metrics`. Where they are not those that
+        the page knows (`heads`), all rows are told.
+        """
+        with self.index.lock:
+            runs, now, removed = dict(self.index.runs), self.index.generation, dict(self.index.removed)
+        where = self.places()
+        keys, metrics = differing(runs.values()), measured(runs.values())
+        known = "|".join([*keys, *metrics, str(sum(map(len, where.values())))])
+        whole = generation == 0 or heads != str(hash(known))
+        rows = [
+            row(run, keys, metrics, where.get(run_id, []))
+            for run_id, run in runs.items()
+            if whole or run["generation"] > generation
+        ]
+        gone = [run_id for run_id, when in removed.items() if when > generation]
+        return {
+            "generation": now,
+            "heads": str(hash(known)),
+            "whole": whole,
+            "keys": keys,
+            "minor": minor(keys),
+            "paths": list(filter(is_data_path, keys)),
+            "metrics": metrics,
+            "units": units(metrics),
+            "sets": sets(runs.values()),
+            "shared": shared(runs.values()),
+            "rows": rows,
+            "removed": gone,
+        }
+
+
+def row(
+    facts: Mapping[str, Any], keys: Sequence[str], metrics: Sequence[str], where: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return a run's row in the table."""
+    own = (
+        "id",
+        "name",
+        "kind",
+        "status",
+        "started",
+        "finished",
+        "seconds",
+        "device",
+        "tags",
+        "note",
+        "failure",
+        "damage",
+        "data",
+        "code",
+        "steps",
+        "recent",
+    )
+    return {
+        **{key: facts[key] for key in own},
+        "places": list(where),
+        "config": [facts["config"].get(key) for key in keys],
+        "metrics": [_short(facts["metrics"].get(metric)) for metric in metrics],
+    }
+
+
+def differing(runs: Any) -> list[str]:
+    """Return the config keys in which runs differ, in the order of the configs.
+
+    The path of data differs where the data does, whichever way it is spelled.
+    """
+    first: dict[str, Any] = {}
+    counts: dict[str, int] = {}
+    found: dict[str, None] = {}
+    total = 0
+    for run in runs:
+        total += bool(run["config"])
+        for key, value in run["config"].items():
+            counts[key] = counts.get(key, 0) + 1
+            meant = run["data"] if is_data_path(key) else value
+            if first.setdefault(key, meant) != meant:
+                found[key] = None
+    return [key for key in first if key in found or (counts[key] < total and not is_data_path(key))]
+
+
+def minor(keys: Sequence[str]) -> list[str]:
+    """Return the keys that change no result, and `profile`, whose choices other keys repeat."""
+    groups = [name for name in NEUTRAL if name != "data"]
+    return [key for key in keys if any(key == name or key.startswith(f"{name}.") for name in groups)]
+
+
+def measured(runs: Any) -> list[str]:
+    """Return the names of all numbers that were measured of some run."""
+    return list(dict.fromkeys(metric for run in runs for metric in run["metrics"]))
+
+
+def sets(runs: Iterable[Mapping[str, Any]]) -> dict[str, str]:
+    """Return, by short digest, the name and short digest of the data of runs: `mocap 78bb7c86`.
+
+    A VQ-VAE's config does not name its data; a network's on the same data does.
+    """
+    named = {run["data"]: run["data_name"] for run in runs if run["data"] and run["data_name"]}
+    return {data: f"{name} {data}" for data, name in named.items()}
+
+
+def shared(runs: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Return names that several data sets share, so that a digest must be added."""
+    found: dict[str, set[str]] = {}
+    for run in runs:
+        found.setdefault(run["name"], set()).add(run["data"])
+    return sorted(name for name, data in found.items() if len(data) > 1)
+
+
+def units(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Return, by the last word of their names, the unit of metrics, and what is better of each.
+
+    `better` is "lower" or "higher", and empty for what is no error, as the Jitter of the truth. A metric that
+    nobody knows here, since its package is not in use, is left out.
+    """
+    found = {}
+    for metric in dict.fromkeys(dotted.rpartition(".")[2] for dotted in metrics):
+        if metric in COSTS:
+            found[metric] = {"unit": COSTS[metric], "better": "lower"}
+        elif way := better(metric):
+            found[metric] = {"unit": unit(metric), "better": "" if metric.startswith("GT ") else way}
+    return found
+
+
+def _short(value: float | None) -> float | None:
+    return None if value is None else float(f"{value:.6g}")
+
+
+def page(
+    index: Index, plans: Sequence[Plan], every: Mapping[str, Sequence[Mapping[str, Any]]], run_id: str
+) -> dict[str, Any]:
+    """Return everything that a run's page shows. Raises KeyError for an unknown run.
+
+    Args:
+        index: the runs.
+        plans: the plans of all sweeps.
+        every: the places of all runs (`places`).
+        run_id: which run.
+    """
+    with index.lock:
+        facts = dict(index.runs[run_id])
+        known = dict(index.runs)
+    run = Run.of(index.outputs, run_id)
+    where, config = every.get(run_id, []), whole_config(run)
+    control = control_of(plans, run_id, known)
+    return {
+        **facts,
+        "places": where,
+        "config": config,
+        "paths": list(filter(is_data_path, config)),
+        "partners": partners(known, run_id, control),
+        "control": control
+        and {
+            "id": control,
+            "name": known[control]["name"],
+            "data": known[control]["data"],
+            "config": whole_config(Run.of(index.outputs, control)),
+        },
+        "manifest": flatten(run.manifest),
+        "clips": clips(run),
+        "latency": latency(run),
+        "changed": verified(run),
+        "files": files(run.folder),
+    }
+
+
+def whole_config(run: Run) -> dict[str, Any]:
+    """Return the dotted keys of a run's config; empty where it can't be read."""
+    try:
+        return flatten(read_config(run.config_path))
+    except ValueError:
+        return {}
+
+
+def control_of(plans: Sequence[Plan], run_id: str, known: Mapping[str, Any]) -> str | None:
+    """Return the run of the same seed in the arm that the first sweep of a run names first; None for none."""
+    for plan in plans:
+        seeds = [entry.seed for entry in plan.entries if entry.id == run_id]
+        first = plan.entries[0].label if plan.entries else None
+        for entry in plan.entries:
+            if entry.label == first and entry.seed in seeds and entry.id != run_id and entry.id in known:
+                return entry.id
+    return None
+
+
+def partners(known: Mapping[str, Mapping[str, Any]], run_id: str, control: str | None = None) -> list[str]:
+    """Return the finished networks on a run's own data, the one to see beside it first.
+
+    That is its control, then those of its seed whose configs differ in the fewest groups and keys. What
+    changes no result is no difference. The errors of other data do not compare: its runs are none of these.
+    """
+    own = known[run_id]
+    near = {
+        other["id"]: differences(own["config"], other["config"])
+        for other in known.values()
+        if other["id"] != run_id
+        and (other["kind"], other["status"]) == ("memmlp", "done")
+        and other["data"] == own["data"]
+    }
+
+    def far(other: str) -> tuple[bool, bool, int, int, str]:
+        keys = near[other]
+        return other != control, "seed" in keys, len({key.split(".")[0] for key in keys}), len(keys), other
+
+    return sorted(near, key=far)
+
+
+def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """Return the keys of two configs that differ, without those that change no result."""
+    keys = [key for key in {**one, **other} if one.get(key) != other.get(key)]
+    neutral = {*minor(keys), *filter(is_data_path, keys)}
+    return [key for key in keys if key not in neutral]
+
+
+def clips(run: Run) -> list[dict[str, Any]]:
+    """Return the errors of each test clip by mode and branch; empty where they can't be read."""
+    if not is_trained(run):
+        return []
+    try:
+        found = load(run.folder).clips
+        own = {
+            report["name"]: report.get("frames")
+            for path in run.own_evaluations
+            for report in read_json(path).get("clips", [])
+        }
+    except (InputError, KeyError, TypeError):
+        return []
+    return [
+        {
+            "name": clip,
+            "frames": own.get(clip),
+            **{mode: errors[mode] for mode in ("stream", "window") if mode in errors},
+        }
+        for clip, errors in found.items()
+    ]
+
+
+def latency(run: Run) -> dict[str, Any]:
+    """Return the numbers of the deployment that the run prefers."""
+    try:
+        record = run.preferred_deployment.record
+    except InputError:
+        return {}
+    return {key: value for key, value in flatten(record).items() if isinstance(value, int | float | str)}
+
+
+def verified(run: Run) -> list[str]:
+    """Return the files of a finished run that are missing or were changed since."""
+    return run.verify() if run.done else []
+
+
+def files(folder: Path) -> list[dict[str, Any]]:
+    """Return the files of a run's folder, with their sizes."""
+    paths = sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
+    return [
+        {
+            "name": str(path.relative_to(folder)),
+            "bytes": path.stat().st_size,
+            "shown": path.name in SHOWN_FILES and path.parent == folder,
+        }
+        for path in paths[:MOST_FILES]
+    ]

@@ -1,0 +1,308 @@
+"""What the pages of sweeps are told: how far they are, how long it will take, effects and verdicts."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import threading
+import time
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from memmlp.common.errors import InputError
+from memmlp.common.files import plain
+from memmlp.evaluation.units import UNITS
+from memmlp.report.ui.index import Index
+from memmlp.runs.identity import NETWORK, training_settings
+from memmlp.runs.run import STAGE_WORDS
+from memmlp.sweep.board import name as task_name
+from memmlp.sweep.kept_sweep import kept
+from memmlp.sweep.parsing import parse_sweep
+from memmlp.sweep.plan import Entry, Plan, RunTask
+from memmlp.sweep.spec import Arm, Sweep
+from memmlp.tables.build_table import collect, finished_runs
+from memmlp.tables.formats import as_json
+from memmlp.tables.measured_run import Measured, load
+from memmlp.tables.rounds import Rounds, standings, subject
+from memmlp.tables.rounds_file import NAME as ROUNDS_FILE
+from memmlp.tables.rounds_file import read as read_rounds
+from memmlp.tables.rounds_file import same_runs
+from memmlp.tables.statistics import Verdict
+from memmlp.tables.table_text import better, caption, heading, legend
+
+ROUNDS = "seeds were spent in rounds; memmlp table has their verdicts, these do not keep the 5 %"
+OTHERS = "seeds were spent in rounds, but not of these runs: these verdicts do not keep the 5 %"
+NOT_KEPT = "this sweep's file was not kept with it, so its first arm is the control; memmlp table has its own"
+
+
+class Made(NamedTuple):
+    """What was made of a sweep's runs: its table, and its rounds where seeds were spent in rounds."""
+
+    table: dict[str, Any]
+    rounds: dict[str, Any] | None
+
+
+class Sweeps:
+    """The sweeps below an outputs folder."""
+
+    def __init__(self, index: Index):
+        self.index = index
+        self.lock = threading.Lock()
+        self.plans: dict[Path, tuple[int, Plan]] = {}
+        self.tables: dict[str, tuple[Any, Made]] = {}
+        self.bad: dict[str, str] = {}
+
+    def known(self) -> list[Plan]:
+        """Return the plans of all sweeps, each under its folder's name, the last one changed first."""
+        found: dict[Path, tuple[int, Plan]] = {}
+        self.bad = {}
+        for path in self.index.outputs.glob("sweeps/*/plan.json"):
+            try:
+                changed = path.stat().st_mtime_ns
+                before = self.plans.get(path)
+                plan = before[1] if before and before[0] == changed else Plan.load(path)
+                found[path] = (changed, replace(plan, name=path.parent.name, outputs=self.index.outputs))
+            except (InputError, OSError) as error:
+                self.bad[path.parent.name] = str(error)
+        self.plans = found
+        return [plan for _, plan in sorted(found.values(), key=lambda one: -one[0])]
+
+    def stamp(self) -> str:
+        """Return a text that changes when a sweep comes, goes, is planned anew, or took a look."""
+        found = sorted(self.plans.items())
+        return repr([(str(p), seen, _changed(p.with_name(ROUNDS_FILE))) for p, (seen, _) in found])
+
+    def rows(self) -> dict[str, Any]:
+        """Return a row for each sweep."""
+        return {"sweeps": [self.progress(plan) for plan in self.known()], "damaged": self.bad}
+
+    def progress(self, plan: Plan) -> dict[str, Any]:
+        """Return how far a sweep is."""
+        states = self.states(plan)
+        counts = {kind: Counter(states[task.key] for task in tasks) for kind, tasks in _kinds(plan).items()}
+        sweep = self._kept(plan.name)
+        return {
+            "name": plan.name,
+            "title": caption_of(sweep) if sweep else plan.name,
+            "arms": len({entry.label for entry in plan.entries}),
+            "seeds": len({entry.seed for entry in plan.entries}),
+            "tasks": len(_kinds(plan)["networks"]),
+            "counts": dict(counts["networks"]),
+            "above": dict(counts["upstream"]),
+            "share": self._share(plan, states),
+            "left": self._time_left(plan, states),
+        }
+
+    def page(self, name: str) -> dict[str, Any]:
+        """Return everything that a sweep's page shows. Raises KeyError for an unknown sweep."""
+        plan = next((plan for plan in self.known() if plan.name == name), None)
+        if plan is None:
+            raise KeyError(name)
+        states = self.states(plan)
+        sweep = self._kept(name) or sweep_of_plan(plan)
+        metric = next((metric for metric in sweep.metrics if metric in UNITS), "MPJPE")
+        shown = {arm.label: f"stream.{arm.branch}.{metric}" for arm in sweep.arms}
+        cells = [self._cell(plan, entry, states, shown.get(entry.label, "")) for entry in plan.entries]
+        upstream = [self._upstream(plan, task, states) for task in plan.tasks if task.kind != NETWORK]
+        branches = {arm.branch for arm in sweep.arms}
+        made = self.made(plan)
+        found = {
+            "metric": metric,
+            "branch": branches.pop() if len(branches) == 1 else "",
+            "cells": cells,
+            "upstream": upstream,
+            "table": made.table,
+            "rounds": made.rounds,
+        }
+        return self.progress(plan) | found
+
+    def states(self, plan: Plan) -> dict[str, str]:
+        """Return every task's state by its key, as `Plan.states` does, from what the index knows."""
+        return plan.with_blocked({task.key: self._state(plan, task) for task in plan.tasks})
+
+    def _state(self, plan: Plan, task: RunTask) -> str:
+        facts = self.index.runs.get(task.id)
+        if facts is None:
+            return "new"
+        if facts["status"] != "done":
+            return facts["status"]
+        run = plan.run_of(task)
+        return "done" if all(map(run.has, task.stages)) else run.doing or run.state(False)
+
+    def _cell(self, plan: Plan, entry: Entry, states: Mapping[str, str], shown: str) -> dict[str, Any]:
+        facts = self.index.runs.get(entry.id, {})
+        recent = facts.get("recent") or [[0, 0, None]]
+        return {
+            "arm": entry.label, "seed": entry.seed, "id": entry.id, "state": states[entry.key],
+            "step": recent[-1][0], "steps": facts.get("steps"), "failure": facts.get("failure", ""),
+            "value": facts.get("metrics", {}).get(shown),
+        }  # fmt: skip
+
+    def _upstream(self, plan: Plan, task: RunTask, states: Mapping[str, str]) -> dict[str, Any]:
+        return {"name": task_name(plan, task), "id": task.id, "state": states[task.key]}
+
+    def _left(self, task: RunTask, state: str) -> int:
+        """Return how many steps of a task's training are left."""
+        total = int(training_settings(task.kind, task.config)["steps"] or 0)
+        facts = self.index.runs.get(task.id)
+        if state == "done" or facts is None or not facts["recent"]:
+            return 0 if state == "done" else total
+        return max(total - int(facts["recent"][-1][0]), 0)
+
+    def _share(self, plan: Plan, states: Mapping[str, str]) -> float:
+        """Return which part of all steps is done; a run that is not done has one left at least."""
+        total = sum(
+            self._left(task, "new")
+            if task.id not in self.index.runs
+            else int(self.index.runs[task.id]["steps"] or 0)
+            for task in plan.tasks
+        )
+        each = [(task, states[task.key]) for task in plan.tasks]
+        left = sum(max(self._left(task, state), state != "done") for task, state in each)
+        return 1 - left / total if total else 0.0
+
+    def _time_left(self, plan: Plan, states: Mapping[str, str]) -> float | None:
+        """Return about how many seconds of training the workers that are at it still need; None if nobody is
+        at it, or all is trained.
+        """
+        running = [task for task in plan.tasks if states[task.key] in STAGE_WORDS.values()]
+        paces = [pace for task in plan.tasks if (pace := _pace(self.index.runs.get(task.id))) is not None]
+        if not running or not paces:
+            return None
+        left = sum(
+            self._left(task, states[task.key])
+            for task in plan.tasks
+            if states[task.key] not in ("failed", "blocked")
+        )
+        return left * statistics.median(paces) / len(running) if left else None
+
+    def made(self, plan: Plan) -> Made:
+        """Return what was made of a sweep's runs, made again when one of them or its rounds changed."""
+        with self.lock:
+            runs = [(entry.key, self.index.signatures.get(entry.id)) for entry in plan.entries]
+            stamp = (runs, _changed(self._rounds_path(plan)))
+            known = self.tables.get(plan.name)
+            if known and known[0] == stamp:
+                return known[1]
+            made = self._make(plan)
+            self.tables[plan.name] = (stamp, made)
+            return made
+
+    def _make(self, plan: Plan) -> Made:
+        flags: list[str] = []
+        sweep = self._kept(plan.name)
+        if sweep is None:
+            sweep, flags = sweep_of_plan(plan), [NOT_KEPT]
+        rounds, doubts = rounds_of(sweep, plan, self._rounds_path(plan)) if not flags else (None, [])
+        sweep = rounds.spent(sweep) if rounds else sweep
+        flags += doubts
+        entries = {(entry.label, entry.seed): entry for entry in plan.entries}
+
+        def find(arm: Arm, seed: int) -> Measured | None:
+            entry = entries.get((arm.label, seed))
+            if entry is None or not plan.complete(entry):
+                return None
+            try:
+                return load(plan.run_of(entry).folder, entry.stages)
+            except InputError as error:
+                flags.append(str(error))
+                return None
+
+        made = collect(sweep, finished_runs(sweep, find), rounds=rounds)
+        table = table_words(replace(made, flags=(*made.flags, *flags)))
+        return Made(table, rounds_words(rounds, sweep) if rounds else None)
+
+    def _rounds_path(self, plan: Plan) -> Path:
+        return self.index.outputs / "sweeps" / plan.name / ROUNDS_FILE
+
+    def _kept(self, name: str) -> Sweep | None:
+        try:
+            return kept(self.index.outputs / "sweeps" / name)
+        except InputError:
+            return None
+
+
+def rounds_of(sweep: Sweep, plan: Plan, path: Path) -> tuple[Rounds | None, list[str]]:
+    """Return the rounds whose verdicts stand, None for none, and what a reader has to know otherwise."""
+    try:
+        rounds = read_rounds(path)
+        if rounds is None or not rounds.taken:
+            return None, []
+        if rounds.subject != plain(subject(sweep)):
+            return None, [OTHERS]
+        same_runs(rounds, sweep, plan, path)
+    except InputError:
+        return None, [ROUNDS]
+    return rounds, []
+
+
+def rounds_words(rounds: Rounds, sweep: Sweep) -> dict[str, Any]:
+    """Return the looks of a sweep's rounds, what each decided, and how far each arm is."""
+    looks = []
+    for seeds, level in zip(rounds.looks, rounds.levels, strict=True):
+        found = [finding for look in rounds.taken if look.seeds == seeds for finding in look.found]
+        decided = sum(finding.verdict is not Verdict.OPEN for finding in found)
+        looks.append({"seeds": seeds, "level": level, "compared": len(found), "decided": decided})
+    return {
+        "comparisons": len(rounds.family(sweep)),
+        "looks": looks,
+        "arms": [asdict(arm) for arm in standings(rounds, sweep)],
+    }
+
+
+def table_words(table: Any) -> dict[str, Any]:
+    """Return what a table holds, with its columns' heads, what is better in each, and what explains it."""
+    words = json.loads(as_json(table))
+    return {
+        **words,
+        "caption": caption(table),
+        "headings": {m: heading(m) for m in table.metrics},
+        "better": {m: better(m) for m in table.metrics},
+        "legend": legend(table),
+    }
+
+
+def _kinds(plan: Plan) -> dict[str, list[RunTask]]:
+    """Return a plan's tasks: the networks, which are its arms and seeds, and what these build upon."""
+    found: dict[str, list[RunTask]] = {"networks": [], "upstream": []}
+    for task in plan.tasks:
+        found["networks" if task.kind == NETWORK else "upstream"].append(task)
+    return found
+
+
+def caption_of(sweep: Sweep) -> str:
+    """Return a sweep's title, with its table's number in the paper."""
+    return f"Table {sweep.table}: {sweep.title}" if sweep.table else sweep.title
+
+
+def sweep_of_plan(plan: Plan) -> Sweep:
+    """Return a sweep with a plan's arms and seeds; its first arm is the control."""
+    seeds = list(dict.fromkeys(entry.seed for entry in plan.entries)) or [0]
+    arms: dict[str, list[str]] = {
+        label: [] for label in dict.fromkeys(entry.label for entry in plan.entries)
+    } or {"-": []}
+    return parse_sweep(plan.name, {"title": plan.name, "seeds": seeds, "arms": arms})
+
+
+def _changed(path: Path) -> int:
+    """Return when a file was last changed, ns; 0 where there is none."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
+def _pace(facts: Mapping[str, Any] | None) -> float | None:
+    """Return a run's seconds a step over its last entries; None where they don't tell."""
+    recent = (facts or {}).get("recent") or []
+    if len(recent) < 2 or recent[-1][0] <= recent[0][0]:
+        return None
+    seconds = recent[-1][1] - recent[0][1]
+    return (
+        seconds / (recent[-1][0] - recent[0][0])
+        if 0 < seconds < 86400 and recent[-1][1] < time.time() + 60
+        else None
+    )

@@ -1,0 +1,231 @@
+"""The director of a search: it asks the study for trials, has their runs made, and tells how they ended.
+
+A trial has a run for each seed. The first seed's run decides whether the trial is pruned; the runs of the
+other seeds are made after it.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from optuna.trial import Trial, TrialState
+
+from memmlp.common import fences
+from memmlp.common.errors import InputError
+from memmlp.runs.identity import inference
+from memmlp.runs.metrics_log import Metrics
+from memmlp.runs.run import Run
+from memmlp.sweep.board import total_steps
+from memmlp.sweep.controller import LOOK, Fleet
+from memmlp.sweep.plan import Entry, Plan, RunTask, unique
+from memmlp.sweep.search.board import SearchBoard
+from memmlp.sweep.search.spec import Objective, Value
+from memmlp.sweep.search.study import Study, values
+
+HOPELESS = 5  # so many trials that all fail end the search
+DROPPED = (TrialState.PRUNED, TrialState.FAIL)  # states of trials whose runs nobody wants any more
+
+Compose = Callable[[Mapping[str, Value]], Sequence[Sequence[RunTask]]]
+"""Makes a list of tasks for each seed from a trial's values; the last task of a list is the seed's run.
+
+Raises InputError where the config refuses the values.
+"""
+
+
+@dataclass
+class Going:
+    """A trial under way.
+
+    Attributes:
+        trial: the trial.
+        seeds: the tasks of each seed, the last of which is the seed's run.
+        wanted: for how many seeds the runs are to be made by now.
+    """
+
+    trial: Trial
+    seeds: Sequence[Sequence[RunTask]]
+    wanted: int = 0
+
+    @property
+    def tasks(self) -> list[RunTask]:
+        """The tasks that are to be done by now."""
+        return [task for tasks in self.seeds[: self.wanted] for task in tasks]
+
+    @property
+    def runs(self) -> list[str]:
+        """The ids of the seeds' runs that are to be made by now."""
+        return [tasks[-1].id for tasks in self.seeds[: self.wanted]]
+
+    def want(self, count: int) -> None:
+        """Have the runs of that many seeds made, and record their ids with the trial."""
+        if count != self.wanted:
+            self.wanted = count
+            self.trial.set_user_attr("runs", self.runs)
+
+
+class Director:
+    """The trials under way, and the plan of their runs.
+
+    Args:
+        study: owns the trials.
+        compose: makes the tasks of a trial.
+        plan: an empty, open plan; plans with the tasks of the trials under way are made from it.
+    """
+
+    def __init__(self, study: Study, compose: Compose, plan: Plan):
+        self.study, self.compose, self.plan = study, compose, plan
+        self.going: dict[int, Going] = {}
+        for trial in study.running():
+            self._begin(trial)
+
+    def look(self, capacity: int) -> Plan:
+        """Record what ended, ask for trials until `capacity` runs go on at once, and return the plan.
+
+        Raises:
+            InputError: when the first trials all failed.
+        """
+        for number in list(self.going):
+            if self._ended(self.going[number]):
+                del self.going[number]
+        while self._busy() < capacity and (trial := self.study.ask()):
+            self._check_hope()
+            self._begin(trial)
+        return self._planned()
+
+    def _begin(self, trial: Trial) -> None:
+        """Take a trial's first run into the plan. A trial whose values the config refuses fails at once."""
+        try:
+            going = Going(trial, self.compose(values(trial, self.study.search)))
+        except InputError as error:
+            self.study.fail(trial, str(error))
+            return
+        trial.set_user_attr("steps", total_steps(going.seeds[0][-1]))
+        going.want(1)
+        self.going[trial.number] = going
+
+    def _ended(self, going: Going) -> bool:
+        """Return whether the trial has ended, and record it with the study if so.
+
+        Once its first run is done, the trial wants the runs of the other seeds.
+        """
+        runs = [self.plan.run_of(tasks[-1]) for tasks in going.seeds]
+        done = [self.plan.complete(tasks[-1]) for tasks in going.seeds]
+        if other := next((reason for tasks in going.seeds if (reason := self._otherwise(tasks[-1]))), None):
+            self.study.fail(going.trial, other)
+            return True
+        news = self._report(going.trial, runs[0])
+        if done[0]:
+            going.want(len(runs))
+        if all(done):
+            self.study.complete(going.trial, [objectives(self.study.search.objectives, run) for run in runs])
+            return True
+        for task in going.tasks:
+            if failure := self.plan.run_of(task).failure:
+                self.study.fail(going.trial, failure)
+                return True
+        total = total_steps(going.seeds[0][-1])
+        return going.wanted == 1 and 0 < news < total and self.study.prune(going.trial)
+
+    def _otherwise(self, task: RunTask) -> str | None:
+        """Say why a finished run's validations are not the task's: they used its network in another way.
+
+        None where they are.
+        """
+        run, wanted = self.plan.run_of(task), inference(task.config)
+        if not run.done or inference(run.config) == wanted:
+            return None
+        return f"run {run.id} was validated with {inference(run.config)}, not {wanted}; it has no others"
+
+    def _busy(self) -> int:
+        """Return how many workers the trials under way can use: one for each wanted run that is not done.
+
+        A trial whose runs are all done still counts as one until it is recorded as ended.
+        """
+        return sum(max(1, sum(not run.done for run in self._runs(going))) for going in self.going.values())
+
+    def _runs(self, going: Going) -> list[Run]:
+        """Return a trial's runs that are to be made by now."""
+        return [Run.of(self.plan.outputs, run_id) for run_id in going.runs]
+
+    def _report(self, trial: Trial, run: Run) -> int:
+        """Report the run's new validations to the study, where there is one objective.
+
+        Returns:
+            The step of the last new validation; 0 where there is none.
+        """
+        (objective, *others) = self.study.search.objectives
+        if others:
+            return 0
+        known = trial.study.get_trials(deepcopy=False)[trial.number].intermediate_values
+        news = {e.step: objective.value(e.values) for e in validations(run) if e.step not in known}
+        for step, value in news.items():
+            self.study.report(trial, step, value)
+        return max(news, default=0)
+
+    def _planned(self) -> Plan:
+        """Return the plan of the trials under way, which cancels the runs of pruned and failed trials."""
+        entries = tuple(
+            Entry(f"trial {number}", seed, run_id)
+            for number, going in self.going.items()
+            for seed, run_id in enumerate(going.runs)
+        )
+        dropped = [trial for trial in self.study.trials if trial.state in DROPPED]
+        cancelled = {run_id for trial in dropped for run_id in trial.user_attrs.get("runs", ())}
+        return replace(
+            self.plan,
+            entries=entries,
+            tasks=unique(task for going in self.going.values() for task in going.tasks),
+            cancelled=tuple(sorted(cancelled - {entry.id for entry in entries})),
+        )
+
+    def _check_hope(self) -> None:
+        """Raise InputError when all trials so far failed, and there are at least HOPELESS of them."""
+        ended = [trial for trial in self.study.trials if trial.state.is_finished()]
+        if len(ended) >= HOPELESS and all(trial.state == TrialState.FAIL for trial in ended):
+            reason = ended[-1].user_attrs.get("reason", "no reason is known")
+            raise InputError(f"all {len(ended)} trials failed, the last one so: {reason}")
+
+
+def validations(run: Run) -> list[Metrics]:
+    """Return what a run logged on its validation split."""
+    return [entry for entry in run.metrics() if entry.phase == "val"]
+
+
+def objectives(wanted: Sequence[Objective], run: Run) -> list[float]:
+    """Return the objectives' values at a finished run's last validation.
+
+    Raises:
+        InputError: where that is missing in the log, which was damaged since.
+    """
+    found, steps = validations(run), run.config["optim"]["steps"]
+    if not found or found[-1].step != steps:
+        raise InputError(f"{run.metrics_path}: lacks the validation at step {steps}; do the run again")
+    return [objective.value(found[-1].values) for objective in wanted]
+
+
+def direct(director: Director, fleet: Fleet, board: SearchBoard, path: Path) -> None:
+    """Keep the fleet at the trials' runs until the study has all the trials it wants.
+
+    `path` is the file of the plan, which the workers read. It is touched all the time, as a sign that the
+    director lives.
+    """
+    plan = None
+    try:
+        with board:
+            while plan is None or director.going:
+                fences.check_owner(path)
+                before, plan = plan, director.look(fleet.size)
+                if plan != before:
+                    plan.save(path)
+                os.utime(path)
+                board.update(director.study)
+                fleet.keep(len(plan.left()))
+                time.sleep(LOOK)
+        replace(plan, open=False).save(path)  # workers end by themselves
+    except BaseException:
+        fleet.cancel()
+        raise

@@ -1,0 +1,208 @@
+"""What a search leaves behind: its trials as CSV, the best as experiments, Table 5 with it, and plots."""
+
+from __future__ import annotations
+
+import csv
+import io
+import warnings
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import optuna
+import yaml
+from optuna.exceptions import ExperimentalWarning
+from optuna.trial import FrozenTrial, TrialState
+
+from memmlp.common.files import atomic_write
+from memmlp.sweep.search.spec import Search
+from memmlp.sweep.search.study import Study, deviations, values
+
+TABLE = 5  # the paper's table of manual weights against learned ones
+
+
+def write_trials(study: Study, path: Path) -> None:
+    """Write all trials to a CSV file: number, state, objectives, values, runs, and the reason of a failure.
+
+    With several seeds the objectives are means, followed by the standard deviation of each and by the seeds'
+    own values.
+    """
+    names = [objective.text for objective in study.search.objectives]
+    keys = [one.key for one in study.search.space]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["trial", "state", *names, *_seed_columns(study.search), *keys, "run", "reason"])
+    for trial in study.trials:
+        figures = trial.values or [""] * len(names)
+        by_seed = _seed_values(study.search, trial)
+        params = [trial.params.get(key, "") for key in keys]
+        extra = [" ".join(trial.user_attrs.get("runs", ())), trial.user_attrs.get("reason", "")]
+        writer.writerow([trial.number, trial.state.name.lower(), *figures, *by_seed, *params, *extra])
+    atomic_write(path, text.getvalue())
+
+
+def _seed_columns(search: Search) -> list[str]:
+    """Return the heads of the columns that `_seed_values` fills."""
+    if search.seeds == 1:
+        return []
+    names = [objective.text for objective in search.objectives]
+    counted = [f"{name}, run {number}" for number in range(1, search.seeds + 1) for name in names]
+    return [*(f"{name} sd" for name in names), *counted]
+
+
+def _seed_values(search: Search, trial: FrozenTrial) -> list[float | str]:
+    """Return each objective's standard deviation over seeds, then the objectives of each seed's run."""
+    if search.seeds == 1:
+        return []
+    found = [*deviations(trial), *(value for seed in trial.user_attrs.get("values", ()) for value in seed)]
+    return found or [""] * len(_seed_columns(search))
+
+
+def write_experiments(study: Study, folder: Path, groups: Collection[str]) -> list[Path]:
+    """Write the best trial to experiment/best.yaml, and the others of a Pareto front to trial-N.yaml.
+
+    Args:
+        study: the study.
+        folder: the search's folder.
+        groups: the names of the config groups, whose values are options rather than numbers.
+
+    Returns:
+        The files, the best trial's first.
+    """
+    (folder / "experiment").mkdir(parents=True, exist_ok=True)
+    best = study.best()
+    files = [folder / "experiment" / f"trial-{trial.number}.yaml" for trial in best[1:]]
+    files = [folder / "experiment" / "best.yaml", *files] if best else []
+    for path, trial in zip(files, best, strict=True):
+        atomic_write(path, experiment(study, trial, groups))
+    return files
+
+
+def experiment(study: Study, trial: FrozenTrial, groups: Collection[str]) -> str:
+    """Return a trial as the text of a file for the config group `experiment`."""
+    search = study.search
+    tree: dict[str, Any] = {}
+    options: list[dict[str, str]] = []
+    for key, text in _words(search, trial):
+        if key in groups:
+            options.append({f"override /{key}": text})
+        else:
+            _put(tree, key.split("."), yaml.safe_load(text))
+    head = (
+        f"# @package _global_\n# Trial {trial.number} of {len(study.trials)} of the search {search.name}: "
+        f"{', '.join(o.text for o in search.objectives)} on validation "
+        f"{', '.join(f'{value:.4f}' for value in trial.values)}; run {' '.join(trial.user_attrs['runs'])}.\n"
+    )
+    return head + yaml.safe_dump({"defaults": [*options, "_self_"], **tree}, sort_keys=False)
+
+
+def _words(search: Search, trial: FrozenTrial) -> Iterator[tuple[str, str]]:
+    """Yield the keys of the search's base and of the trial, with their values as they are typed."""
+    for override in (*search.base, *search.overrides(values(trial, search))):
+        key, _, value = override.partition("=")
+        yield key.lstrip("+"), value
+
+
+def _put(tree: dict[str, Any], keys: Sequence[str], value: Any) -> None:
+    for key in keys[:-1]:
+        tree = tree.setdefault(key, {})
+    tree[keys[-1]] = value
+
+
+def write_table(study: Study, shipped: Path, path: Path) -> bool:
+    """Write the paper's Table 5 with the best trial as one more arm, where only loss weights were searched.
+
+    Returns:
+        Whether the table was written.
+    """
+    best = study.best()
+    if not best or not all(one.key.startswith("loss.") for one in study.search.space):
+        return False
+    content = yaml.safe_load(shipped.read_text(encoding="utf-8"))
+    overrides = [*study.search.base, *study.search.overrides(values(best[0], study.search))]
+    content["arms"] = {"manual, searched": {"overrides": overrides}, **content["arms"]}
+    atomic_write(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+    return True
+
+
+def importances(study: Study) -> list[tuple[str, float]]:
+    """Return each key's share in the variation of the first objective, the largest first (PED-ANOVA).
+
+    Empty with fewer than four complete trials or a single key.
+    """
+    return study_importances(study.study)
+
+
+def study_importances(study: optuna.Study) -> list[tuple[str, float]]:
+    """Return each key's share in the variation of the first objective of an Optuna study, largest first."""
+    complete = [t for t in study.get_trials(deepcopy=False) if t.state == TrialState.COMPLETE]
+    if len(complete) < 4 or len(complete[0].params) < 2:
+        return []
+    target = None if len(study.directions) == 1 else _first
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = optuna.importance.get_param_importances(study, target=target)
+    return sorted(found.items(), key=lambda item: -item[1])
+
+
+def _first(trial: FrozenTrial) -> float:
+    return trial.values[0]
+
+
+def plots(study: Study) -> dict[str, dict[str, Any]]:
+    """Return the plots that a study can have, by name, with their arguments beside the study."""
+    complete = [trial for trial in study.trials if trial.state == TrialState.COMPLETE]
+    names = [objective.text for objective in study.search.objectives]
+    if len(complete) < 2:
+        return {}
+    if len(names) == 2:
+        first = {"target": _first, "target_name": names[0]}
+        return {"pareto_front": {"target_names": names}, "parallel_coordinate": first, "slice": first}
+    titled = {"target_name": names[0]}
+    found: dict[str, dict[str, Any]] = dict.fromkeys(
+        ("optimization_history", "parallel_coordinate", "slice"), titled
+    )
+    return found | ({"param_importances": titled} if importances(study) else {})
+
+
+def write_plots(study: Study, folder: Path) -> list[Path]:
+    """Write the plots as PNG files, and all of them into study.html, which needs no network."""
+    wanted = plots(study)
+    files = [_png(study, name, keywords, folder / f"{name}.png") for name, keywords in wanted.items()]
+    if wanted:
+        files.append(_page(study, wanted, folder / "study.html"))
+    return files
+
+
+def _png(study: Study, name: str, keywords: dict[str, Any], path: Path) -> Path:
+    """Draw a plot with matplotlib into a PNG file, and return the file."""
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    draw = getattr(optuna.visualization.matplotlib, f"plot_{name}")
+    with warnings.catch_warnings(), pyplot.rc_context():
+        warnings.simplefilter("ignore")
+        axes = draw(study.study, **keywords)
+        figure = next(iter(axes.flat)).figure if hasattr(axes, "flat") else axes.figure
+        figure.set_size_inches(max(figure.get_size_inches()[0], 9), 5)
+        figure.savefig(path, dpi=110, bbox_inches="tight")
+        pyplot.close("all")
+    return path
+
+
+def _page(study: Study, wanted: dict[str, dict[str, Any]], path: Path) -> Path:
+    """Draw all plots with plotly into one HTML page, and return its file."""
+    parts: list[str] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ExperimentalWarning)
+        for name, keywords in wanted.items():
+            figure = getattr(optuna.visualization, f"plot_{name}")(study.study, **keywords)
+            parts.append(figure.to_html(full_html=False, include_plotlyjs=not parts))
+    title = f"search {study.search.name}: {len(study.trials)} trials"
+    atomic_write(
+        path,
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
+        f"<body><h1>{title}</h1>{''.join(parts)}</body></html>\n",
+    )
+    return path

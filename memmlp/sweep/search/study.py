@@ -1,0 +1,259 @@
+"""The Optuna study of a search. A single process owns it: it asks for trials and tells how they ended.
+
+A trial has these user attributes: "runs" are the ids of its runs, one for each seed, as far as they were
+wanted; "values" are each seed's objectives, whose means over seeds are the trial's own values; "reason" says
+why it failed. At whatever moment the owner is killed, the next owner finds every trial either ended or
+running, and goes on with the running ones under their numbers.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+import optuna
+from optuna.exceptions import ExperimentalWarning
+from optuna.storages import BaseStorage, JournalStorage, get_storage
+from optuna.storages.journal import JournalFileBackend
+from optuna.study import StudyDirection
+from optuna.trial import FrozenTrial, Trial, TrialState
+
+from memmlp.common import fences
+from memmlp.common.errors import InputError
+from memmlp.common.files import atomic_write
+from memmlp.sweep.search.spec import Range, Search, Value
+
+BEGINNING = b'{"op_code":'  # how every line of a journal begins
+
+
+class Study:
+    """The trials of a search, in a storage that outlives its owner."""
+
+    def __init__(self, search: Search, study: optuna.Study):
+        self.search, self.study = search, study
+
+    @classmethod
+    def opened(cls, search: Search, name: str, folder: Path) -> Study:
+        """Return the study of that name, new or as it was left, for its only owner.
+
+        Args:
+            search: the search.
+            name: the study's name in the storage.
+            folder: the folder of the journal, where the search names no storage.
+
+        Raises:
+            InputError: where the storage can't be opened.
+        """
+        if search.storage is None:
+            mend(journal(folder))
+        after = search.prune_after
+        pruner = optuna.pruners.NopPruner() if after is None else optuna.pruners.MedianPruner(after, 0)
+        kept: dict[str, Any] = {"storage": storage(search, folder), "study_name": name, "pruner": pruner}
+        try:
+            study = optuna.load_study(**kept)
+        except KeyError:
+            minimize = [StudyDirection.MINIMIZE] * len(search.objectives)
+            study = optuna.create_study(**kept, directions=minimize)
+        if study.metric_names is None:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ExperimentalWarning)
+                study.set_metric_names([objective.text for objective in search.objectives])
+        for values in search.first_trials():
+            study.enqueue_trial(values, skip_if_exists=True)
+        return cls(search, study)
+
+    @classmethod
+    def view(cls, search: Search, name: str, folder: Path) -> Study | None:
+        """Return the study for looking at it while its owner works; None where there is none yet."""
+        if search.storage is None and not journal(folder).exists():
+            return None
+        try:
+            return cls(search, optuna.load_study(storage=storage(search, folder), study_name=name))
+        except KeyError:
+            return None
+
+    @property
+    def trials(self) -> list[FrozenTrial]:
+        """All trials that were asked for, by number."""
+        trials = self.study.get_trials(deepcopy=False)
+        return [trial for trial in trials if trial.state != TrialState.WAITING]
+
+    def running(self) -> Iterator[Trial]:
+        """Yield the trials that have not ended, each with all its values."""
+        for trial in self.trials:
+            if trial.state == TrialState.RUNNING:
+                yield self._taken_up(trial)
+
+    def ask(self) -> Trial | None:
+        """Return a new trial; None when there are as many as the search wants."""
+        number = len(self.trials)
+        if number >= self.search.n_trials:
+            return None
+        self.study.sampler = sampler(self.search, number)
+        return self._suggested(self.study.ask())
+
+    def _taken_up(self, trial: FrozenTrial) -> Trial:
+        """Return a running trial; its last owner may have been killed before it had all its values."""
+        self.study.sampler = sampler(self.search, trial.number)
+        return self._suggested(Trial(self.study, trial._trial_id))
+
+    def _suggested(self, trial: Trial) -> Trial:
+        """Return the trial with a value for every key; values that it already has stay."""
+        for one in self.search.space:
+            suggest(trial, one)
+        return trial
+
+    def report(self, trial: Trial, step: int, value: float) -> None:
+        """Report the objective's value at one of a trial's validations, where there is one objective."""
+        trial.report(value, step)
+
+    def prune(self, trial: Trial) -> bool:
+        """End the trial if others were better at its step, and return whether that was so."""
+        if self.search.pruner == "none" or not trial.should_prune():
+            return False
+        self.study.tell(trial.number, state=TrialState.PRUNED)
+        return True
+
+    def complete(self, trial: Trial, values: Sequence[Sequence[float]]) -> None:
+        """End the trial with the means over seeds of its objectives. A mean that is NaN makes it a failure.
+
+        `values` has a list for each seed, with the value of each objective.
+        """
+        trial.set_user_attr("values", [list(seed) for seed in values])
+        means = [fmean(of_seeds) for of_seeds in zip(*values, strict=True)]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            self.study.tell(trial.number, means, skip_if_finished=True)
+
+    def fail(self, trial: Trial, reason: str) -> None:
+        """End the trial as failed, without values."""
+        trial.set_user_attr("reason", reason)
+        self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
+
+    def best(self) -> list[FrozenTrial]:
+        """Return the best trial; with two objectives the Pareto front, sorted by the first objective."""
+        complete = [trial for trial in self.trials if trial.state == TrialState.COMPLETE]
+        if not complete:
+            return []
+        if len(self.search.objectives) == 1:
+            return [self.study.best_trial]
+        return sorted(self.study.best_trials, key=lambda trial: trial.values)
+
+
+class FencedJournal(JournalFileBackend):
+    """A journal to which the present owner of its folder alone appends, so that it needs no lock."""
+
+    def __init__(self, path: Path):
+        super().__init__(str(path))
+        self.path = path
+
+    def append_logs(self, logs: list[dict[str, Any]]) -> None:
+        """Append lines to the journal. Raises LeaseLost if its folder has another owner by now."""
+        lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
+        with open(self.path, "ab") as file:
+            fences.check_owner(self.path)  # after opening: `mend` gave a later owner another file
+            file.write(lines.encode())
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def storage(search: Search, folder: Path) -> BaseStorage:
+    """Return the journal in a folder, or the storage of the search's URL.
+
+    Raises:
+        InputError: for a bad URL or a damaged journal.
+    """
+    return open_storage(search.storage, folder)
+
+
+def open_storage(url: str | None, folder: Path) -> BaseStorage:
+    """Return the storage of a URL, or where that is None the journal in a folder. Raises InputError."""
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    if url:
+        try:
+            return get_storage(url)
+        except Exception as error:
+            reason = " ".join(str(error).split())[:200]
+            raise InputError(f"search.storage={url}: {reason}") from None
+    path = journal(folder)
+    check_journal(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ExperimentalWarning)
+            return JournalStorage(FencedJournal(path))
+    except (ValueError, KeyError, TypeError) as error:
+        raise _damaged(path, error) from None
+
+
+def journal(folder: Path) -> Path:
+    """Return the file of a search's study in its folder, which `optuna-dashboard` can read."""
+    return folder / "study.journal"
+
+
+def mend(path: Path) -> None:
+    """Replace a journal by a copy without an incomplete last line, and remove its locks; only for the owner.
+
+    A process that was killed may leave both behind (locks if it was of an earlier version). Optuna takes a
+    line appended to an incomplete one for damage. An earlier owner that was frozen may append to the
+    file that it had open, which is this one no more, and so changes nothing.
+    """
+    check_journal(path)
+    for left in path.parent.glob(f"{path.name}.lock*"):
+        left.unlink(missing_ok=True)
+    if path.exists():
+        content = path.read_bytes()
+        atomic_write(path, content[: content.rfind(b"\n") + 1])
+
+
+def check_journal(path: Path) -> None:
+    """Refuse a file that is no journal, which Optuna would take for an empty one. Raises InputError."""
+    if path.exists():
+        with open(path, "rb") as file:
+            begins = file.read(len(BEGINNING))
+        if not BEGINNING.startswith(begins):
+            raise _damaged(path, "it does not begin like one")
+
+
+def _damaged(path: Path, reason: object) -> InputError:
+    return InputError(f"{path}: not a journal of Optuna's ({reason}); move it away to begin the search anew")
+
+
+def sampler(search: Search, number: int) -> optuna.samplers.BaseSampler:
+    """Return the sampler of one trial, seeded by the search and the trial's number.
+
+    So a search that is resumed does not draw the random numbers of its earlier trials again.
+    """
+    seed = int(np.random.SeedSequence([search.seed, number]).generate_state(1)[0])
+    if search.startup is None or search.sampler != "tpe":  # a grid's trials have their values already
+        return optuna.samplers.RandomSampler(seed=seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ExperimentalWarning)
+        return optuna.samplers.TPESampler(
+            seed=seed, n_startup_trials=search.startup, multivariate=True, constant_liar=True
+        )
+
+
+def suggest(trial: Trial, one: Range) -> Value:
+    """Return a trial's value for a key: the one that it has already, or a new one."""
+    if one.choices:
+        return trial.suggest_categorical(one.key, one.choices)
+    if isinstance(one.low, int) and isinstance(one.high, int):
+        return trial.suggest_int(one.key, one.low, one.high, step=int(one.step or 1), log=one.log)
+    return trial.suggest_float(one.key, one.low, one.high, step=one.step, log=one.log)
+
+
+def deviations(trial: FrozenTrial) -> list[float]:
+    """Return each objective's standard deviation over seeds; empty with fewer than two seeds."""
+    by_seed = trial.user_attrs.get("values", [])
+    return np.std(by_seed, axis=0, ddof=1).tolist() if len(by_seed) > 1 else []
+
+
+def values(trial: FrozenTrial | Trial, search: Search) -> Mapping[str, Value]:
+    """Return a trial's values by config key, in the order of the search's space."""
+    return {one.key: trial.params[one.key] for one in search.space}

@@ -1,0 +1,37 @@
+"""Statistics of differences between two arms that were run with the same seeds and tested on the same clips.
+
+`differences` are everywhere (K, S, C): for each of K comparisons, one arm's error less the other's, of seed s
+on clip c. `crossed` estimates the error of their mean, which seeds and groups of clips contribute to.
+`effects` turns it into intervals and p-values. `power` says which effects could have been seen, `verdicts`
+what may be claimed of many comparisons, in one look or in several, and `robust` describes without testing.
+docs/statistics.md explains the method and how well it keeps its promises.
+"""
+
+from __future__ import annotations
+
+from memmlp.tables.statistics.effects import Effects, equivalence_p, paired_effects, seed_effects
+from memmlp.tables.statistics.power import detectable, seeds_needed
+from memmlp.tables.statistics.robust import (
+    interquartile_mean,
+    performance_profile,
+    probability_of_improvement,
+)
+from memmlp.tables.statistics.verdicts import Verdict, holm, looks, sequential, spending, verdict
+
+__all__ = [
+    "Effects",
+    "Verdict",
+    "detectable",
+    "equivalence_p",
+    "holm",
+    "interquartile_mean",
+    "looks",
+    "paired_effects",
+    "performance_profile",
+    "probability_of_improvement",
+    "seed_effects",
+    "seeds_needed",
+    "sequential",
+    "spending",
+    "verdict",
+]

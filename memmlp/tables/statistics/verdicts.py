@@ -1,0 +1,102 @@
+"""What may be claimed of many comparisons, at once or in several looks at a growing number of seeds."""
+
+from __future__ import annotations
+
+import itertools
+from enum import StrEnum
+
+import numpy as np
+
+from memmlp.tables.statistics.effects import LEVEL
+
+
+class Verdict(StrEnum):
+    """What is claimed of a comparison.
+
+    HOLDS and OPPOSITE speak of the paper's effect, HIGHER and LOWER of the measured difference where the
+    paper has none. OPEN claims nothing.
+    """
+
+    HOLDS = "holds"
+    OPPOSITE = "opposite"
+    HIGHER = "higher"
+    LOWER = "lower"
+    EQUIVALENT = "equivalent"
+    OPEN = "open"
+
+
+def holm(p: np.ndarray) -> np.ndarray:
+    """Correct p-values (K,) for their number by Holm's step-down method; NaN stays NaN and does not count.
+
+    The probability of any wrong claim of a difference stays below the level (Holm 1979).
+    """
+    p = np.asarray(p, float)
+    order = np.flatnonzero(~np.isnan(p))
+    order = order[np.argsort(p[order])]
+    corrected = np.full_like(p, np.nan)
+    corrected[order] = np.minimum(1, np.maximum.accumulate(p[order] * np.arange(len(order), 0, -1)))
+    return corrected
+
+
+def verdict(
+    difference: float, equivalence: float, mean: float, paper: float | None = None, level: float = LEVEL
+) -> Verdict:
+    """Return the verdict on one comparison of a table.
+
+    Claims of a difference and claims of equivalence are two families, each with 5 % for a wrong claim: they
+    answer different questions, and a mean can't be wrongly called both. An interval that lies within the
+    margin shows no effect of interest, even where it does not contain 0.
+
+    Args:
+        difference: the p-value of a difference, corrected over the table; NaN where there is none.
+        equivalence: the p-value of `equivalence_p`, corrected likewise.
+        mean: the measured mean difference.
+        paper: the paper's difference; None or 0 where it claims no sign.
+        level: what either family may spend, less than 5 % where there are several looks.
+    """
+    if equivalence <= level:
+        return Verdict.EQUIVALENT
+    if not difference <= level:
+        return Verdict.OPEN
+    if paper:
+        return Verdict.HOLDS if mean * paper > 0 else Verdict.OPPOSITE
+    return Verdict.HIGHER if mean > 0 else Verdict.LOWER
+
+
+def looks(most: int) -> tuple[int, ...]:
+    """Return the numbers of seeds at which there are looks: 3, 5, 8, 13, ... up to `most`.
+
+    Two seeds never decide anything at the levels of a table, so the first look is at three.
+    """
+    counts = [3, 5]
+    while counts[-1] < most:
+        counts.append(counts[-1] + counts[-2])
+    return (*itertools.takewhile(lambda count: count < most, counts), most)
+
+
+def spending(number: int) -> tuple[float, ...]:
+    """Return the level that each of so many looks may spend.
+
+    Together they are 5 %, so that nothing need be assumed of how the looks depend on each other. Each level
+    is twice the one before: of weights growing by a factor of 1, 2 and 3 these cost few decisions and few
+    seeds.
+    """
+    weights = 2.0 ** np.arange(number)
+    return tuple(map(float, LEVEL * weights / weights.sum()))
+
+
+def sequential(p: np.ndarray, claimed: np.ndarray, closed: np.ndarray) -> np.ndarray:
+    """Correct p-values (K,) by Holm at a look after others; they compare with the look's share of the level.
+
+    What was decided stays so. Comparisons that this family has claimed leave the correction of the others.
+    Comparisons that are closed without such a claim, because the other family decided them or their arm has
+    stopped, stay in it as ones that can't be claimed any more. So a first wrong claim needs a true null whose
+    p-value is below the look's level over the number of nulls, at a look that was fixed beforehand: the
+    looks' levels add up.
+
+    Args:
+        p: p-values (K,) of this look; NaN where there is none, which never decides.
+        claimed: what this family claimed at earlier looks, (K,) bool.
+        closed: what was decided otherwise, (K,) bool.
+    """
+    return holm(np.where(claimed, 0.0, np.where(closed, 1.0, p)))

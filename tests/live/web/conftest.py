@@ -1,0 +1,99 @@
+"""A site of a tiny network, made once, and what of npm's packages its tests need."""
+
+from __future__ import annotations
+
+import gzip
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import tiny
+import wearer
+from conftest import shared
+from filelock import FileLock
+
+from memmlp.common.errors import InputError
+from memmlp.common.npm import ONNXRUNTIME_WEB, Package, read
+from memmlp.deploy.export import export
+from memmlp.live.full_graph import export_full
+from memmlp.live.web.clips import packed
+from memmlp.live.web.networks import SiteNetwork
+from memmlp.live.web.site import Site
+from memmlp.motion.coordinates import World
+from memmlp.networks.memory import NoMemory
+from memmlp.networks.motion_model import MotionModel
+
+RUN = "0123456789abcdef"
+PERSON = wearer.person(np.arange(60 * 4 + 1) / 60)
+
+
+class Made(NamedTuple):
+    """A site, and the file of its network for Python's Stream."""
+
+    folder: Path
+    step: Path
+
+
+def network() -> MotionModel:
+    """A tiny network of random weights that stands as a person does."""
+    return wearer.at_ease(tiny.model(NoMemory, coordinates=World()), PERSON.frames)
+
+
+def once(write: Callable[..., None]) -> Callable[..., None]:
+    """A writer of ONNX files that exports each kind of graph once; that takes seconds."""
+    files: dict[type, bytes] = {}
+
+    def written(model: object, path: Path, *rest: object) -> None:
+        if type(model) not in files:
+            write(model, path, *rest)
+            files[type(model)] = path.read_bytes()
+        path.write_bytes(files[type(model)])
+
+    return written
+
+
+def package_files(package: Package, *names: str) -> list[bytes]:
+    """Files of an npm package; skips where they cannot be had."""
+    try:
+        found = read(package, names)
+    except InputError as error:
+        pytest.skip(str(error))
+    return [found[name] for name in names]
+
+
+@pytest.fixture(scope="session")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """A site with a network to play and wear, and the same beside it to be timed."""
+    package_files(ONNXRUNTIME_WEB, "package.json")
+    home = shared(tmp_path_factory, "web")
+    made = Made(home / "site", home / "step.onnx")
+    with FileLock(home / "lock"), pytest.MonkeyPatch.context() as patched:
+        patched.setattr("memmlp.live.web.networks.export", once(export))
+        patched.setattr("memmlp.live.web.networks.export_full", once(export_full))
+        patched.setattr(
+            "memmlp.live.web.weights.LEAST", 1_000_000
+        )  # the yardstick's alone are drawn on the page
+        if not made.step.exists():
+            clip = packed("walk", PERSON.frames.numpy(), 4.0)
+            Site(
+                networks=[SiteNetwork(RUN, "tiny", RUN, network(), (clip.key,))],
+                base=SiteNetwork("base", "AvatarPoser", "random", network()),
+                clips=[clip],
+                calibration=[PERSON.frames],
+                webgpu=False,
+            ).make(made.folder)
+            bare = made.folder / "networks" / f"{RUN}-streaming.onnx.gz"
+            made.step.write_bytes(gzip.decompress(bare.read_bytes()))
+    return made
+
+
+@pytest.fixture(scope="session")
+def node() -> Callable[..., str]:
+    """Node, or a skip."""
+    path = shutil.which("node")
+    if path is None:
+        pytest.skip("node is not installed")
+    return path

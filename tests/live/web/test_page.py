@@ -1,0 +1,194 @@
+"""The site in a browser with a headset in software: worn, played, timed, copied, and all offline."""
+
+from __future__ import annotations
+
+import functools
+import json
+import threading
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from chromium import Browser
+from live.web.conftest import PERSON, Made, package_files
+
+from memmlp.common.npm import IWER
+from memmlp.live.stream import Offsets, Stream
+from memmlp.tables.browser_rows import read
+
+pytestmark = pytest.mark.slow
+
+HEADSET = Path(__file__).with_name("headset.js")
+SITE = "document.documentElement.dataset"
+COPY = "if (navigator.clipboard) navigator.clipboard.writeText = async text => { window.copied = text; }"
+TOLERANCE = 1e-4  # metres
+
+
+class Server(ThreadingHTTPServer):
+    """Any static server, which counts what it is asked for in vain."""
+
+    def __init__(self, folder: Path):
+        self.missing: list[str] = []
+        outer = self
+
+        class Handler(SimpleHTTPRequestHandler):
+            def log_request(self, code: Any = "-", size: Any = "-") -> None:
+                if int(code) >= 400:
+                    outer.missing.append(self.path)
+
+        super().__init__(("127.0.0.1", 0), functools.partial(Handler, directory=folder))
+        self.url = f"http://127.0.0.1:{self.server_port}/"
+        self.thread = threading.Thread(target=self.serve_forever)
+        self.thread.start()
+
+    def stop(self) -> None:
+        """End it."""
+        self.shutdown()
+        self.server_close()
+        self.thread.join()
+
+
+def test_it_is_worn_played_timed_and_copied_without_the_server(site: Made, tmp_path: Path):
+    """In one browser, whose start and first load take seconds."""
+    (script,) = package_files(IWER, "build/iwer.min.js")
+    with Browser(360, 280) as browser:
+        browser.before(script.decode() + HEADSET.read_text())
+        browser.before(COPY)
+        server = Server(site.folder)
+        try:
+            browser.open(server.url)
+            browser.wait(f"{SITE}.offline == 'ready' && {SITE}.wear == 'ready'")
+            browser.wait("navigator.serviceWorker.controller !== null")
+        finally:
+            server.stop()
+        assert server.missing == []
+        check_wearer(worn(browser, site), site)
+        check_play(browser)
+        check_bench(browser, tmp_path / "rows.json")
+        check_phone(browser)
+        assert browser.errors == []
+
+
+def go(browser: Browser, page: str, until: str) -> None:
+    """Load a page anew, from what the browser keeps, and wait for something."""
+    origin = browser.value("location.origin")
+    browser.open("about:blank")
+    browser.open(f"{origin}/#/{page}")
+    browser.wait(until)
+
+
+def joints() -> list[list[dict[str, Any]]]:
+    """The person's head and wrists, frame by frame, as the site's clip has them."""
+    from memmlp.live.web.clips import NUMBERS, packed
+
+    numbers = np.frombuffer(packed("", PERSON.frames.numpy(), 4.0).content, "<f4").reshape(-1, NUMBERS)
+    return [
+        [
+            {"position": row[3 * i :][:3].tolist(), "rotation": row[9 + 4 * i :][:4].tolist()}
+            for i in range(3)
+        ]
+        for row in numbers
+    ]  # fmt: skip
+
+
+def t_pose(site: Made) -> list[dict[str, Any]]:
+    """Head and wrists of who stands in T-pose."""
+    body = json.loads((site.folder / "site.json").read_text())["networks"][0]["body"]
+    rest = np.array(body["rest"])
+    return [
+        {"position": place, "rotation": [0, 0, 0, 1]} for place in (rest - [0, body["floor"], 0]).tolist()
+    ]
+
+
+def worn(browser: Browser, site: Made) -> dict[str, Any]:
+    """Enter VR, calibrate in T-pose, move as the clip does, leave, and save the recording."""
+    go(browser, "wear", f"{SITE}.wear == 'ready'")
+    height = json.loads((site.folder / "site.json").read_text())["networks"][0]["body"]["height"]
+    browser.value(f"document.querySelector('#height').value = {100 * height}")
+    browser.value("document.querySelector('#record').click()")
+    browser.value("document.querySelector('#immersive-vr').click()")
+    browser.wait("window.headset.session && Number(document.querySelector('#frames').textContent) > 0")
+    browser.resolved("headset.learn()")
+    browser.resolved(
+        "import('./headset.js').then(module => { window.offsets = module.usualOffsets('controllers'); })"
+    )
+    browser.value(f"window.tPose = {json.dumps(t_pose(site))}")
+    browser.resolved("headset.play([tPose], offsets)")  # the countdown does not wait for a slow machine
+    browser.resolved("headset.pull()")
+    browser.resolved(f"headset.play([tPose], offsets, () => {SITE}.calibrated)")
+    browser.resolved(f"headset.play({json.dumps(joints())}, offsets)")
+    browser.resolved("headset.session.end()")
+    browser.value("document.querySelector('#save').click()")
+    return json.loads(browser.wait("headset.saved")) | {"worn": browser.value("offsets")}
+
+
+def check_wearer(recording: dict[str, Any], site: Made) -> None:
+    """The samples that the page recorded, through Python's Stream: the same joints to 1e-4 m."""
+    calibrated = [sample for sample in recording["samples"] if "calibrated" in sample]
+    assert len(calibrated) == 1
+    begun = recording["samples"].index(calibrated[0])
+    offsets = Offsets(*(calibrated[0]["calibrated"][key] for key in ("positions", "rotations")))
+    stream, apart = Stream(site.step, space="openxr", height=calibrated[0]["height"]), []
+    worn = recording["worn"]  # how the devices sat on the network's own body, laid as near as it can be
+    np.testing.assert_allclose(offsets.rotations, worn["rotations"], atol=1e-5)
+    np.testing.assert_allclose(offsets.positions[0], 2 / 3 * np.array(worn["positions"][0]), atol=1e-5)
+    found = stream.calibrate(*given(calibrated[0]["at"]))
+    np.testing.assert_allclose(found.positions, offsets.positions, atol=1e-5)
+    stream.offsets = matrices(offsets)
+    for sample in recording["samples"][begun + 1 :]:
+        pose = stream.step(*given(sample["trackers"]), time=sample["time"])
+        if sample["pose"]:
+            made = np.array(sample["pose"]["positions"]).reshape(-1, 3)
+            apart.append(np.linalg.norm(made - pose.positions, axis=1).max())
+        assert list(pose.held) == sample["held"]
+    assert len(apart) > 80
+    assert max(apart) <= TOLERANCE, max(apart)
+
+
+def given(trackers: list[dict[str, Any] | None]) -> list[Any]:
+    """Trackers as Python's Stream takes them."""
+    return [t and (t["position"], t["rotation"]) for t in trackers]
+
+
+def matrices(offsets: Offsets) -> Offsets:
+    """Offsets with matrices in place of the page's quaternions."""
+    from memmlp.live.rotations import quaternion_to_matrix
+
+    return Offsets(np.array(offsets.positions), quaternion_to_matrix(np.array(offsets.rotations)))
+
+
+def check_play(browser: Browser) -> None:
+    """A clip is played, and its error shown."""
+    go(browser, "play", f"Number({SITE}.shown) > 20")
+    browser.value("document.querySelector('#pause').click()")
+    browser.wait("document.querySelector('#pause').textContent == 'Play'")
+    assert 0 < float(browser.value("document.querySelector('#mean').textContent")) < 200
+
+
+def check_bench(browser: Browser, file: Path) -> None:
+    """The bench's rows are such as Table 17 takes."""
+    go(browser, "bench", f"{SITE}.bench == 'ready'")
+    browser.value("document.querySelector('#device').value = 'Test headset'")
+    browser.value("document.querySelector('#start').click()")
+    browser.wait(f"{SITE}.bench == 'done' || document.querySelector('#start').textContent == 'Start'")
+    assert "Measured 8 rows" in browser.value("document.querySelector('#progress').textContent")
+    browser.value("document.querySelector('#copy').click()")
+    file.write_text(browser.wait("window.copied"))
+    measured = read(file)
+    assert measured.about["device"] == "Test headset"
+    kinds = [(row["network"], row["graph"], row["precision"]) for row in measured.rows]
+    graphs = [("naive", "fp32"), ("streaming", "fp32"), ("streaming", "int8"), ("streaming", "fp16")]
+    assert kinds == [(name, *graph) for name in ("AvatarPoser", "tiny") for graph in graphs]
+    assert measured.rows[0]["ratio_to_avatar_poser"] == 1
+    assert {row["steps"] for row in measured.rows} == {500}
+    assert [row["whole_median_ms"] is not None for row in measured.rows] == [True, True, False, True] * 2
+
+
+def check_phone(browser: Browser) -> None:
+    """No page is wider than a phone."""
+    browser.size(390, 844)
+    for page in ("wear", "play", "bench"):
+        go(browser, page, "document.querySelector('.page > *') !== null")
+        assert browser.value("document.documentElement.scrollWidth") <= 390

@@ -1,0 +1,106 @@
+"""The site's folder: what is in it, that it is whole or not there, and that nothing else is overwritten."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import re
+from pathlib import Path
+
+import pytest
+from live.web.conftest import Made
+
+from memmlp.common import npm
+from memmlp.common.errors import InputError
+from memmlp.live.web.packages import _bare
+from memmlp.live.web.site import SHARED, Site, check_place
+
+NOTHING = Site(networks=[], base=None, clips=[], calibration=[], webgpu=False)
+
+
+@pytest.mark.slow
+def test_everything_that_the_page_names_is_there(site: Made):
+    about = json.loads((site.folder / "site.json").read_text())
+    entries = [about["base"], *about["networks"]]
+    graphs = [graph[part] for entry in entries for graph in entry["graphs"] for part in ("step", "whole")]
+    played = [entry["play"] for entry in about["networks"]]
+    named = [graph["file"] for graph in (*graphs, *played, about["yardstick"]) if graph]
+    named += [clip["file"] for clip in about["clips"]]
+    assert [name for name in named if not (site.folder / name).is_file()] == []
+    assert about["base"]["play"] is None
+    assert [(row["graph"], row["precision"]) for row in about["networks"][0]["graphs"]] == [
+        ("naive", "fp32"),
+        ("streaming", "fp32"),
+        ("streaming", "int8"),
+        ("streaming", "fp16"),
+    ]
+    imports = re.compile(r"""(?:from|import\()\s*['"](\./[^'"$]+)['"]""")
+    for path in site.folder.glob("*.js"):
+        for name in imports.findall(path.read_text()):
+            assert (path.parent / name).is_file(), f"{path.name} imports {name}"
+
+
+@pytest.mark.slow
+def test_the_service_worker_keeps_every_file(site: Made):
+    files = {path.relative_to(site.folder).as_posix() for path in site.folder.rglob("*") if path.is_file()}
+    head = re.match(
+        r'const VERSION = "(\w{16})";\nconst FILES = (\[.*\]);\n', (site.folder / "sw.js").read_text()
+    )
+    assert head is not None
+    assert set(json.loads(head[2])) == files - {"sw.js"}
+
+
+@pytest.mark.slow
+def test_nothing_of_another_host_is_named(site: Made):
+    """Addresses are relative; the policy allows no other host."""
+    page = (site.folder / "index.html").read_text()
+    assert "POLICY" not in page
+    assert "default-src 'none'" in page
+    own = [path for path in site.folder.glob("*") if path.suffix in (".js", ".html", ".css")]
+    assert [path.name for path in own if re.search(r"https?://", path.read_text())] == []
+    assert not re.search(r"""(?:src|href)=["']/""", page)
+
+
+@pytest.mark.slow
+def test_compressed_files_are_what_they_were(site: Made):
+    packed = list(site.folder.rglob("*.gz"))
+    assert len(packed) > 5
+    starts = {gzip.decompress(path.read_bytes())[:1] for path in packed if path.parent.name != "clips"}
+    assert starts == {b"\0", b"\x08"}  # of WebAssembly and of ONNX
+
+
+def test_files_of_other_pages_are_there():
+    """They are copied, so that a renamed one would be seen by nobody before a site is made."""
+    from importlib import resources
+
+    for package, names in SHARED.items():
+        assert [n for n in names if not resources.files(package).joinpath("page", n).is_file()] == []
+
+
+def test_nothing_else_is_overwritten(tmp_path: Path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(InputError, match="has something else in it; allowed is a new folder"):
+        NOTHING.make(tmp_path)
+    with pytest.raises(InputError, match="a file; allowed"):
+        check_place(tmp_path / "thesis.tex")
+    with pytest.raises(InputError, match="there is no folder"):
+        check_place(tmp_path / "none" / "site")
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_without_the_packages_an_earlier_site_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("NPM_CONFIG_REGISTRY", (tmp_path / "nowhere").as_uri())
+    monkeypatch.delenv(npm.FOLDER, raising=False)
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "site.json").write_text('{"packages": {}}')
+    with pytest.raises(InputError, match=r"three@.*: cannot be fetched from the npm registry"):
+        NOTHING.make(tmp_path / "site")
+    assert [path.name for path in tmp_path.iterdir()] == ["site"]
+    assert [path.name for path in (tmp_path / "site").iterdir()] == ["site.json"]
+
+
+def test_comments_for_developers_are_left_out_and_licences_kept():
+    licence = b"/**\n * @license\n * MIT\n */\nconst a = '/** no comment */';\n"
+    source = licence + b"\t/**\n\t * Adds.\n\t */\n\tadd() {}\n"
+    assert _bare(source) == licence + b"\tadd() {}\n"

@@ -1,0 +1,165 @@
+"""The site's stream.js in node, with the site's own ONNX Runtime: the numbers of Python's Stream."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import wearer
+from live.web.conftest import RUN, Made
+from processes import finished
+
+from memmlp.live.rotations import matrix_to_quaternion
+from memmlp.live.spaces import SPACES
+from memmlp.live.stream import Pose, Stream
+
+pytestmark = pytest.mark.slow
+
+HERE, SPACE = Path(__file__).parent, SPACES["openxr"]
+TOLERANCE = 1e-4  # metres, and of rotation matrices
+HEIGHT = 1.6  # metres, of another person than the network's
+
+
+def samples(times: np.ndarray, lost: dict[int, tuple[int, ...]] | None = None) -> list[dict[str, Any]]:
+    """A person's trackers at times, some of them lost, as the page takes them."""
+    person = wearer.person(times - times[0])
+    positions = SPACE.positions_out(person.positions)
+    rotations = matrix_to_quaternion(SPACE.rotations_out(person.rotations).reshape(-1, 3, 3)).reshape(
+        -1, 3, 4
+    )
+    made = []
+    for index, time in enumerate(times):
+        gone = (lost or {}).get(index, ())
+        trackers = [
+            None if k in gone else {"position": p.tolist(), "rotation": q.tolist()}
+            for k, (p, q) in enumerate(zip(positions[index], rotations[index], strict=True))
+        ]
+        made.append({"time": float(time), "trackers": trackers})
+    return made
+
+
+def jittered(seconds: float, hz: float) -> np.ndarray:
+    """Times of a device whose clock is no good, among them one twice and one set back a little."""
+    times = (
+        100
+        + np.arange(0, seconds, 1 / hz)
+        + np.random.default_rng(0).uniform(-2e-3, 2e-3, round(seconds * hz))
+    )
+    times[20], times[30] = times[19], times[29] - 0.1
+    return times
+
+
+def t_pose() -> list[dict[str, Any]]:
+    """Devices that sit crookedly on a person in T-pose who looks to the left."""
+    turns = [[0.1, 0.2, 0.05, 1], [0.3, -0.6, 0.2, 1], [-0.2, 0.5, 0.4, 1]]
+    places = [[0.1, 1.62, 0.2], [0.2, 1.4, 0.95], [0.1, 1.38, -0.55]]
+    return [
+        {"position": place, "rotation": (np.array(turn) / np.linalg.norm(turn)).tolist()}
+        for place, turn in zip(places, turns, strict=True)
+    ]
+
+
+def gaps() -> np.ndarray:
+    """Times with a pause in them, and a clock that is set back."""
+    times = np.arange(0, 2, 1 / 90)
+    times[60:] += 0.6
+    times[120:] -= 3
+    return times
+
+
+def gone(first: int, end: int, *which: int) -> dict[int, tuple[int, ...]]:
+    """Trackers that are lost from a sample to another."""
+    return dict.fromkeys(range(first, end), which)
+
+
+PARTS: dict[str, dict[str, Any]] = {
+    "60 Hz": {"samples": samples(np.arange(120) / 60)},
+    "72 Hz": {"samples": samples(np.arange(144) / 72)},
+    "50 Hz, jittered": {"samples": samples(jittered(1.6, 50.0))},
+    "22 Hz": {"samples": samples(np.arange(40) / 22)},
+    "lost hands": {"samples": samples(np.arange(144) / 72, {**gone(30, 70, 1), **gone(60, 100, 1, 2)})},
+    "lost head": {"samples": samples(np.arange(100) / 60, {**gone(0, 12, 0, 2), **gone(50, 80, 0)})},
+    "gaps": {"samples": samples(gaps())},
+    "calibrated": {"samples": samples(np.arange(90) / 90), "calibrate": t_pose(), "height": HEIGHT},
+}  # fmt: skip
+
+
+def in_python(step: Path, part: dict[str, Any]) -> tuple[Stream, list[Pose]]:
+    """The same by Python's Stream."""
+    stream = Stream(step, space="openxr", height=part.get("height"))
+
+    def given(trackers: list[dict[str, Any] | None]) -> list[Any]:
+        return [t and (np.array(t["position"]), np.array(t["rotation"])) for t in trackers]
+
+    if "calibrate" in part:
+        stream.calibrate(*given(part["calibrate"]))
+    return stream, [stream.step(*given(one["trackers"]), time=one["time"]) for one in part["samples"]]
+
+
+@pytest.fixture(scope="module")
+def answers(site: Made, node: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What node makes of all parts, in one process."""
+    folder = tmp_path_factory.mktemp("node")
+    entry = json.loads((site.folder / "site.json").read_text())["networks"][0]
+    for name, packed in (("model.onnx", entry["play"]["file"]), ("ort.wasm", "ort/wasm.wasm.gz")):
+        (folder / name).write_bytes(gzip.decompress((site.folder / packed).read_bytes()))
+    page = folder / "page"
+    page.mkdir()
+    (page / "package.json").write_text('{"type": "module"}')
+    for name in ("session.js", "stream.js", "trackers.js", "rotations.js", "ort/wasm.js"):
+        (page / Path(name).name).write_bytes((site.folder / name).read_bytes())
+    job = folder / "job.json"
+    job.write_text(json.dumps({"body": entry["body"], "parts": list(PARTS.values())}))
+    command = [
+        node,
+        HERE / "play.mjs",
+        page,
+        page / "wasm.js",
+        folder / "ort.wasm",
+        folder / "model.onnx",
+        job,
+    ]
+    finished([str(word) for word in command])
+    return dict(zip(PARTS, json.loads(Path(f"{job}.answer").read_text()), strict=True))
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_it_is_python_s_stream(name: str, site: Made, answers: dict[str, Any]):
+    assert entry_is_of(site)
+    stream, expected = in_python(site.step, PARTS[name])
+    found = answers[name]["poses"]
+    for key in ("held", "fresh", "restarted"):
+        told = [
+            list(value) if key == "held" else value for value in (getattr(pose, key) for pose in expected)
+        ]
+        assert [pose[key] for pose in found] == told
+    np.testing.assert_allclose([p["time"] for p in found], [p.time for p in expected], atol=1e-9)
+    for theirs, ours in (
+        ("positions", "positions"),
+        ("rotations", "rotations"),
+        ("joints", "position_branch"),
+    ):
+        made = np.array([pose[theirs] for pose in found])
+        wanted = np.array([getattr(pose, ours).ravel() for pose in expected])
+        np.testing.assert_allclose(made, wanted, atol=TOLERANCE)
+    if stream.offsets is not None:
+        offsets = answers[name]["offsets"]
+        np.testing.assert_allclose(offsets["positions"], stream.offsets.positions, atol=1e-9)
+        turns = np.abs(
+            (np.array(offsets["rotations"]) * matrix_to_quaternion(stream.offsets.rotations)).sum(1)
+        )
+        np.testing.assert_allclose(turns, 1, atol=1e-9)
+
+
+def entry_is_of(site: Made) -> bool:
+    """Whether the site's network is the one that Python has."""
+    return json.loads((site.folder / "site.json").read_text())["networks"][0]["run"] == RUN
+
+
+def test_parts_differ_enough_to_tell_a_stream_from_a_copy():
+    """Rates are resampled, hands are lost, and clips restart: none of the parts is the first one again."""
+    assert len({json.dumps(part) for part in PARTS.values()}) == len(PARTS)

@@ -1,0 +1,103 @@
+"""The source of an experiment's motion: what is refused of a list that isn't all there."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from memmlp.common.errors import InputError
+from memmlp.motion.clip import Clip
+from memmlp.motion.formats.npz import write_clip
+from memmlp.motion.motion_source import MotionSource
+from memmlp.motion.preparing import survey
+from memmlp.motion.preparing.cache import ClipFolder
+from memmlp.motion.preparing.splits import ListSplit, SeededSplit, SubsetSplit
+
+NAMES = [f"{subset}/0{n}/take" for subset in ("CMU", "HDM05") for n in range(1, 5)]
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    for name in NAMES:
+        write_clip(tmp_path / "amass" / f"{name}_stageii.npz", still(50))
+    for subset, first in (("CMU", "CMU"), ("HDM05", "MPI_HDM05")):
+        lists = tmp_path / "lists" / first
+        lists.mkdir(parents=True)
+        lines = [name.replace(subset, first) + "_poses.npz\n" for name in NAMES if name.startswith(subset)]
+        (lists / "train_split.txt").write_text("".join(lines[:3]))
+        (lists / "test_split.txt").write_text(lines[3])
+    return tmp_path / "amass"
+
+
+def still(frames: int) -> Clip:
+    return Clip("", np.zeros((frames, 22, 3)), np.zeros((frames, 3)), 60.0)
+
+
+def listed(root: Path, **changes) -> MotionSource:
+    split = ListSplit(root.with_name("lists"), val=0.2)
+    return MotionSource(ClipFolder(root, split), None, root.with_name("cache"), **changes)
+
+
+def test_a_whole_list_is_whole_under_later_names(root):
+    manifest = listed(root).prepare().manifest
+    assert manifest.coverage.whole
+    assert manifest.coverage.counts == (8, 8)
+    assert (manifest.missing, manifest.listed) == ((), {"CMU": 4, "MPI_HDM05": 4})
+    assert len(manifest.clips) == 8
+
+
+def test_one_missing_clip_is_said_before_any_is_read(root, monkeypatch):
+    (root / f"{NAMES[5]}_stageii.npz").unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr(survey, "read_clip", lambda *args: pytest.fail("read a clip"))
+        with pytest.raises(InputError, match=r"1 of 8 .*\(MPI_HDM05 1 of 4\).*data.partial=true") as error:
+            listed(root).prepare()
+    assert "\n" not in str(error.value)
+    assert not root.with_name("cache").exists()
+    manifest = listed(root, partial=True).prepare().manifest
+    assert str(manifest.coverage) == "87 % of the list (7 of 8 entries)"
+    assert manifest.missing == ("MPI_HDM05/02/take_poses",)
+    with pytest.raises(InputError, match="1 of 8"):
+        listed(root).prepare()  # though its cache is finished
+    assert listed(root).digest() == manifest.digest  # tables find what was trained on it
+
+
+def test_a_damaged_clip_is_missing_and_one_that_is_too_short_is_not(root):
+    write_clip(root / f"{NAMES[0]}_stageii.npz", still(20))
+    assert listed(root).prepare().manifest.coverage.whole
+    (root / f"{NAMES[1]}_stageii.npz").write_bytes(b"PK broken")
+    with pytest.raises(InputError, match=r"1 of 8 .*\(CMU 1 of 4\)"):
+        listed(root).prepare()
+    manifest = listed(root, partial=True).prepare().manifest
+    assert (manifest.missing, manifest.damaged) == ((), ("CMU/02/take_poses",))
+
+
+def test_a_missing_subset_is_said_and_a_seeded_split_has_no_list(root):
+    def source(split):
+        return MotionSource(ClipFolder(root, split), None, root.with_name("cache"))
+
+    with pytest.raises(InputError, match=r"1 of 3 .*\(SFU 1 of 1\)"):
+        source(SubsetSplit(["CMU", "SFU"], ["MPI_HDM05"])).prepare()
+    assert source(SubsetSplit(["CMU"], ["MPI_HDM05"])).prepare().manifest.coverage.whole
+    assert source(SeededSplit()).prepare().manifest.coverage.whole
+
+
+def test_a_column_file_has_a_cache_of_its_own_and_names_the_groups(root):
+    file = root.with_name("groups.csv")
+
+    def prepared(last: str):
+        rows = [f"{name}_stageii,{name.split('/')[0]}" for name in NAMES]
+        file.write_text("\n".join(["clip,group", *rows[:-1], f"{NAMES[-1]}_stageii,{last}"]))
+        split = SeededSplit(0.3, 0.3, groups_file=file)
+        return MotionSource(ClipFolder(root, split), None, root.with_name("cache")).prepare()
+
+    found = prepared("third")
+    assert set(found.manifest.groups.values()) == {"CMU", "HDM05", "third"}
+    assert {clip.group: clip.split for clip in found.manifest.clips}.keys() == {"CMU", "HDM05", "third"}
+    assert len({(clip.group, clip.split) for clip in found.manifest.clips}) == 3
+    assert prepared("fourth").cache != found.cache
+    (root / f"{NAMES[0]}_stageii.npz").write_bytes(b"PK broken")
+    prepared("third")  # a row for a clip that can't be used is none for an unknown one
+    (root / f"{NAMES[0]}_stageii.npz").unlink()
+    with pytest.raises(InputError, match="has not, clip CMU/01/take_stageii"):
+        prepared("third")

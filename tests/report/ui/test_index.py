@@ -1,0 +1,151 @@
+"""The index follows run folders, keeps what it parsed, and shows damage as damage."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+from report.ui.conftest import begun, run_of
+
+from memmlp.report.ui import facts as run_facts
+from memmlp.report.ui.facts import facts, last_entries, read_config
+from memmlp.report.ui.index import Index
+
+
+def test_facts_of_a_finished_run(outputs: Path):
+    run = run_of(outputs, "gru", 1)
+    (run.folder / "notes.json").write_text(json.dumps({"tags": ["good", 7], "note": "<b>look</b>"}))
+    found = facts(run.folder)
+    assert (found["id"], found["done"], found["steps"], found["damage"]) == (run.id, True, 2000, [])
+    assert found["metrics"]["stream.rotation.MPJPE"] == pytest.approx(
+        run.results["stream"]["rotation"]["MPJPE"]
+    )
+    assert found["metrics"]["latency.median_ms"] == pytest.approx(0.64)
+    assert (found["tags"], found["note"]) == (["good", "7"], "<b>look</b>")
+    assert found["recent"][-1][0] == 2000
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "damaged"),
+    [
+        ("manifest.json", b"{", "manifest.json"),
+        ("config.yaml", b"a: [", "config.yaml"),
+        ("config.yaml", b"\xff\xfe", "config.yaml"),
+        ("config.yaml", b"- a list", "config.yaml"),
+        ("evaluations/stream-0.json", b'{"mean": 3}', "evaluations/stream-0.json"),
+        ("notes.json", b"[1]", None),
+        ("metrics.jsonl", b"\x00\x00 no line\n{}\n", None),
+        ("deployments/fp32-0/latency.json", b"[", None),
+        ("FAILED", b"[]", None),
+        (".holder", b'{"pid": "no number", "host": 3}', None),
+    ],
+)
+def test_damage_is_told_and_raises_nothing(outputs: Path, name: str, content: bytes, damaged: str | None):
+    run = run_of(outputs)
+    (run.folder / name).write_bytes(content)
+    index = Index(outputs)
+    index.refresh()
+    assert len(index.runs) == 6
+    assert index.runs[run.id]["damage"] == ([damaged] if damaged else [])
+
+
+def test_a_folder_without_anything_is_a_run_that_is_damaged(outputs: Path):
+    (outputs / "runs" / ("0" * 16)).mkdir()
+    (outputs / "runs" / "no run").mkdir()
+    index = Index(outputs)
+    index.refresh()
+    assert index.runs["0" * 16]["damage"] == ["manifest.json", "config.yaml"]
+    assert "no run" not in index.runs
+
+
+def test_only_what_changed_is_parsed_again(outputs: Path, monkeypatch: pytest.MonkeyPatch):
+    parsed = []
+    monkeypatch.setattr(run_facts, "facts", lambda folder: parsed.append(folder.name) or facts(folder))
+    index = Index(outputs)
+    first = index.refresh()
+    assert len(parsed) == 6
+    assert index.refresh() == first
+    assert len(parsed) == 6
+    run = begun(outputs)
+    second = index.refresh()
+    assert (second, parsed[6:]) == (first + 1, [run.id])
+    assert index.runs[run.id]["status"] == "stopped"
+    run.log(600, {"loss": 1.0})
+    assert index.refresh() == first + 2
+    assert (parsed[6:], index.runs[run.id]["recent"][-1][0]) == ([run.id] * 2, 600)
+
+
+def test_a_run_is_not_done_while_it_is_evaluated(outputs: Path):
+    index = Index(outputs)
+    index.refresh()
+    run = run_of(outputs)
+    with run.lock():
+        run.attempt("evaluation")
+        index.refresh()
+        assert index.runs[run.id]["status"] == "evaluating"
+    index.refresh()
+    assert index.runs[run.id]["status"] == "done"
+
+
+def test_a_run_that_is_gone_is_told(outputs: Path):
+    index = Index(outputs)
+    index.refresh()
+    run = begun(outputs)
+    index.refresh()
+    for path in run.folder.iterdir():
+        path.unlink()
+    run.folder.rmdir()
+    assert index.refresh() == index.removed[run.id] == 3
+    assert run.id not in index.runs
+
+
+def test_facts_are_kept_between_starts(outputs: Path, monkeypatch: pytest.MonkeyPatch):
+    store = outputs / "cache" / "ui" / "runs.sqlite"
+    first = Index(outputs, store)
+    first.refresh()
+    first.keep()
+    parsed = []
+    monkeypatch.setattr(run_facts, "facts", lambda folder: parsed.append(folder.name) or facts(folder))
+    changed = run_of(outputs)
+    os.utime(changed.manifest_path, ns=(1, 1))
+    second = Index(outputs, store)
+    second.refresh()
+    assert parsed == [changed.id]
+    status = {run_id: run["status"] for run_id, run in second.runs.items()}
+    assert status == {run_id: run["status"] for run_id, run in first.runs.items()}
+
+
+@pytest.mark.parametrize("content", [b"no database", b""])
+def test_a_damaged_store_is_made_anew(outputs: Path, content: bytes):
+    store = outputs / "cache" / "ui" / "runs.sqlite"
+    store.parent.mkdir(parents=True)
+    store.write_bytes(content)
+    index = Index(outputs, store)
+    index.refresh()
+    index.keep()
+    assert len(Index(outputs, store).runs) == 6
+
+
+def test_a_config_in_parts_is_the_config_as_a_whole(tmp_path: Path):
+    import yaml
+
+    content = {
+        "a": {"b": [1, {"c": None}], "text": "one\n\ntwo: three\n# no comment\n"},
+        "list": [[1, 2], "- x"],
+        "long": "word " * 60,
+        "empty": {},
+        "7": 8,
+    }
+    path = tmp_path / "config.yaml"
+    path.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+    assert read_config(path) == content
+
+
+def test_last_entries_of_a_log_that_is_being_written(tmp_path: Path):
+    path = tmp_path / "metrics.jsonl"
+    lines = [{"step": step, "phase": "train", "time": step, "values": {"loss": 1}} for step in range(9)]
+    path.write_text("\n".join(map(json.dumps, lines)) + '\n{"step": 9, "pha')
+    assert [entry[0] for entry in last_entries(path)] == [4, 5, 6, 7, 8]
+    assert last_entries(tmp_path / "none") == []

@@ -1,0 +1,282 @@
+"""The page in a browser: filter, sort, curves, effects, a replay, news, and data that looks like markup."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Event
+
+import pytest
+from chromium import Browser
+from report.ui.conftest import SEEDS, begun, made, run_of
+from report.ui.test_replay import motion
+
+from memmlp.cli.rounds import look
+from memmlp.evaluation.units import UNITS
+from memmlp.report.ui.answers import Answers
+from memmlp.report.ui.one_file import ReportedSweep, page_text, query, rounded
+from memmlp.report.ui.server import Server
+from memmlp.runs.run import Run
+from memmlp.sweep.kept_sweep import kept
+from memmlp.sweep.plan import Plan
+from memmlp.tables.build_table import collect, finished_runs
+from memmlp.tables.measured_run import load
+from memmlp.tables.rounds import begin
+from memmlp.tables.runs_of_plan import finder
+
+EVIL = "<img src=x onerror=owned=1>"
+READY = "document.documentElement.dataset.ready"
+NAMES = "[...document.querySelectorAll('.runs tbody th a')].map(a => a.textContent)"
+
+
+def predict(run: Run, clip: str, mode: str) -> dict:
+    """Stand in for a network."""
+    return motion(300 if clip == "kicks/01" else 120, 20.0 if run.config["memory"]["name"] == "gru" else 10.0)
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep, a run that trains, one that is damaged, and one whose every word looks like markup."""
+    outputs = tmp_path_factory.mktemp("home") / "outputs"
+    made(outputs)
+    begun(outputs)
+    (outputs / "runs" / ("0" * 16)).mkdir()
+    evil = begun(outputs, "e" * 16)
+    evil.config_path.write_text(
+        json.dumps({"memory": {"name": EVIL}, "seed": 9, EVIL: EVIL, "optim": {"steps": 900}})
+    )
+    (evil.folder / "notes.json").write_text(json.dumps({"tags": [EVIL], "note": EVIL}))
+    evil.log(1000, {EVIL: 1.0})
+    evil.fail(EVIL)
+    return outputs
+
+
+@pytest.fixture(scope="module")
+def server(home: Path) -> Iterator[Server]:
+    with Server(Answers(home, predict), 0, every=0.05) as running:
+        yield running
+
+
+@pytest.fixture
+def browser() -> Iterator[Browser]:
+    with Browser() as running:
+        yield running
+        assert not running.errors
+
+
+def go(browser: Browser, base: str, route: str, until: str) -> None:
+    """Open a route of the page and wait for what it must show."""
+    browser.open("about:blank")
+    browser.open(f"{base}#/{route}")
+    browser.wait(f"!!({READY} && ({until}))")
+
+
+pytestmark = pytest.mark.slow
+
+
+def test_filter_sort_and_the_address(browser: Browser, server: Server):
+    go(browser, server.url, "runs", "document.querySelectorAll('.runs tbody tr').length >= 9")
+    browser.value(
+        "const f = document.querySelector('#filter'); f.value = 'memory=gru stream.MPJPE<99'; "
+        "f.dispatchEvent(new Event('input'))"
+    )
+    names = [f"memory=gru · seed {seed}" for seed in SEEDS]
+    assert sorted(browser.value(NAMES)) == names
+    for order in (names, names[::-1]):
+        browser.click(".runs thead th:nth-child(2) button")
+        browser.wait(f"JSON.stringify({NAMES}) == JSON.stringify({json.dumps(order)})")
+    assert browser.value("document.querySelector('th[aria-sort]').ariaSort") == "descending"
+    heads = browser.value(
+        "[...document.querySelectorAll('.runs thead button')].map(b => b.firstChild.textContent)"
+    )
+    assert "seed" in heads
+    assert "memory" not in heads  # all of these have the same
+    route = browser.value("location.hash")
+    go(browser, server.url, route.removeprefix("#/"), f"{NAMES}.length == 3")
+    assert browser.value(NAMES) == names[::-1]
+
+
+def test_chosen_runs_are_compared(browser: Browser, server: Server, home: Path):
+    go(browser, server.url, "runs?filter=memory%3Dgru", f"{NAMES}.length == 3")
+    browser.click(".runs thead input")
+    browser.wait("document.querySelector('a.button').textContent == 'Compare 3'")
+    browser.click("a.button")
+    browser.wait("document.querySelectorAll('.plot svg path').length >= 3")
+    assert browser.value("document.querySelector('h1').textContent") == "3 runs"
+    label = browser.value("document.querySelector('.plot svg').ariaLabel")
+    assert label.startswith("training loss by step. memory=gru · seed")
+
+
+def test_a_run_s_page_and_its_replay(browser: Browser, server: Server, home: Path):
+    run = run_of(home, "gru", 0)
+    go(
+        browser,
+        server.url,
+        f"run/{run.id}?clip=kicks%2F01",
+        f"/^{run.id} .* 3$/.test(document.documentElement.dataset.replayed)",
+    )
+    assert browser.value("[...document.querySelectorAll('.view-name span')].map(s => s.textContent)") == [
+        "Truth",
+        "memory=gru · seed 0",
+        "memory=none · seed 0",
+    ]
+    pieces = browser.value("[...document.querySelectorAll('.pieces button')].map(b => b.textContent)")
+    assert pieces[0] == "Worst second at 5.0 s: 20.0 cm"
+    browser.value("document.querySelector('.transport .primary').click()")
+    browser.wait("document.querySelector('.transport .primary').textContent == 'Play'")
+    browser.value("document.querySelector('.pieces button').click()")
+    browser.wait("Number(document.documentElement.dataset.replayed.split(' ')[1]) >= 300")
+    assert "memory.name" in browser.value("document.querySelector('.config').textContent")
+    assert browser.value("document.querySelectorAll('.meter').length") == 12
+
+
+def test_a_sweep_s_effects_and_curves(browser: Browser, server: Server):
+    go(browser, server.url, "sweep/mine", "document.querySelectorAll('.plot svg').length >= 2")
+    label = browser.value("document.querySelector('.plot svg').ariaLabel")
+    assert label.startswith("MPJPE [cm], differences from the control. gru: \N{MINUS SIGN}")
+    assert ", holds; the paper: \N{MINUS SIGN}1.20" in label
+    assert browser.value("[...document.querySelectorAll('.verdict')].map(v => v.textContent)") == [
+        "holds",
+        "holds",
+    ]
+
+
+def scored(run: Run, **values: float) -> None:
+    """Add metrics to a run's evaluations, to means and clips alike."""
+    for path in run.evaluations.glob("*.json"):
+        report = json.loads(path.read_text())
+        for errors in (report["mean"], *report["clips"]):
+            errors["rotation"] |= values
+        path.write_text(json.dumps(report))
+
+
+def test_units_and_directions_of_metrics_of_ones_own(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Those of a package in use; of another metric nobody knows what is better."""
+    monkeypatch.setitem(UNITS, "Score", "points")
+    monkeypatch.setattr("memmlp.tables.table_text.HIGHER", {"Score"})
+    made(tmp_path)
+    none, gru = (run_of(tmp_path, arm, 0) for arm in ("none", "gru"))
+    scored(none, Score=5.0, Odd=1.0)
+    scored(gru, Score=7.0, Odd=2.0)
+    with Server(Answers(tmp_path, kept=False), 0, every=0.05) as running:
+        go(browser, running.url, f"run/{gru.id}", "document.querySelectorAll('.grid').length >= 2")
+        rows = browser.value("[...document.querySelectorAll('.grid tbody tr')].map(r => r.textContent)")
+        (row,) = (row for row in rows if row.startswith("Score"))
+        assert row.startswith("Scorepoints ↑")
+        assert "7.00+2.00" in row
+        assert any(re.match(r"Odd[^a-z]*2.00\+1.00", row) for row in rows)  # no unit, no arrow
+        marked = (
+            "[...document.querySelectorAll('.grid td small')].filter(s => s.textContent == '{}')[0].className"
+        )
+        assert browser.value(marked.format("+2.00")) == "better"
+        assert browser.value(marked.format("+1.00")) == ""
+        go(browser, running.url, f"compare?runs={none.id},{gru.id}", "document.querySelectorAll('.lines')[1]")
+        best = (
+            "[...document.querySelectorAll('.lines tbody tr')].filter(r => /{}/.test(r.textContent))"
+            ".map(r => r.querySelector('.least')?.textContent ?? '')[0]"
+        )
+        assert browser.value(best.format("Score")) == "7.00"
+        assert browser.value(best.format("Odd")) == ""
+        assert browser.value(best.format("stream MPJPE")) != ""
+
+
+def test_rounds_of_a_sweep(browser: Browser, tmp_path: Path):
+    sweep, folder = made(tmp_path), tmp_path / "sweeps" / "mine"
+    look(sweep, tmp_path, begin(sweep), Plan.load(folder / "plan.json"))
+    with Server(Answers(tmp_path, kept=False), 0, every=0.05) as running:
+        go(browser, running.url, "sweep/mine", "document.body.textContent.includes('Rounds')")
+        words = browser.value("document.body.textContent")
+        assert "2 of 2 comparisons are decided" in words
+        assert "holdsat 3 seeds" in words
+        rows = browser.value("[...document.querySelectorAll('.pair tbody tr')].map(r => r.textContent)")
+        assert rows[0].startswith("3 seeds")
+        assert "gru203\N{EN DASH}" in rows
+
+
+def test_news_are_shown_without_a_touch(browser: Browser, server: Server, home: Path):
+    run = Run.of(home, "abcdef0123456789")
+    go(browser, server.url, f"run/{run.id}", "document.querySelector('.plot svg')")
+    data = "document.querySelector('.plot svg')?.ariaLabel"
+    browser.wait(f"{data}?.includes('ends at 4.5')")
+    browser.wait("document.querySelector('#status').textContent == 'live'")
+    run.log(600, {"loss": 2.5})
+    browser.wait(f"{data}?.includes('ends at 2.5')")
+
+
+def test_data_is_never_markup_and_damage_is_told(browser: Browser, server: Server):
+    for route in ("runs?kind=all", f"run/{'e' * 16}", f"compare?runs={'e' * 16},abcdef0123456789"):
+        go(browser, server.url, route, "document.body.textContent.includes('<img src=x')")
+        assert browser.value("document.querySelectorAll('main img').length") == 0
+        assert browser.value("typeof owned") == "undefined"
+    go(browser, server.url, f"run/{'0' * 16}", "document.querySelector('.warning')")
+    words = browser.value("document.querySelector('.warning').textContent")
+    assert "manifest.json, config.yaml cannot be read" in words
+
+
+def test_a_phone_s_page_is_not_wider_than_the_phone(browser: Browser, server: Server):
+    browser.size(390, 844)
+    for route in ("runs", "sweep/mine", "sweeps", "run/abcdef0123456789", "searches"):
+        go(browser, server.url, route, "document.querySelector('h1')")
+        assert browser.value("document.documentElement.scrollWidth") <= 390, route
+    go(browser, server.url, "runs", "document.querySelector('.runs thead th.n')")
+    assert browser.value("document.querySelector('.runs thead th.n').textContent") == "MPJPEstream, cm"
+    assert browser.value("document.querySelector('.runs thead th.n').getBoundingClientRect().right") <= 390
+
+
+def test_colours_are_a_choice_that_is_kept(browser: Browser, server: Server):
+    paper = "getComputedStyle(document.body).backgroundColor"
+    go(browser, server.url, "runs", "document.querySelector('h1')")
+    light = browser.value(paper)
+    for _ in range(2):  # from the system's to light, and to dark
+        browser.click("#theme")
+    dark = browser.value(paper)
+    assert dark != light
+    go(browser, server.url, "sweeps", "document.querySelector('h1')")
+    assert browser.value(paper) == dark
+
+
+def test_a_replay_says_that_the_other_run_s_is_being_computed(browser: Browser, home: Path):
+    seen = Event()
+
+    def slow(run: Run, clip: str, mode: str) -> dict:
+        if run.config["memory"]["name"] == "none":
+            seen.wait()
+        return predict(run, clip, mode)
+
+    with Server(Answers(home, slow, kept=False), 0, every=0.05) as server:
+        go(browser, server.url, f"run/{run_of(home, 'gru', 1).id}", "document.querySelector('.view .wait')")
+        assert browser.value("document.querySelector('.view .wait').textContent") == "computing …"
+        seen.set()
+        browser.wait("/ 3$/.test(document.documentElement.dataset.replayed)")
+        assert browser.value("document.querySelector('.view .wait')") is None
+
+
+def test_a_file_without_a_server(browser: Browser, home: Path, tmp_path: Path):
+    folder = home / "sweeps" / "mine"
+    sweep, plan = kept(folder), Plan.load(folder / "plan.json")
+    assert sweep is not None
+    table = collect(sweep, finished_runs(sweep, finder(plan, load)))
+    text = page_text(Answers(home, predict, kept=False), [ReportedSweep("mine", table)], "<h1>Extra</h1>")
+    assert EVIL not in text
+    file = tmp_path / "report.html"
+    file.write_text(text)
+    go(browser, file.as_uri(), "", "document.querySelector('main h1').textContent == 'Extra'")
+    go(browser, file.as_uri(), "runs", f"{NAMES}.length == 6")
+    best = min(
+        (run_of(home, "gru", seed) for seed in range(3)),
+        key=lambda run: run.results["stream"]["rotation"]["MPJPE"],
+    )
+    go(browser, file.as_uri(), f"run/{best.id}", "document.documentElement.dataset.replayed?.endsWith(' 3')")
+    go(browser, file.as_uri(), "sweep/mine", "document.querySelectorAll('.plot svg').length >= 2")
+    go(browser, file.as_uri(), "extra", "document.querySelector('main h1').textContent == 'Extra'")
+
+
+def test_words_of_an_address_and_numbers_of_a_file():
+    assert query(clip="a b/c~d*e", mode="stream") == "clip=a+b%2Fc%7Ed*e&mode=stream"
+    assert rounded({"a": [1.23456789, float("nan"), (float("inf"), 3, "x", None, True)]}) == {
+        "a": [1.23457, None, [None, 3, "x", None, True]]
+    }

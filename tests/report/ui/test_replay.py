@@ -1,0 +1,115 @@
+"""Replays: the worst seconds, the page's axes, what is kept, and what can't be computed."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from processes import until
+from report.ui.conftest import run_of
+
+from memmlp.common.errors import InputError
+from memmlp.report.ui.replay import Replays, piece, worst_seconds
+from memmlp.runs.run import Run
+
+FRAMES = 900
+
+
+def motion(at: int = 300, centimetres: float = 20.0) -> dict[str, np.ndarray]:
+    """Truth and a prediction that is off by so much in one second, and by a centimetre elsewhere."""
+    truth = np.zeros((FRAMES, 22, 3))
+    truth[..., 2] = 1.0
+    off = np.full(FRAMES, 0.01)
+    off[at : at + 60] = centimetres / 100
+    predicted = truth.copy()
+    predicted[..., 0] += off[:, None]
+    return {"true_positions": truth, "predicted_positions": predicted}
+
+
+def ready(replays: Replays, *words: str) -> dict:
+    """Wait for a replay."""
+    found: dict = {}
+
+    def come() -> bool:
+        found.update(replays.get(*words))
+        return found["state"] != "computing"
+
+    until(come, "the replay")
+    return found
+
+
+def test_a_piece_is_around_the_worst_second_in_the_page_s_axes():
+    made = motion()
+    found = piece(made["true_positions"], made["predicted_positions"])
+    assert found["worst"][0] == {"first": 300, "mean": 20.0}
+    assert (found["frames"], found["from"], len(found["truth"])) == (FRAMES, 30, 600)
+    assert found["truth"][0][:3] == [0, 1000, 0]  # up is y there
+    assert found["joints"][270][:3] == [200, 1000, 0]
+    assert found["errors"][300] == 20.0
+    assert piece(made["true_positions"], made["predicted_positions"], 12.0)["from"] == 300
+
+
+def test_worst_seconds_do_not_overlap():
+    errors = np.ones(400)
+    errors[100:160], errors[130:190] = 5.0, 6.0
+    errors[300:360] = 3.0
+    found = worst_seconds(errors)
+    firsts = sorted(one["first"] for one in found)
+    assert found[0] == {"first": 130, "mean": 6.0}
+    assert all(later - earlier >= 60 for earlier, later in itertools.pairwise(firsts))
+    assert {300} < set(firsts)
+
+
+@pytest.mark.parametrize("frames", [1, 30, 60, 61])
+def test_short_clips(frames: int):
+    truth = np.zeros((frames, 22, 3))
+    found = piece(truth, truth + 0.1)
+    assert (len(found["truth"]), found["worst"][0]["first"]) == (frames, 0)
+
+
+def test_a_prediction_is_computed_once_and_kept_for_these_weights(outputs: Path):
+    asked = []
+
+    def predict(run: Run, clip: str, mode: str) -> dict[str, np.ndarray]:
+        asked.append((clip, mode))
+        return motion()
+
+    run = run_of(outputs)
+    replays = Replays(outputs, predict)
+    assert ready(replays, run.id, "a clip", "stream")["worst"][0]["mean"] == 20.0
+    ready(replays, run.id, "a clip", "stream")
+    ready(Replays(outputs, predict), run.id, "a clip", "stream")
+    assert asked == [("a clip", "stream")]
+    ready(replays, run.id, "a clip", "window")
+    run.marker.write_text(f'{{"id": "{run.id}", "artifacts": {{"model.safetensors": "other"}}}}')
+    ready(Replays(outputs, predict), run.id, "a clip", "stream")
+    assert len(asked) == 3
+
+
+def test_a_damaged_file_is_computed_anew(outputs: Path):
+    run = run_of(outputs)
+    replays = Replays(outputs, lambda *_: motion())
+    ready(replays, run.id, "a clip", "stream")
+    (file,) = (outputs / "cache" / "ui" / "replays").glob("*.npz")
+    file.write_bytes(b"no arrays")
+    assert (
+        ready(Replays(outputs, lambda *_: motion(100)), run.id, "a clip", "stream")["worst"][0]["first"]
+        == 100
+    )
+
+
+def test_what_cannot_be_computed_says_why_and_may_be_asked_again(outputs: Path):
+    answers = iter([InputError("its data has changed"), MemoryError("no room"), None])
+
+    def predict(*_: object) -> dict[str, np.ndarray]:
+        if (error := next(answers)) is not None:
+            raise error
+        return motion()
+
+    run, replays = run_of(outputs), Replays(outputs, predict)
+    assert ready(replays, run.id, "c", "stream") == {"state": "failed", "reason": "its data has changed"}
+    assert ready(replays, run.id, "c", "stream")["reason"] == "MemoryError: no room"
+    assert ready(replays, run.id, "c", "stream")["state"] == "ready"
+    assert ready(Replays(outputs, None), run.id, "d", "stream")["state"] == "failed"

@@ -1,0 +1,200 @@
+"""The server: what it answers, and to whom."""
+
+from __future__ import annotations
+
+import http.client
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import quote
+
+import pytest
+from report.ui.conftest import begun, run_of
+
+from memmlp.common.errors import InputError
+from memmlp.report.ui import pages
+from memmlp.report.ui.answers import Answers
+from memmlp.report.ui.server import Server
+
+TOKEN = "a token of many letters"
+
+
+class Answer(NamedTuple):
+    code: int
+    body: bytes
+    headers: http.client.HTTPMessage
+
+    @property
+    def json(self) -> dict:
+        return json.loads(self.body)
+
+
+def get(server: Server, path: str, **headers: str) -> Answer:
+    """Ask the server for a path, literally as it is given."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=60)
+    connection.putrequest("GET", path, skip_host="Host" in headers)
+    for name, value in headers.items():
+        connection.putheader(name.replace("_", "-"), value)
+    connection.endheaders()
+    response = connection.getresponse()
+    answer = Answer(response.status, response.read(), response.headers)
+    connection.close()
+    return answer
+
+
+@pytest.fixture
+def server(outputs: Path) -> Iterator[Server]:
+    with Server(Answers(outputs), 0, every=0.05) as running:
+        yield running
+
+
+def test_runs_and_only_what_changed_since(server: Server, outputs: Path):
+    first = get(server, "/api/runs").json
+    assert (len(first["rows"]), first["whole"]) == (6, True)
+    row = next(row for row in first["rows"] if row["id"] == run_of(outputs, "gru", 2).id)
+    assert (row["name"], row["status"]) == ("memory=gru · seed 2", "done")
+    assert dict(zip(first["keys"], row["config"], strict=True))["memory.name"] == "gru"
+    since = f"/api/runs?since={first['generation']}&heads={first['heads']}"
+    assert get(server, since).json["rows"] == []
+    (run_of(outputs).folder / "notes.json").write_text('{"tags": ["good"]}')
+    server.answers.look()
+    changed = get(server, since).json
+    assert ([row["tags"] for row in changed["rows"]], changed["whole"]) == ([["good"]], False)
+    begun(outputs)
+    server.answers.look()
+    assert get(server, since).json["whole"]  # its config has values that no other run has
+
+
+def test_pages_of_a_run_a_sweep_and_curves(server: Server, outputs: Path):
+    run, control = run_of(outputs, "gru", 1), run_of(outputs, "none", 1)
+    page = get(server, f"/api/run/{run.id}").json
+    assert page["name"] == "memory=gru · seed 1"
+    assert (page["control"]["id"], len(page["clips"])) == (control.id, 12)
+    assert page["control"]["config"]["memory.name"] == "none"
+    assert "config.yaml" in [file["name"] for file in page["files"]]
+    assert get(server, "/api/sweeps").json["sweeps"][0]["title"] == "Mine"
+    assert get(server, "/api/sweeps/mine").json["table"]["caption"] == "Mine"
+    curves = get(server, f"/api/curves?runs={run.id},{control.id},zzz&names=train%20loss").json["curves"]
+    assert {len(found["train loss"][0]) for found in curves.values()} == {21}
+    assert get(server, "/api/searches").json == {"searches": []}
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../../etc/passwd", "/plot/../../server.py", "/plot/%2e%2e/%2e%2e/server.py", "/server.py",
+        "/api/run/" + "0" * 16,
+        "/api/run/../x", "/api/sweeps/none", "/api/sweeps/..%2Fmine", "/api/searches/..%2F..", "/api/none",
+        "/files/", "/files/{id}/", "/files/{id}/DONE", "/files/{id}/model.safetensors",
+        "/files/{id}/..%2F{id}%2Fconfig.yaml",
+        "/files/{id}/evaluations/stream-0.json", "/files/..%2Fruns%2F{id}/config.yaml", "/files//etc/passwd",
+    ],
+)  # fmt: skip
+def test_nothing_else_is_sent(server: Server, outputs: Path, path: str):
+    answer = get(server, path.replace("{id}", run_of(outputs).id))
+    assert answer.code == 404
+    assert answer.json.keys() == {"error"}
+
+
+def test_the_page_says_what_it_reads_before_it_has_read_it(server: Server):
+    assert b"Reading the run folders" in get(server, "/").body
+
+
+def test_what_is_missing_is_named(server: Server, outputs: Path):
+    assert (
+        get(server, "/api/run/nope").json["error"].startswith(f"run nope: it is not in {outputs / 'runs'};")
+    )
+    assert get(server, "/api/sweeps/none").json["error"].startswith("sweep none: it is not in ")
+    assert get(server, "/api/none").json["error"] == "none: there is no such page"
+
+
+@pytest.mark.parametrize(
+    "path", ["/api/runs?since=x", "/api/replay/{id}?mode=other&clip=c", "/api/replay/{id}"]
+)
+def test_a_bad_question_is_one_line(server: Server, outputs: Path, path: str):
+    answer = get(server, path.replace("{id}", run_of(outputs).id))
+    assert (answer.code, list(answer.json)) == (400, ["error"])
+
+
+def test_the_page_s_files_and_their_policy(server: Server):
+    for name in pages.FILES:
+        answer = get(server, f"/{name}")
+        assert (answer.code, len(answer.body) > 100) == (200, True)
+    policy = answer.headers["Content-Security-Policy"]
+    assert "script-src 'self' 'sha256-" in policy
+    assert "unsafe-inline" not in policy.partition("style-src")[0]
+    assert answer.headers["X-Content-Type-Options"] == "nosniff"
+
+
+def test_a_run_s_file_is_text_without_any_right(server: Server, outputs: Path):
+    run = run_of(outputs)
+    answer = get(server, f"/files/{run.id}/config.yaml")
+    assert (answer.code, answer.headers["Content-Type"]) == (200, "text/plain; charset=utf-8")
+    assert answer.headers["Content-Security-Policy"] == "default-src 'none'; sandbox"
+
+
+@pytest.mark.parametrize(
+    ("headers", "code"),
+    [
+        ({}, 200),
+        ({"Host": "localhost:1"}, 200),
+        ({"Host": "evil.example"}, 403),
+        ({"Host": "127.0.0.1.evil.example:80"}, 403),
+        ({"Host": ""}, 403),
+        ({"Sec_Fetch_Site": "cross-site"}, 403),
+        ({"Sec_Fetch_Site": "same-origin"}, 200),
+    ],
+)
+def test_other_hosts_and_other_pages_get_nothing(server: Server, headers: dict[str, str], code: int):
+    assert get(server, "/api/runs", **headers).code == code
+
+
+def test_a_link_on_another_page_may_open_the_page_alone(server: Server):
+    elsewhere = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"}
+    assert get(server, "/", **elsewhere).code == 200
+    assert get(server, "/api/runs", **elsewhere).code == 403
+
+
+def test_another_address_needs_the_token(outputs: Path):
+    with Server(Answers(outputs), 0, "0.0.0.0", TOKEN) as server:
+        for path in ("/", "/api/runs", "/style.css", "/events", "/?token=wrong", "/api/runs?token="):
+            answer = get(server, path)
+            assert (answer.code, b"runs" in answer.body) == (403, False)
+        entered = get(server, f"/?token={quote(TOKEN)}")
+        assert (entered.code, entered.headers["Location"]) == (303, "/")
+        cookie = entered.headers["Set-Cookie"]
+        assert "HttpOnly; SameSite=Strict" in cookie
+        assert len(get(server, "/api/runs", Cookie=cookie.partition(";")[0]).json["rows"]) == 6
+        assert get(server, "/api/runs", Cookie=cookie.partition("=")[0] + "=other").code == 403
+        assert f"?token={quote(TOKEN)}" in server.url
+    with Server(Answers(outputs), 0, "0.0.0.0") as server:
+        assert len(server.access.token or "") >= 32
+
+
+def test_news_come_when_something_changed(server: Server, outputs: Path):
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=60)
+    connection.request("GET", "/events")
+    news = connection.getresponse()
+    first = news.readline()
+    assert first.startswith(b'data: "1 ')
+    assert news.readline() == b"\n"
+    begun(outputs)
+    assert news.readline().startswith(b'data: "2 ')
+    connection.close()
+
+
+def test_a_port_that_is_taken_is_one_line(server: Server, outputs: Path):
+    with pytest.raises(InputError, match=f"--port {server.server_port}: .*; allowed are"):
+        Server(Answers(outputs), server.server_port)
+    with pytest.raises(InputError, match=r"--host nowhere\.invalid"):
+        Server(Answers(outputs), 0, "nowhere.invalid")
+
+
+def test_a_bug_in_an_answer_is_an_answer(server: Server, monkeypatch: pytest.MonkeyPatch):
+    def broken(*_: object) -> dict:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(server.answers, "of", broken)
+    answer = get(server, "/api/runs")
+    assert (answer.code, answer.json) == (500, {"error": "ZeroDivisionError: a bug"})

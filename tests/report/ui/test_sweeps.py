@@ -1,0 +1,204 @@
+"""Sweeps: how far they are, and the same verdicts as `memmlp table`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from fake_runs import fake_run
+from report.ui.conftest import begun, run_of
+
+from memmlp.cli.rounds import look
+from memmlp.report.ui.index import Index
+from memmlp.report.ui.sweeps import NOT_KEPT, OTHERS, ROUNDS, Sweeps
+from memmlp.runs.run import Run
+from memmlp.sweep.kept_sweep import keep, kept
+from memmlp.sweep.plan import Plan, RunTask
+from memmlp.sweep.spec import Scale
+from memmlp.tables.build_table import collect, finished_runs
+from memmlp.tables.formats import as_json
+from memmlp.tables.measured_run import load
+from memmlp.tables.rounds import Rounds, begin
+from memmlp.tables.runs_of_plan import finder, states
+
+
+def sweeps_of(outputs: Path) -> Sweeps:
+    index = Index(outputs)
+    index.refresh()
+    return Sweeps(index)
+
+
+def test_the_table_is_that_of_the_command(outputs: Path):
+    folder = outputs / "sweeps" / "mine"
+    sweep, plan = kept(folder), Plan.load(folder / "plan.json")
+    assert sweep is not None
+    table = json.loads(as_json(collect(sweep, finished_runs(sweep, finder(plan, load)))))
+    shown = sweeps_of(outputs).page("mine")["table"]
+    assert shown["rows"] == table["rows"]
+    (row,) = [row for row in shown["rows"] if row["label"] == "gru"]
+    effect = row["cells"]["stream"]["MPJPE"]["effect"]
+    assert (effect["verdict"], row["cells"]["stream"]["MPJPE"]["paper_effect"]) == (
+        "holds",
+        pytest.approx(-1.2),
+    )
+
+
+def test_progress_and_time_left(outputs: Path, monkeypatch: pytest.MonkeyPatch):
+    before = sweeps_of(outputs).progress(sweeps_of(outputs).known()[0])
+    assert (before["counts"], before["share"], before["left"]) == ({"done": 6}, 1.0, None)
+    run = run_of(outputs, "gru", 2)
+    run.marker.unlink()
+    lines = [
+        {"step": s, "phase": "train", "time": s / 100, "values": {"loss": 1}} for s in range(0, 1001, 100)
+    ]
+    run.metrics_path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    monkeypatch.setattr(Run, "doing", property(lambda self: None if self.done else "training"))
+    sweeps = sweeps_of(outputs)
+    found = sweeps.progress(sweeps.known()[0])
+    assert found["counts"] == {"done": 5, "training": 1}
+    assert found["share"] == pytest.approx(11 / 12)
+    assert found["left"] is not None
+    (cell,) = [cell for cell in sweeps.page("mine")["cells"] if cell["state"] == "training"]
+    assert (cell["arm"], cell["seed"], cell["step"], cell["steps"]) == ("gru", 2, 1000, 2000)
+
+
+def test_a_run_that_lacks_an_evaluation_is_trained_and_a_vqvae_is_no_arm(outputs: Path):
+    path = outputs / "sweeps" / "mine" / "plan.json"
+    plan = Plan.load(path)
+    upstream = fake_run(outputs, "vqvae")
+    first = plan.entries[0]
+    tasks = tuple(
+        replace(task, stages=("stream-absent",)) if task.id == first.id else task for task in plan.tasks
+    )
+    vqvae = RunTask(upstream.id, "vqvae", {"vqvae": {"steps": 20}})
+    entries = (replace(first, stages=("stream-absent",)), *plan.entries[1:])
+    replace(plan, entries=entries, tasks=(vqvae, *tasks)).save(path)
+    sweeps = sweeps_of(outputs)
+    found = sweeps.progress(sweeps.known()[0])
+    assert (found["counts"], found["above"], found["tasks"]) == ({"trained": 1, "done": 5}, {"done": 1}, 6)
+    say = states(Plan.load(path))
+    arm = next(arm for arm in kept(path.parent).runnable() if arm.label == first.label)
+    assert say(arm, first.seed) == "trained, an evaluation or export is missing"
+
+
+def test_no_time_is_left_where_only_the_evaluation_is(outputs: Path):
+    run = run_of(outputs, "gru", 2)
+    with run.lock():
+        run.attempt("evaluation")
+        sweeps = sweeps_of(outputs)
+        found = sweeps.progress(sweeps.known()[0])
+    assert (found["counts"], found["left"]) == ({"done": 5, "evaluating": 1}, None)
+    assert 0.999 < found["share"] < 1
+
+
+def test_the_board_shows_the_sweep_s_first_metric_and_its_branch(outputs: Path):
+    folder, run = outputs / "sweeps" / "mine", run_of(outputs, "gru", 0)
+    sweep = kept(folder)
+    assert sweep is not None
+    keep(replace(sweep, metrics=("FLOPs", "MPJRE", "MPJPE")).with_branch("combined"), folder)
+    page = sweeps_of(outputs).page("mine")
+    assert (page["metric"], page["branch"]) == ("MPJRE", "combined")
+    (cell,) = [cell for cell in page["cells"] if cell["id"] == run.id]
+    assert cell["value"] == pytest.approx(run.results["stream"]["combined"]["MPJRE"])
+
+
+def test_a_failed_run_and_its_reason(outputs: Path):
+    run = run_of(outputs, "none", 1)
+    run.marker.unlink()
+    run.fail("the loss was no number")
+    page = sweeps_of(outputs).page("mine")
+    (cell,) = [cell for cell in page["cells"] if cell["state"] == "failed"]
+    assert (cell["arm"], cell["seed"], cell["failure"]) == ("none", 1, "the loss was no number")
+
+
+def test_a_sweep_from_before_has_its_first_arm_as_control_and_says_so(outputs: Path):
+    (outputs / "sweeps" / "mine" / "sweep.json").unlink()
+    page = sweeps_of(outputs).page("mine")
+    assert NOT_KEPT in page["table"]["flags"]
+    assert page["table"]["control"] == "none"
+
+
+def looked(outputs: Path) -> Rounds:
+    """Take the first look, at the three seeds that there are."""
+    folder = outputs / "sweeps" / "mine"
+    sweep = kept(folder)
+    assert sweep is not None
+    return look(sweep, outputs, begin(sweep), Plan.load(folder / "plan.json"))
+
+
+def test_verdicts_of_rounds_and_their_looks_are_shown(outputs: Path):
+    sweeps = sweeps_of(outputs)
+    assert sweeps.page("mine")["rounds"] is None
+    before = sweeps.stamp()
+    rounds = looked(outputs)
+    assert sweeps.stamp() != before
+    page = sweeps.page("mine")
+    effect = page["table"]["rows"][1]["cells"]["stream"]["MPJPE"]["effect"]
+    assert (effect["verdict"], effect["decided"], effect["level"]) == ("holds", 3, rounds.levels[0])
+    assert not {ROUNDS, OTHERS} & set(page["table"]["flags"])
+    first, second = page["rounds"]["looks"][:2]
+    assert first == {"seeds": 3, "level": rounds.levels[0], "compared": 2, "decided": 2}
+    assert (second["compared"], page["rounds"]["comparisons"]) == (0, 2)
+    arms = {arm["label"]: arm for arm in page["rounds"]["arms"]}
+    assert arms["gru"] == {"label": "gru", "decided": 2, "open": 0, "seeds": 3, "next": None}
+
+
+@pytest.mark.parametrize(
+    ("change", "flag"),
+    [
+        ({"subject": {}}, OTHERS),
+        ({"taken": 3}, ROUNDS),
+        ({"taken": [{"seeds": 3, "level": 0.01, "runs": {"gru": "0" * 16}, "found": []}]}, ROUNDS),
+    ],
+)
+def test_rounds_of_something_else_are_flagged(outputs: Path, change: dict, flag: str):
+    looked(outputs)
+    path = outputs / "sweeps" / "mine" / "rounds.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    page = sweeps_of(outputs).page("mine")
+    assert page["rounds"] is None
+    assert flag in page["table"]["flags"]
+    assert page["table"]["rows"][1]["cells"]["stream"]["MPJPE"]["effect"]["decided"] is None
+
+
+def test_damaged_rounds_are_flagged(outputs: Path):
+    (outputs / "sweeps" / "mine" / "rounds.json").write_text("{}")
+    assert ROUNDS in sweeps_of(outputs).page("mine")["table"]["flags"]
+
+
+def test_damage_is_told(outputs: Path):
+    bad = outputs / "sweeps" / "bad"
+    bad.mkdir()
+    (bad / "plan.json").write_text("{")
+    (run_of(outputs, "gru", 0).folder / "evaluations" / "stream-0.json").write_text("{")
+    sweeps = sweeps_of(outputs)
+    assert list(sweeps.rows()["damaged"]) == ["bad"]
+    assert any("cannot be read" in flag for flag in sweeps.page("mine")["table"]["flags"])
+    with pytest.raises(KeyError):
+        sweeps.page("bad")
+
+
+def test_a_table_is_made_again_when_a_run_changed(outputs: Path):
+    begun(outputs)
+    sweeps = sweeps_of(outputs)
+    first = sweeps.page("mine")["table"]
+    assert sweeps.page("mine")["table"] is first
+    run_of(outputs, "gru", 0).marker.unlink()
+    sweeps.index.refresh()
+    assert [row["found"] for row in sweeps.page("mine")["table"]["rows"]] == [[0, 1, 2], [1, 2]]
+
+
+def test_a_kept_sweep_is_the_sweep(outputs: Path):
+    folder = outputs / "sweeps" / "mine"
+    sweep = kept(folder)
+    assert sweep is not None
+    changed = replace(
+        sweep.with_overrides(["seed=4,5", "optim.lr=0.1"]),
+        scale=Scale(("compute", "a.b"), ("profile=paper",)),
+        arms=(*sweep.arms[1:], replace(sweep.arms[0], series="a", cell=("b=1", "c=2"))),
+    )
+    keep(changed, folder)
+    assert kept(folder) == changed
+    assert kept(folder.parent) is None

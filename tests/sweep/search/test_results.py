@@ -1,0 +1,113 @@
+"""What a search leaves: trials as CSV, experiments, Table 5, plots."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+import yaml
+from fake_search import (
+    STEPS,
+    begun,
+    director,
+    error,
+    finish,
+    log,
+    open_study,
+    seeded,
+    to_the_end,
+)
+
+from memmlp.sweep.search import results
+
+
+def test_trials_of_several_seeds_as_csv(tmp_path: Path):
+    study = open_study(tmp_path, seeds=2, n_trials=2, objectives=["MPJPE", "Jitter"])
+    one = seeded(study, tmp_path)
+    finish(one.look(1))
+    finish(one.look(1))
+    begun(one.look(1)).fail("the loss is nan")
+    one.look(1)
+    results.write_trials(study, tmp_path / "trials.csv")
+    with open(tmp_path / "trials.csv", newline="") as file:
+        row, failed = csv.DictReader(file)
+    first = error({"values": study.trials[0].params, "seed": 0})
+    assert float(row["MPJPE"]) == pytest.approx(first + 0.15)
+    assert float(row["MPJPE sd"]) == pytest.approx(0.3 / 2**0.5)
+    assert float(row["MPJPE, run 1"]) == pytest.approx(first)
+    assert float(row["Jitter, run 2"]) == pytest.approx(20 - first - 0.3)
+    assert len(row["run"].split()) == 2
+    assert (failed["state"], failed["MPJPE sd"], failed["reason"]) == ("fail", "", "the loss is nan")
+    (path,) = results.write_experiments(study, tmp_path, ["loss"])
+    assert row["run"] in path.read_text()
+
+
+@pytest.mark.slow
+def test_two_objectives_give_a_front(tmp_path: Path):
+    study = open_study(tmp_path, objectives=["MPJPE", "Jitter"])
+    to_the_end(study, tmp_path)
+    front = study.best()
+    assert len(front) == 6  # Jitter is 20 less MPJPE here, so that none is better in both
+    assert [trial.values[0] for trial in front] == sorted(trial.values[0] for trial in front)
+    files = results.write_experiments(study, tmp_path, ["loss"])
+    assert [file.name for file in files] == ["best.yaml", *(f"trial-{t.number}.yaml" for t in front[1:])]
+    names = {path.name for path in results.write_plots(study, tmp_path)}
+    assert names == {"pareto_front.png", "parallel_coordinate.png", "slice.png", "study.html"}
+
+
+@pytest.mark.slow
+def test_what_a_search_leaves(tmp_path: Path):
+    study = open_study(tmp_path)
+    to_the_end(study, tmp_path)
+    results.write_trials(study, tmp_path / "trials.csv")
+    with open(tmp_path / "trials.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["trial"] for row in rows] == list("012345")
+    assert [float(row["MPJPE"]) for row in rows] == [trial.value for trial in study.trials]
+    (path,) = results.write_experiments(study, tmp_path, ["loss"])
+    best = study.best()[0]
+    content = yaml.safe_load(path.read_text())
+    assert content["defaults"] == [{"override /loss": "manual"}, "_self_"]
+    assert {f"loss.{key}": value for key, value in content["loss"].items()} == best.params
+    assert path.read_text().startswith("# @package _global_\n")
+    shipped = tmp_path / "shipped.yaml"
+    shipped.write_text("control: b\narms: {a: {overrides: [loss=manual]}, b: []}\n")
+    assert results.write_table(study, shipped, tmp_path / "table05.yaml")
+    arms = yaml.safe_load((tmp_path / "table05.yaml").read_text())["arms"]
+    assert list(arms) == ["manual, searched", "a", "b"]
+    assert f"loss.hand={best.params['loss.hand']}" in arms["manual, searched"]["overrides"]
+    written = results.write_plots(study, tmp_path)
+    assert {path.name for path in written} == {
+        "optimization_history.png", "parallel_coordinate.png", "slice.png", "param_importances.png",
+        "study.html",
+    }  # fmt: skip
+    assert all(path.stat().st_size > 5000 for path in written)
+    page = (tmp_path / "study.html").read_text()
+    assert "<script src=" not in page
+
+
+def test_table_5_takes_only_loss_weights(tmp_path: Path):
+    study = open_study(tmp_path, space={"optim": {"lr": {"low": 0.1, "high": 1.0}}}, n_trials=1)
+    one = director(study, tmp_path)
+    run = begun(one.look(1))
+    log(run, STEPS, 1.0)
+    run.finish([])
+    one.look(1)
+    assert not results.write_table(study, tmp_path / "none", tmp_path / "table05.yaml")
+
+
+def test_a_best_trial_of_groups_lists_and_plain_keys_is_a_config(tmp_path: Path):
+    space = {"hand": {"choices": ["off", "fk"]}, "memory": {"layers": {"choices": [[2], [2, 4]]}}}
+    space |= {"seed": {"low": 3, "high": 9}}
+    study = open_study(tmp_path, space=space, n_trials=1, base=[])
+    one = director(study, tmp_path)
+    run = begun(one.look(1))
+    log(run, STEPS, 1.0)
+    run.finish([])
+    one.look(1)
+    (path,) = results.write_experiments(study, tmp_path, ["hand", "memory"])
+    content = yaml.safe_load(path.read_text())
+    assert content["defaults"][0]["override /hand"] in ("off", "fk")
+    assert content["memory"]["layers"] in ([2], [2, 4])
+    assert content["seed"] in range(3, 10)

@@ -1,0 +1,142 @@
+"""The study survives kills, proposes the same again, and says what it cannot read."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+from fake_search import (
+    director,
+    finish,
+    open_study,
+    search,
+    to_the_end,
+)
+
+from memmlp.common.errors import InputError, LeaseLost
+from memmlp.common.fences import fenced
+from memmlp.sweep.search.study import Study, journal, mend
+
+
+def test_a_resumed_search_proposes_what_the_undisturbed_one_does(tmp_path: Path):
+    calm = open_study(tmp_path / "calm" if (tmp_path / "calm").mkdir() is None else tmp_path)
+    to_the_end(calm, tmp_path / "calm", capacity=1)
+    (tmp_path / "stopped").mkdir()
+    for _ in range(6):
+        one = director(open_study(tmp_path / "stopped"), tmp_path / "stopped")
+        finish(one.look(1))
+    last = open_study(tmp_path / "stopped")
+    to_the_end(last, tmp_path / "stopped", capacity=1)
+    assert [trial.params for trial in last.trials] == [trial.params for trial in calm.trials]
+
+
+def test_the_seed_changes_what_is_proposed_and_the_sampler_too(tmp_path: Path):
+    proposed = []
+    for name, changes in {"a": {}, "b": {"seed": 1}, "c": {"sampler": "random"}}.items():
+        (tmp_path / name).mkdir()
+        study = open_study(tmp_path / name, **changes)
+        to_the_end(study, tmp_path / name, capacity=1)
+        proposed.append([tuple(trial.params.values()) for trial in study.trials])
+    assert proposed[0] != proposed[1]
+    assert proposed[0] != proposed[2]
+
+
+def test_a_grid_has_each_combination_once_in_order_however_often_it_is_stopped(tmp_path: Path):
+    space = {"loss": {"rotation": {"choices": [1.0, 2.0]}, "hand": {"choices": [0.1, 0.2, 0.3]}}}
+    grid = {"sampler": "grid", "space": space, "n_trials": 6, "startup": None, "prune_after": None}
+    for _ in range(3):
+        one = director(open_study(tmp_path, **grid), tmp_path)
+        finish(one.look(1))
+    study = open_study(tmp_path, **grid)
+    to_the_end(study, tmp_path, capacity=1)
+    every = [{"loss.rotation": one, "loss.hand": other} for one in (1.0, 2.0) for other in (0.1, 0.2, 0.3)]
+    assert [trial.params for trial in study.trials] == every
+
+
+def test_a_torn_line_and_a_dead_owners_lock_are_mended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """At once: Optuna alone sleeps until the lock is half a minute old."""
+
+    def sleep(seconds: float) -> None:
+        raise AssertionError("it waits for the lock")
+
+    study = open_study(tmp_path)
+    one = director(study, tmp_path)
+    finish(one.look(2))
+    one.look(2)
+    with open(journal(tmp_path), "ab") as file:
+        file.write(b'{"op_code":4,"worker_id":"x"')
+    Path(f"{journal(tmp_path)}.lock").symlink_to(journal(tmp_path))
+    monkeypatch.setattr("memmlp.runs.run.changes", str)  # git, in a changed checkout, is waited for in sleeps
+    monkeypatch.setattr(time, "sleep", sleep)
+    to_the_end(open_study(tmp_path), tmp_path)
+    again = open_study(tmp_path)
+    assert [trial.number for trial in again.trials] == list(range(6))
+
+
+class Superseded:
+    """The fence of an owner of a search that another one follows before a check, or right after the first."""
+
+    number = 1
+
+    def __init__(self, path: Path, frozen_after: bool):
+        self.path, self.lost, self.mending = path, not frozen_after, False
+
+    def check(self) -> None:
+        if self.mending:
+            return  # that is the next owner, in this process
+        if self.lost:
+            raise LeaseLost("lost")
+        self.lost = self.mending = True
+        mend(self.path)
+        self.mending = False
+
+
+@pytest.mark.parametrize("frozen_after", [False, True])
+def test_an_owner_that_wakes_up_superseded_tells_the_study_nothing(tmp_path: Path, frozen_after: bool):
+    study = open_study(tmp_path)
+    before = journal(tmp_path).read_bytes()
+    with fenced(tmp_path, Superseded(journal(tmp_path), frozen_after)), pytest.raises((LeaseLost, KeyError)):
+        study.ask()
+    assert journal(tmp_path).read_bytes() == before
+    assert open_study(tmp_path).trials == []
+
+
+def test_mending_leaves_a_whole_journal_alone(tmp_path: Path):
+    open_study(tmp_path)
+    content = journal(tmp_path).read_bytes()
+    mend(journal(tmp_path))
+    assert journal(tmp_path).read_bytes() == content
+    mend(tmp_path / "none.journal")
+    assert not (tmp_path / "none.journal").exists()
+
+
+def test_a_study_is_looked_at_while_its_owner_works(tmp_path: Path):
+    assert Study.view(search(), "mine", tmp_path) is None
+    study = open_study(tmp_path)
+    director(study, tmp_path).look(2)
+    seen = Study.view(search(), "mine", tmp_path)
+    assert seen is not None
+    assert len(seen.trials) == 2
+    assert Study.view(search(), "other", tmp_path) is None
+
+
+@pytest.mark.slow
+def test_a_team_storage_and_a_bad_one(tmp_path: Path):
+    study = open_study(tmp_path, storage=f"sqlite:///{tmp_path}/team.db")
+    to_the_end(study, tmp_path)
+    assert len(study.trials) == 6
+    assert not journal(tmp_path).exists()
+    with pytest.raises(InputError, match=r"search\.storage=nonsense:"):
+        open_study(tmp_path, storage="nonsense://x")
+
+
+@pytest.mark.parametrize(
+    "content", [b"x" * 5000, b"hello\nthis is no journal\n", b'{"op_code":0,"x":1}\ngarbage\n{}\n']
+)
+def test_what_is_no_journal_is_left_alone_and_named(tmp_path: Path, content: bytes):
+    journal(tmp_path).write_bytes(content)
+    for look in (open_study, lambda folder: Study.view(search(), "mine", folder)):
+        with pytest.raises(InputError, match=r"study.journal: not a journal of Optuna's"):
+            look(tmp_path)
+    assert journal(tmp_path).read_bytes() == content

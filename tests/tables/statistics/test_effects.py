@@ -1,0 +1,214 @@
+"""Effects of paired differences: intervals and p-values, and what they promise."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from drawn import GRID, SHARES, TABLE, differences, groups, starred
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from memmlp.tables.statistics import (
+    Effects,
+    detectable,
+    equivalence_p,
+    paired_effects,
+    seeds_needed,
+)
+from memmlp.tables.statistics.crossed import error
+
+
+def satterthwaite(d: np.ndarray) -> np.ndarray:
+    """Return p-values by an earlier method: one t of both variances, Satterthwaite's degrees of freedom."""
+    a, b = (side.var(1, ddof=1) / side.shape[1] for side in (d.mean(2), d.mean(1)))
+    freedom = (a + b) ** 2 / (a**2 / (d.shape[1] - 1) + b**2 / (d.shape[2] - 1))
+    return 2 * stats.t.sf(np.abs(d.mean((1, 2))) / np.sqrt(a + b), freedom)
+
+
+def test_two_by_two_by_hand():
+    # Seeds' means 2, 4 and clips' means 2, 4: A = B = 2 / 2; nothing is left, so E = 0.
+    known = error(np.array([[[1.0, 3.0], [3.0, 5.0]]]))
+    np.testing.assert_allclose(known.variances[:, 0], [1, 1, 0], atol=1e-12)
+    # 0.9 degrees of freedom for clips, which may be skewed
+    half = np.hypot(stats.t.ppf(0.975, 1), stats.t.ppf(0.975, 0.9))
+    effects = paired_effects(np.array([[[1.0, 3.0], [3.0, 5.0]]]))
+    assert effects.mean[0] == 3
+    assert effects.high[0] == pytest.approx(3 + half)
+    assert effects.low[0] == pytest.approx(3 - half)
+
+
+def test_clips_that_do_not_differ_leave_students_test_of_the_seeds():
+    sample = np.random.default_rng(2).normal(1, 1, 6)
+    effects = paired_effects(np.repeat(sample[None, :, None], 9, 2))
+    expected = stats.ttest_1samp(sample, 0)
+    assert effects.p[0] == pytest.approx(expected.pvalue, rel=1e-9)
+    assert effects.low[0] == pytest.approx(expected.confidence_interval().low)
+
+
+def test_seeds_that_do_not_differ_leave_students_test_of_clips_with_fewer_degrees_of_freedom():
+    sample = np.random.default_rng(2).normal(1, 1, 12)
+    effects = paired_effects(np.repeat(sample[None, None], 3, 1))
+    t = sample.mean() / stats.sem(sample)
+    assert effects.p[0] == pytest.approx(2 * stats.t.sf(t, 0.9 * 11**0.6), rel=1e-6)
+
+
+def test_equal_groups_are_the_analysis_of_their_means():
+    d = np.random.default_rng(3).normal(size=(5, 3, 12))
+    labels = np.array(list("aabbccddeeff"))
+    order = np.random.default_rng(4).permutation(12)
+    grouped = paired_effects(d[:, :, order], labels[order])
+    for ours, theirs in zip(grouped[:4], paired_effects(d.reshape(5, 3, 6, 2).mean(3))[:4], strict=True):
+        np.testing.assert_allclose(ours, theirs)
+
+
+def test_unequal_groups_weigh_as_their_clips():
+    # weights 1/4 and 3/4; seeds' means by group 0, 4 and 2, 4, over both 3 and 3.5; groups' means 1 and 4
+    d = np.array([[[0.0, 4.0, 5.0, 3.0], [2.0, 4.0, 3.0, 5.0]]])
+    assert paired_effects(d, [7, 1, 1, 1]).mean[0] == 3.25
+    # 0.125 / 2; 4.5 x 10/16; what is left is -1, 0 and 1, 0: (0.5 + 0.5) x 10/16 / 2
+    np.testing.assert_allclose(error(d, [7, 1, 1, 1]).variances[:, 0], [0.0625, 2.8125, 0.3125])
+
+
+@pytest.mark.parametrize(
+    ("shape", "labels", "conditional"),
+    [((1, 5), None, "seeds"), ((5, 1), None, "clips"), ((5, 4), [2, 2, 2, 2], "clips")],
+)
+def test_one_seed_or_one_group_has_an_interval_of_the_other_alone(shape, labels, conditional: str):
+    d = np.random.default_rng(1).normal(3, 0.1, (2, *shape))
+    effects = paired_effects(d, labels)
+    assert effects.conditional == conditional
+    assert np.isnan(effects.p).all()
+    assert (effects.low < effects.mean).all()
+    assert (effects.mean < effects.high).all()
+    assert np.isnan(equivalence_p(d, 100, labels)).all()
+    assert np.isnan(detectable(d, 1, labels)).all()
+    assert seeds_needed(d[0], 100, 1, labels) is None
+    if conditional == "clips":
+        sample = d.mean(2)[0]
+        assert effects.high[0] == pytest.approx(stats.ttest_1samp(sample, 0).confidence_interval().high)
+
+
+def test_no_interval_from_one_value():
+    effects = paired_effects(np.full((1, 1, 1), 0.3))
+    assert effects.mean[0] == 0.3
+    assert effects.conditional == "seeds and clips"
+    assert np.isnan([effects.low[0], effects.high[0], effects.p[0]]).all()
+
+
+def test_differences_that_are_all_the_same():
+    effects = paired_effects(np.stack([np.zeros((3, 4)), np.full((3, 4), 2.0)]))
+    np.testing.assert_array_equal(effects.low, [0, 2])
+    np.testing.assert_array_equal(effects.high, [0, 2])
+    np.testing.assert_array_equal(effects.p, [1, 0])
+    np.testing.assert_array_equal(equivalence_p(np.full((1, 3, 4), 2.0), 3), [0])
+
+
+@pytest.mark.parametrize("shares", SHARES.values())
+def test_zero_is_outside_exactly_where_p_is_small(shares: tuple[float, ...]):
+    d = differences(4, 6, 1, shares, tables=40) + np.linspace(-8, 8, 40 * TABLE)[:, None, None]
+    effects = paired_effects(d)
+    inside = (effects.low < 0) & (effects.high > 0)
+    np.testing.assert_array_equal(inside, effects.p > 0.05)
+    assert 0.2 < inside.mean() < 0.8
+    np.testing.assert_allclose(error(d).half(effects.p), np.abs(effects.mean), rtol=1e-6)
+
+
+def test_equivalence_is_the_interval_within_the_margin():
+    d = differences(6, 40, 1, SHARES["equal"], tables=20)
+    effects, p = paired_effects(d), equivalence_p(d, 4.0)
+    within = (effects.low > -4) & (effects.high < 4)
+    np.testing.assert_array_equal(within, p < 0.05)
+    assert 0.1 < within.mean() < 0.9
+    assert equivalence_p(d + 10, 4.0).min() == 1
+    np.testing.assert_array_equal(equivalence_p(d, np.full(len(d), 4.0)), p)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("shape", "name"), [*itertools.product(GRID, SHARES)])
+def test_promises(shape: tuple[int, int, int], name: str):
+    d = differences(*shape, SHARES[name], tables=300)
+    effects = paired_effects(d, groups(*shape[1:]))
+    covered = np.mean((effects.low <= 0) & (effects.high >= 0))
+    assert covered >= 0.93
+    if shape[0] >= 3 and shape[1] / shape[2] >= 5:
+        assert covered <= 0.995
+    # of a family-wise error of 5 %, the standard error is 1.3 %
+    assert starred(effects.p) <= 0.08
+
+
+@pytest.mark.parametrize("shape", [(3, 40), (5, 40)])
+def test_satterthwaites_degrees_of_freedom_would_break_them(shape: tuple[int, int]):
+    d = differences(*shape, 1, SHARES["values"], tables=500)
+    assert starred(satterthwaite(d)) > 0.1
+    assert starred(paired_effects(d).p) < 0.05
+
+
+def test_clips_for_their_own_replicates_would_break_them():
+    d = differences(5, 40, 10, SHARES["groups"], tables=300)
+    assert starred(paired_effects(d).p) > 0.1
+    assert starred(paired_effects(d, groups(40, 10)).p) < 0.06
+
+
+def test_unequal_groups_keep_the_promises():
+    labels = np.repeat(np.arange(5), [9, 4, 1, 1, 1])
+    rng = np.random.default_rng(1)
+    for by_clip, by_group in ((1, 0), (0, 1), (1, 1)):
+        effects_of_groups = by_group * rng.normal(size=(9600, 1, 5))[:, :, labels]
+        d = (
+            by_clip * rng.normal(size=(9600, 1, 16))
+            + effects_of_groups
+            + 1e-3 * rng.normal(size=(9600, 3, 16))
+        )
+        effects = paired_effects(d, labels)
+        assert np.mean((effects.low <= 0) & (effects.high >= 0)) >= 0.95
+        assert starred(effects.p) <= 0.05
+
+
+sizes = st.tuples(st.integers(2, 4), st.integers(2, 6), st.integers(0, 1000))
+
+
+def assert_same(one: Effects, other: Effects) -> None:
+    for a, b in zip(one[:4], other[:4], strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-9)
+
+
+@settings(max_examples=30)
+@given(sizes)
+def test_order_and_names_do_not_matter(size: tuple[int, int, int]):
+    seeds, clips, number = size
+    rng = np.random.default_rng(number)
+    d, labels = rng.normal(0.5, 1, (3, seeds, clips)), rng.integers(0, 3, clips)
+    effects = paired_effects(d, labels)
+    order = rng.permutation(clips)
+    assert_same(effects, paired_effects(d[:, rng.permutation(seeds)][:, :, order], labels[order]))
+    assert_same(effects, paired_effects(d, np.array(["z", "a", "m"])[labels]))
+    assert_same(paired_effects(d), paired_effects(d, np.arange(clips)))
+    alone = [paired_effects(one[None], labels) for one in d]
+    assert_same(effects, Effects(*(np.concatenate([e[i] for e in alone]) for i in range(4)), ""))
+
+
+@settings(max_examples=30)
+@given(sizes, st.floats(0.01, 100))
+def test_units_and_signs_do_not_matter(size: tuple[int, int, int], scale: float):
+    seeds, clips, number = size
+    d = np.random.default_rng(number).normal(0.5, 1, (3, seeds, clips))
+    e, scaled, turned = paired_effects(d), paired_effects(scale * d), paired_effects(-d)
+    assert_same(scaled, Effects(scale * e.mean, scale * e.low, scale * e.high, e.p, ""))
+    assert_same(turned, Effects(-e.mean, -e.high, -e.low, e.p, ""))
+    np.testing.assert_allclose(detectable(scale * d, 5), scale * detectable(d, 5))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_an_error_that_is_no_number_is_evidence_of_nothing(value: float):
+    """Of a network that diverged on one clip; the other comparison keeps its own."""
+    differences = np.random.default_rng(0).normal(1, 0.1, size=(2, 3, 8))
+    alone = paired_effects(differences[1:]).p
+    differences[0, 1, 2] = value
+    with np.errstate(invalid="ignore"):
+        p, equal = paired_effects(differences).p, equivalence_p(differences, 5.0)
+    assert np.isnan([p[0], equal[0]]).all()
+    assert p[1] == alone[0]
+    assert equal[1] < 0.05
