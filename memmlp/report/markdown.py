@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -148,6 +149,7 @@ class Words:
             "title",
             "origin",
             "summary",
+            "held",
             "way",
         )
         return {"names": sorted(self.sources), **{name: getattr(self, name) for name in names}}
@@ -222,6 +224,38 @@ class Words:
                 cells = [self._summed(name, row, mode, metric) for metric in metrics]
                 lines.append(f"| {escaped(row.label)} | {escaped(row.against)} | {' | '.join(cells)} |")
         return "\n".join(lines)
+
+    def held(self, names: Sequence[str], mode: str = "stream") -> str:
+        """Return which of the paper's effects hold: verdicts, counted and in a line for each arm of the tables.
+
+        Effects whose sign the paper prints are counted, and shown with a verdict; the others as `-`.
+
+        Args:
+            names: the names of the tables' results.
+            mode: the mode of evaluation.
+        """
+        rows = [(name, row) for name in names for row in self._table(name).rows if row.found and row.against]
+        metrics = list(dict.fromkeys(m for name in names for m in self._table(name).measured_metrics))
+        words = [[self._held(name, row, mode, metric) for metric in metrics] for name, row in rows]
+        counts = Counter(word for cells in words for word in cells if word != MISSING)
+        said = ", ".join(f"{word} {counts[word]}" for word in map(str, Verdict) if counts[word])
+        lines = [
+            f"Of {counts.total()} effects with a sign in the paper, in {mode} mode: {said}.",
+            "",
+            f"| table | arm | compared with | {' | '.join(metrics)} |",
+            f"| --- | --- | --- |{' --- |' * len(metrics)}",
+        ]
+        for (name, row), cells in zip(rows, words, strict=True):
+            if any(cell != MISSING for cell in cells):
+                number = self._table(name).number or escaped(name)
+                ends = f"{escaped(row.label)} | {escaped(row.against or '')} | {' | '.join(cells)}"
+                lines.append(f"| [{number}]({name}.md) | {ends} |")
+        return "\n".join(lines)
+
+    def _held(self, name: str, row: Row, mode: str, metric: str) -> str:
+        """Return the verdict on an effect whose sign the paper prints; a dash for any other."""
+        cell = row.cells[mode].get(metric)
+        return self.verdict(name, row.label, mode, metric) if cell and cell.paper_effect else MISSING
 
     def way(self, name: str, mode: str = "stream") -> str:
         """Return a table of how each step of a chain of arms changes each metric, with its share of the way.

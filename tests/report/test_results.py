@@ -209,6 +209,21 @@ def test_a_template_takes_numbers_and_verdicts_from_the_table(sweep: Sweep, kept
     assert "### Table 14: Placement of memory blocks in the backbone" in text
 
 
+def test_what_holds_of_the_paper_is_counted_and_listed(sweep: Sweep, kept: Kept):
+    """Counted anew from the cells; an effect without a sign in the paper is not."""
+    made = source(sweep, kept)
+    text = pages({"t": made}, {"README.md": '{{ held(["t"]) }}\n'})["README.md"]
+    cells = [row.cells["stream"][metric] for row in made.table.rows for metric in made.table.measured_metrics]
+    signed = [cell for cell in cells if cell.paper_effect]
+    holds = sum(cell.effect.verdict == Verdict.HOLDS for cell in signed)
+    assert 0 < holds < len(signed) == 12
+    assert f"Of {len(signed)} effects with a sign in the paper, in stream mode: holds {holds}, " in text
+    line = next(line for line in text.splitlines() if line.startswith("| [14](t.md) | 2 |"))
+    row = next(row for row in made.table.rows if row.label == "2")
+    words = [str(row.cells["stream"][metric].effect.verdict) for metric in made.table.measured_metrics]
+    assert line == f"| [14](t.md) | 2 | 2, 4, 6, 8 | {' | '.join(words)} |"
+
+
 def test_each_commit_is_named_once(kept: Kept):
     runs = kept.runs["2"]
     for seed, code in zip(runs, ("e2f8fc0", "92ecce3, e2f8fc0", "e2f8fc0, 92ecce3"), strict=False):
