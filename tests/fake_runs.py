@@ -12,7 +12,7 @@ import numpy as np
 
 from memmlp.runs.run import Run
 from memmlp.sweep.spec import MODES, Arm, Sweep
-from memmlp.tables.build_table import collect, finished_runs
+from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.effects import Runs
 from memmlp.tables.measured_run import Measured, load
 from memmlp.tables.table import Table
@@ -119,7 +119,7 @@ def table_of(sweep: Sweep, find: Find, command: str | None = None, modes: Sequen
         run = find(arm, seed)
         return None if run is None or run.done else run.status
 
-    return collect(sweep, runs_of(sweep, find), modes, command, state)
+    return make_table(sweep, runs_of(sweep, find), modes, command, state)
 
 
 def nothing(arm: Arm, seed: int) -> None:

@@ -28,7 +28,6 @@ from memmlp.motion.coordinates import Heading, HeadRelative, World
 from memmlp.motion.dataset import WindowSampler
 from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.cells import CELLS
 from memmlp.networks.memory import (
     CodeMemory,
     GRUMemory,
@@ -39,6 +38,7 @@ from memmlp.networks.memory import (
 )
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
+from memmlp.networks.recurrent_cells import CELLS
 from memmlp.runs.recipe_numbers import RECIPES
 from memmlp.training.loop import seed_step
 from memmlp.training.losses import (

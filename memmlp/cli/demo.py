@@ -35,9 +35,9 @@ def demo(overrides: tuple[str, ...]) -> None:
 
     started = time.monotonic()
     both = fit_recurrent_poser(overrides)  # asked first: the first network takes minutes
-    outcomes = trained(overrides)
+    outcomes = train_demo(overrides)
     if both:
-        outcomes += trained([*overrides, RECURRENT_POSER])
+        outcomes += train_demo([*overrides, RECURRENT_POSER])
     if len(outcomes) == len(NETWORKS):
         if "profile=tiny" in overrides:
             click.echo("profile=tiny trains for a few steps: these errors say nothing of the networks")
@@ -65,7 +65,7 @@ def fit_recurrent_poser(overrides: Sequence[str]) -> bool:
     return True
 
 
-def trained(overrides: Sequence[str]) -> list[Outcome]:
+def train_demo(overrides: Sequence[str]) -> list[Outcome]:
     """Bring the run of these overrides to its end, show its results and return them."""
     from memmlp.cli.train import run_training, train
 

@@ -132,16 +132,16 @@ def live(network: str, send: bool, save_avatar: Path | None, **options: Any) -> 
     """
     from memmlp.common.ending import termination_interrupts
 
-    feed = InputOptions(network=network, **{key: options.pop(key) for key in FED})
-    room = ShowOptions(**options)
-    check_options(feed, room, send)
+    given = InputOptions(network=network, **{key: options.pop(key) for key in FED})
+    shown = ShowOptions(**options)
+    check_options(given, shown, send)
     with contextlib.suppress(KeyboardInterrupt), termination_interrupts():
         if save_avatar is not None:
-            write_avatar(feed, save_avatar)
+            write_avatar(given, save_avatar)
         elif send:
-            send_clip(feed)
+            send_clip(given)
         else:
-            serve(feed, room)
+            serve(given, shown)
 
 
 class InputOptions(NamedTuple):
@@ -176,57 +176,57 @@ class ShowOptions(NamedTuple):
     no_browser: bool
 
 
-def check_options(feed: InputOptions, room: ShowOptions, send: bool) -> None:
+def check_options(given: InputOptions, shown: ShowOptions, send: bool) -> None:
     """Raise InputError for options that contradict each other, or need what is not installed."""
     from memmlp.common.errors import InputError
     from memmlp.common.page_access import check_token
     from memmlp.live.player.packets import needs_osc
 
-    ports = [number for number in (feed.udp, feed.osc) if number is not None]
-    if len(ports) > 1 or (ports and feed.clip is not None and not send):
+    ports = [number for number in (given.udp, given.osc) if number is not None]
+    if len(ports) > 1 or (ports and given.clip is not None and not send):
         raise InputError("--clip, --udp, --osc: more than one source; allowed is one of them")
     if send and not ports:
         raise InputError("--send: has no port; allowed is --udp PORT or --osc PORT")
     worn = {
-        "--height": room.height is not None, "--floor": room.floor is not None,
-        "--calibration": room.calibration is not None, "--from": bool(feed.senders),
+        "--height": shown.height is not None, "--floor": shown.floor is not None,
+        "--calibration": shown.calibration is not None, "--from": bool(given.senders),
     }  # fmt: skip
-    if (alone := [name for name, given in worn.items() if given]) and (send or not ports):
+    if (alone := [name for name, said in worn.items() if said]) and (send or not ports):
         raise InputError(
             f"{alone[0]}: goes with --udp PORT or --osc PORT, whose packets somebody's devices send"
         )
-    if send and (room.vmc or room.vrchat or room.record or room.avatar):
+    if send and (shown.vmc or shown.vrchat or shown.record or shown.avatar):
         raise InputError(
             "--send: sends a clip's trackers alone; allowed with it is no --vmc, --vrchat or --record"
         )
-    if feed.osc is not None:
+    if given.osc is not None:
         needs_osc()
-    for option, programs in (("--vmc", room.vmc), ("--vrchat", room.vrchat)):
+    for option, programs in (("--vmc", shown.vmc), ("--vrchat", shown.vrchat)):
         if programs:
             needs_osc(option, "the page, and --record")
-    check_token(room.host, room.token)
+    check_token(shown.host, shown.token)
 
 
-def source_of(feed: InputOptions) -> TrackerSource:
+def source_of(given: InputOptions) -> TrackerSource:
     """Return the source of the poses: packets at a port, or a clip that is repeated."""
     from memmlp.live.player.packets import from_json, from_osc
     from memmlp.live.player.sources import PacketSource
 
-    if feed.udp is not None:
-        return PacketSource("UDP", feed.udp, from_json, feed.space, feed.senders, note)
-    if feed.osc is not None:
-        return PacketSource("OSC", feed.osc, from_osc, feed.space, feed.senders, note)
-    return clip_source(feed)
+    if given.udp is not None:
+        return PacketSource("UDP", given.udp, from_json, given.space, given.senders, note)
+    if given.osc is not None:
+        return PacketSource("OSC", given.osc, from_osc, given.space, given.senders, note)
+    return clip_source(given)
 
 
-def clip_source(feed: InputOptions, rounds: float = float("inf")) -> ClipSource:
+def clip_source(given: InputOptions, rounds: float = float("inf")) -> ClipSource:
     """Return a source that plays the clip in real time, `rounds` times."""
     from memmlp.live.player.sources import ClipSource
 
-    return ClipSource(load_clip(feed), feed.hz, rounds)
+    return ClipSource(load_clip(given), given.hz, rounds)
 
 
-def load_clip(feed: InputOptions) -> TrackedClip:
+def load_clip(given: InputOptions) -> TrackedClip:
     """Load the clip of --clip: an AMASS npz on the built-in body, or a test clip of the run.
 
     Raises:
@@ -235,33 +235,33 @@ def load_clip(feed: InputOptions) -> TrackedClip:
     from memmlp.common.errors import InputError
     from memmlp.live.player.sources import TrackedClip, npz_frames
 
-    if feed.clip is not None and feed.clip.endswith(".npz"):
-        return TrackedClip(Path(feed.clip).stem, npz_frames(Path(feed.clip)))
-    if feed.network.endswith(".onnx"):
+    if given.clip is not None and given.clip.endswith(".npz"):
+        return TrackedClip(Path(given.clip).stem, npz_frames(Path(given.clip)))
+    if given.network.endswith(".onnx"):
         raise InputError(
-            f"{feed.network}: has no test clips; allowed with it are --clip FILE.npz, --udp and --osc"
+            f"{given.network}: has no test clips; allowed with it are --clip FILE.npz, --udp and --osc"
         )
     from memmlp.config.open_run import clip_index, open_run
 
-    test = open_run(feed.outputs, feed.network).test
-    index = 0 if feed.clip is None else clip_index(test, feed.clip)
+    test = open_run(given.outputs, given.network).test
+    index = 0 if given.clip is None else clip_index(test, given.clip)
     return TrackedClip(test.names[index], test.clip(index).numpy())
 
 
-def send_clip(feed: InputOptions) -> None:
+def send_clip(given: InputOptions) -> None:
     """Send the clip's packets once to the port of the options, in the frame of reference of --space."""
     from memmlp.live.player.packets import to_json, to_osc
     from memmlp.live.player.sources import send
     from memmlp.live.spaces import space_of
 
-    source = clip_source(feed, rounds=1)
-    port, pack = (feed.udp, to_json) if feed.udp is not None else (feed.osc, to_osc)
+    source = clip_source(given, rounds=1)
+    port, pack = (given.udp, to_json) if given.udp is not None else (given.osc, to_osc)
     assert port is not None
     click.echo(f"sending {source.name} to port {port}")
-    click.echo(f"{send(source, port, pack, space_of(feed.space))} packets sent")
+    click.echo(f"{send(source, port, pack, space_of(given.space))} packets sent")
 
 
-def serve(feed: InputOptions, room: ShowOptions) -> None:
+def serve(given: InputOptions, shown: ShowOptions) -> None:
     """Play the source through the network to the outputs, and serve the page, until Ctrl-C."""
     import threading
     import webbrowser
@@ -271,75 +271,75 @@ def serve(feed: InputOptions, room: ShowOptions) -> None:
     from memmlp.live.player.play import greeting, play, with_avatar
     from memmlp.live.player.server import Hub, Server
 
-    with contextlib.closing(source_of(feed)) as source:
-        stream, name = open_stream(feed, source.space, room)
-        files = page_files(room.avatar, stream)
-        outputs = outputs_of(room, stream)
+    with contextlib.closing(source_of(given)) as source:
+        stream, name = open_stream(given, source.space, shown)
+        files = page_files(shown.avatar, stream)
+        outputs = outputs_of(shown, stream)
         words = greeting(source, name, outputs)
-        hub = Hub(with_avatar(words, stream.rest) if room.avatar else words)
-        fitting = Fitting(stream, source.space, room.calibration, hub.tell) if source.worn else None
+        hub = Hub(with_avatar(words, stream.rest) if shown.avatar else words)
+        fitting = Fitting(stream, source.space, shown.calibration, hub.tell) if source.worn else None
         ask = fitting.ask if fitting else None
-        with closed_in_peace(outputs), Server(hub, room.port, room.host, room.token, files, ask) as server:
+        with closed_in_peace(outputs), Server(hub, shown.port, shown.host, shown.token, files, ask) as server:
             click.echo(f"{server.url}  {source.name}; Ctrl-C ends")
             for output in outputs.outputs:
                 click.echo(f"  to {output.name}")
-            if not room.no_browser:
+            if not shown.no_browser:
                 webbrowser.open(server.url)
             stopped = threading.Event()
-            play(stream, source, hub.publish, stopped, outputs, fitting, room.avatar is not None)
+            play(stream, source, hub.publish, stopped, outputs, fitting, shown.avatar is not None)
 
 
-def open_stream(feed: InputOptions, space: SpaceName, room: ShowOptions) -> tuple[Stream, str]:
+def open_stream(given: InputOptions, space: SpaceName, shown: ShowOptions) -> tuple[Stream, str]:
     """Return the stream of the network, fitted to its wearer, and the network's name."""
     from memmlp.live.stream import Stream
 
-    file, name = network_file(feed)
+    file, name = network_file(given)
     stream = Stream(file, space=space)
-    known = known_of(room, space, stream)
+    known = known_of(shown, space, stream)
     stream.offsets = known.offsets
     stream.fit(known.height, known.floor)
     return stream, name
 
 
-def network_file(feed: InputOptions) -> tuple[Path, str]:
+def network_file(given: InputOptions) -> tuple[Path, str]:
     """Return the ONNX file of the network, and its name."""
     from memmlp.runs.lookup import find_run
 
-    if feed.network.endswith(".onnx"):
-        return Path(feed.network), Path(feed.network).name
-    run = find_run(feed.outputs, feed.network)
+    if given.network.endswith(".onnx"):
+        return Path(given.network), Path(given.network).name
+    run = find_run(given.outputs, given.network)
     return run.preferred_onnx, f"run {run.id[:8]}"
 
 
-def known_of(room: ShowOptions, space: SpaceName, stream: Stream) -> Calibration:
+def known_of(shown: ShowOptions, space: SpaceName, stream: Stream) -> Calibration:
     """Return what is known of the wearer: by the file of --calibration, and by the options before it."""
     from memmlp.live.calibration import Calibration, read_calibration
     from memmlp.live.wearer import stature
 
     body = stature(stream.network.skeleton)
     known = Calibration(space, body)
-    if room.calibration is not None and room.calibration.exists():
-        known = read_calibration(room.calibration, space, body)
-    height = known.height if room.height is None else room.height / 100
-    floor = known.floor if room.floor is None else room.floor / 100
+    if shown.calibration is not None and shown.calibration.exists():
+        known = read_calibration(shown.calibration, space, body)
+    height = known.height if shown.height is None else shown.height / 100
+    floor = known.floor if shown.floor is None else shown.floor / 100
     if known.offsets is not None and abs((height or body) - (known.height or body)) > 0.005:
         was = 100 * (known.height or body)
-        note(f"{room.calibration}: its calibration is of a height of {was:.0f} cm; calibrate again")
+        note(f"{shown.calibration}: its calibration is of a height of {was:.0f} cm; calibrate again")
     return Calibration(space, body, known.offsets, height, floor)
 
 
-def outputs_of(room: ShowOptions, stream: Stream) -> Outputs:
+def outputs_of(shown: ShowOptions, stream: Stream) -> Outputs:
     """Return the outputs that the options name."""
     from memmlp.live.outputs import vmc, vrchat
     from memmlp.live.outputs.osc import Receiver
     from memmlp.live.outputs.output import Outputs
     from memmlp.live.outputs.recording import Recorder
 
-    found: list[Output] = [vmc.VMC(Receiver(host, port or vmc.PORT, "--vmc")) for host, port in room.vmc]
-    found += [vrchat.VRChat(Receiver(host, port or vrchat.PORT, "--vrchat")) for host, port in room.vrchat]
-    if room.record:
+    found: list[Output] = [vmc.VMC(Receiver(host, port or vmc.PORT, "--vmc")) for host, port in shown.vmc]
+    found += [vrchat.VRChat(Receiver(host, port or vrchat.PORT, "--vrchat")) for host, port in shown.vrchat]
+    if shown.record:
         network = stream.network
-        found.append(Recorder(room.record, network.skeleton.rest, network.fps, note))
+        found.append(Recorder(shown.record, network.skeleton.rest, network.fps, note))
     return Outputs(found, note)
 
 
@@ -354,7 +354,7 @@ def page_files(avatar: str | None, stream: Stream) -> Mapping[str, File]:
     return avatar_files(mannequin_vrm(stream.rest) if avatar == OWN else read_vrm(Path(avatar)))
 
 
-def write_avatar(feed: InputOptions, path: Path) -> None:
+def write_avatar(given: InputOptions, path: Path) -> None:
     """Write this project's own avatar with the network's body."""
     from memmlp.common.errors import InputError
     from memmlp.live.exported import ExportedNetwork
@@ -364,7 +364,7 @@ def write_avatar(feed: InputOptions, path: Path) -> None:
         raise InputError(f"--save-avatar {path}: no such kind of file; allowed: .vrm")
     if path.exists():
         raise InputError(f"--save-avatar {path}: is there already; allowed is a new file")
-    file, _ = network_file(feed)
+    file, _ = network_file(given)
     try:
         write_vrm(path, ExportedNetwork(file).skeleton.rest)
     except OSError as error:

@@ -14,8 +14,8 @@ import click
 
 import memmlp
 from memmlp.common import distributed
-from memmlp.common.collecting import collect_seldom
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
+from memmlp.common.garbage_collection import collect_seldom
 from memmlp.common.progress import telling
 
 

@@ -84,7 +84,7 @@ def save_command(
     path = out / f"{stem or sweep.name}.json"
     origins: tuple[str, ...] = ()
     if also_kept:
-        from memmlp.config.kept_elsewhere import with_kept
+        from memmlp.config.shared_results import with_kept
 
         found, origins = with_kept(found, known.plan, sorted(set(out.glob("*.json")) - {path}))
     if untrained:
@@ -99,7 +99,7 @@ def save_command(
     if not kept.every:
         raise InputError(f"sweep {name}: no finished run to keep; make them with: {kept.command}")
     if sweep.scale:
-        from memmlp.config.count_training import predicted_flops, with_flops
+        from memmlp.config.count_flops import predicted_flops, with_flops
 
         kept = replace(kept, runs=with_flops(found), predicted=predicted_flops(sweep))
     ids = {(entry.label, entry.seed): entry.id for entry in known.plan.entries}
@@ -196,7 +196,7 @@ def _table(kept: Kept, source: str | None = None) -> Table:
     """
     from memmlp.cli.rounds import of_another
     from memmlp.config.plan_sweep import find_sweep
-    from memmlp.tables.build_table import collect, on_source
+    from memmlp.tables.build_table import make_table, on_source
     from memmlp.tables.rounds import of_json
 
     sweep = find_sweep(kept.sweep)
@@ -205,13 +205,13 @@ def _table(kept: Kept, source: str | None = None) -> Table:
     other = of_another(rounds, sweep) if rounds else None
     if rounds and not other:
         spent = rounds.spent(sweep)
-        table = collect(spent, kept.of(spent), command=f"{kept.command} --until-decided", rounds=rounds)
+        table = make_table(spent, kept.of(spent), command=f"{kept.command} --until-decided", rounds=rounds)
     else:
         sweep = _with_seeds(sweep, kept)
         runs = kept.of(sweep)
         if source is not None:
             sweep, runs, left_out = on_source(sweep, runs, source)
-        table = collect(sweep, runs, command=kept.command)
+        table = make_table(sweep, runs, command=kept.command)
     said = [*left_out, *([other] if other else []), *kept.flags, *_outdated(kept)]
     return replace(table, flags=(*table.flags, *said))
 

@@ -66,7 +66,7 @@ def check(overrides: Sequence[str], wanted: bool, most: int | None) -> None:
             raise InputError(f"{word}: not with --until-decided, which takes the file's seeds and goes on")
 
 
-def until_decided(
+def run_until_decided(
     sweep: Sweep, outputs: Path, rounds: Rounds, work: Callable[[Sweep, Plan], None], fail_fast: bool
 ) -> tuple[Rounds, Plan]:
     """Take look after look until none can be taken, and return the last rounds and plan.

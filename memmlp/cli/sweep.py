@@ -94,7 +94,7 @@ def sweep(
         reset(plan)
     work = partial(run_workers, workers=workers)
     if known:
-        known, plan = rounds.until_decided(chosen, outputs, known, work, fail_fast)
+        known, plan = rounds.run_until_decided(chosen, outputs, known, work, fail_fast)
         report(rounds.SweepToShow(known.spent(chosen), plan, known), [name, *overrides], chosen)
         return
     plan = replace(plan, fail_fast=fail_fast)

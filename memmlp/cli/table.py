@@ -199,7 +199,7 @@ def table_of_plan(
 
     With `untrained` networks that have no run are measured as they are before training.
     """
-    from memmlp.tables.build_table import collect, finished_runs, on_source, titled
+    from memmlp.tables.build_table import finished_runs, make_table, on_source, titled
     from memmlp.tables.runs_of_plan import finder, older, states
 
     sweep, plan, rounds, flags = shown
@@ -215,7 +215,7 @@ def table_of_plan(
         sweep, runs, left_out = on_source(sweep, runs, source)
         flags = (*left_out, *flags)
     command = f"{command} --until-decided" if rounds else command
-    table = collect(sweep, runs, modes, command, states(plan), older(plan), rounds)
+    table = make_table(sweep, runs, modes, command, states(plan), older(plan), rounds)
     table = titled(table, source) if source else table
     return SweepTable(sweep, runs, replace(table, flags=(*table.flags, *flags)))
 

@@ -46,7 +46,7 @@ def tune(
     from memmlp.common.files import write_json
     from memmlp.sweep.search.study import Study
 
-    if workers.engine == "debug":  # it would wait within this process for the trials that this one hands out
+    if workers.executor == "debug":  # it would wait in this process for its own trials
         raise InputError("executor=debug: allowed of a search is local, slurm, ray or dask")
     setup = prepare_search(overrides, config_dir, outputs.absolute())
     if status:

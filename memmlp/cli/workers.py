@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from memmlp.sweep.executors.gpus import Share
     from memmlp.sweep.plan import Plan
 
-ENGINES = ("local", "slurm", "ray", "dask", "debug")  # the last one is for finding bugs
+EXECUTORS = ("local", "slurm", "ray", "dask", "debug")  # the last one is for finding bugs
 WITHOUT = {"cpu", "mps"}  # devices of runs that no GPU need be given to
 SETTINGS = ("slurm", "ray", "dask")  # executors with words of their own
 OWN = "executor"  # the words executor.KEY=VALUE are for one that is the path of a class
@@ -32,14 +32,14 @@ class Workers:
     """The workers that a command line asks for.
 
     Attributes:
-        engine: the executor's name.
+        executor: the executor's name.
         words: the executor's own settings, KEY -> VALUE of words like slurm.KEY=VALUE.
         count: how many run at once; None leaves it to the machine.
         gpus_per_worker: GPUs of a worker of this machine; None for 1 where there are any.
         workers_per_gpu: the most workers that share a GPU of this machine; None for as many as it takes.
     """
 
-    engine: str = "local"
+    executor: str = "local"
     words: dict[str, str] = field(default_factory=dict)
     count: int | None = None
     gpus_per_worker: int | None = None
@@ -47,21 +47,23 @@ class Workers:
 
     def __post_init__(self) -> None:
         given = {"--gpus-per-worker": self.gpus_per_worker, "--workers-per-gpu": self.workers_per_gpu}
-        for option in (name for name, value in given.items() if value is not None and self.engine != "local"):
-            raise InputError(f"{option}: goes with workers of this machine, and not executor={self.engine}")
+        for option in (
+            name for name, value in given.items() if value is not None and self.executor != "local"
+        ):
+            raise InputError(f"{option}: goes with workers of this machine, and not executor={self.executor}")
         self.settings()
 
     def settings(self) -> Any:
         """Return the executor's own settings, checked. Raises InputError for a wrong one."""
-        if self.engine == "slurm":
+        if self.executor == "slurm":
             from memmlp.sweep.executors.slurm import slurm_options
 
             return slurm_options(self.words)
-        if self.engine == "ray":
+        if self.executor == "ray":
             from memmlp.sweep.executors.ray_cluster import ray_options
 
             return ray_options(self.words)
-        if self.engine == "dask":
+        if self.executor == "dask":
             from memmlp.sweep.executors.dask_cluster import dask_options
 
             return dask_options(self.words)
@@ -69,7 +71,7 @@ class Workers:
 
     def script(self, folder: Path) -> str | None:
         """Return the file that sbatch would be given; None for executors without one."""
-        if self.engine != "slurm":
+        if self.executor != "slurm":
             return None
         from memmlp.sweep.executors.slurm import script
 
@@ -90,19 +92,19 @@ class Workers:
         from memmlp.sweep.executors.gpus import shares, visible_gpus
 
         wanted = [name for name in devices if name not in WITHOUT]
-        here = wanted and self.engine == "local" and self.gpus_per_worker != 0
+        here = wanted and self.executor == "local" and self.gpus_per_worker != 0
         gpus = visible_gpus() if here else ()
-        check_devices(wanted, gpus, self.engine)
+        check_devices(wanted, gpus, self.executor)
         return shares(gpus, self.gpus_per_worker)
 
 
-def check_devices(wanted: Iterable[str], gpus: Share, engine: str) -> None:
+def check_devices(wanted: Iterable[str], gpus: Share, executor: str) -> None:
     """Check that the GPUs that runs ask for can be those of workers.
 
     Args:
         wanted: the values of the key `device` of runs that may use a GPU.
         gpus: the visible GPUs of this machine.
-        engine: the executor's name.
+        executor: the executor's name.
 
     Raises:
         InputError: naming the key.
@@ -110,7 +112,7 @@ def check_devices(wanted: Iterable[str], gpus: Share, engine: str) -> None:
     for name in wanted:
         if ":" in name:
             raise InputError(f"device={name}: allowed is auto, cuda, cpu or mps; each worker has its own GPU")
-        if engine == "local" and name == "cuda" and not gpus:
+        if executor == "local" and name == "cuda" and not gpus:
             raise InputError("device=cuda: no GPU is visible here; allowed here is device=cpu or device=auto")
     if gpus and wanted:
         from memmlp.pipeline.devices import missing_gpu
@@ -153,8 +155,8 @@ def worker_options(command: Callable[..., Any]) -> Callable[..., Any]:
         workers_per_gpu: int | None,
         **others: Any,
     ) -> None:
-        engine, words, rest = split_executor(overrides)
-        workers = Workers(engine, words, count, gpus_per_worker, workers_per_gpu)
+        executor, words, rest = split_executor(overrides)
+        workers = Workers(executor, words, count, gpus_per_worker, workers_per_gpu)
         command(overrides=rest, workers=workers, **others)
 
     for option in reversed(options):
@@ -168,23 +170,23 @@ def split_executor(words: Iterable[str]) -> tuple[str, dict[str, str], tuple[str
     Raises:
         InputError: for an unknown executor, or settings of another one.
     """
-    engine, own, rest = "local", [], []
+    executor, own, rest = "local", [], []
     for word in words:
         key, _, value = word.partition("=")
         if key == "executor":
-            engine = value
+            executor = value
         elif key.split(".")[0] in (*SETTINGS, OWN) and "." in key:
             own.append((key, value))
         else:
             rest.append(word)
-    if engine not in ENGINES and "." not in engine:
-        raise InputError(f"executor={engine}: allowed is local, slurm, ray or dask, or the path of a class")
+    if executor not in EXECUTORS and "." not in executor:
+        raise InputError(f"executor={executor}: allowed is local, slurm, ray or dask, or the path of a class")
     for key, _ in own:
         group = key.split(".")[0]
-        if group != (OWN if "." in engine else engine):
+        if group != (OWN if "." in executor else executor):
             goes = "a class of your own, executor=PATH" if group == OWN else f"executor={group}"
             raise InputError(f"{key}: goes with {goes}")
-    return engine, {key.partition(".")[2]: value for key, value in own}, tuple(rest)
+    return executor, {key.partition(".")[2]: value for key, value in own}, tuple(rest)
 
 
 def executor(workers: Workers, folder: Path, shared: list[Share], gpus: bool) -> Executor:
@@ -196,25 +198,25 @@ def executor(workers: Workers, folder: Path, shared: list[Share], gpus: bool) ->
         shared: the shares of this machine's GPUs for local workers.
         gpus: whether runs may use a GPU.
     """
-    if workers.engine == "slurm":
+    if workers.executor == "slurm":
         from memmlp.sweep.executors.slurm import Slurm
 
         return Slurm(logs(folder), workers.settings())
-    if workers.engine == "ray":
+    if workers.executor == "ray":
         from memmlp.sweep.executors.ray_cluster import Ray
 
         return Ray(workers.settings(), gpus)
-    if workers.engine == "dask":
+    if workers.executor == "dask":
         from memmlp.sweep.executors.dask_cluster import Dask
 
         return Dask(workers.settings(), gpus)
-    if "." in workers.engine:
+    if "." in workers.executor:
         from memmlp.config.instantiate import located
 
-        return located(workers.engine, "executor")(logs(folder), workers.words)
+        return located(workers.executor, "executor")(logs(folder), workers.words)
     from memmlp.sweep.executors.local import Debug, Local
 
-    return Debug(logs(folder)) if workers.engine == "debug" else Local(logs(folder), shared)
+    return Debug(logs(folder)) if workers.executor == "debug" else Local(logs(folder), shared)
 
 
 def hire(folder: Path, plan: Plan, workers: Workers, devices: Iterable[str]) -> tuple[Path, Fleet]:
@@ -245,7 +247,7 @@ def hire(folder: Path, plan: Plan, workers: Workers, devices: Iterable[str]) -> 
     plan.save(path)
     presence = Presence(own.with_suffix(".process"))
     gpu = made.gpus and not named <= WITHOUT
-    if workers.engine == "local":
+    if workers.executor == "local":
         threads = max((os.cpu_count() or 1) // count, 1)
         task = partial(start_worker, str(path), threads, str(presence.path), gpu)
     else:

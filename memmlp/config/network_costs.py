@@ -32,7 +32,7 @@ def with_costs(sweep: Sweep, runs: Mapping[str, Runs]) -> tuple[dict[str, Runs],
     timed = not set(sweep.metrics) <= set(SIZES)
     without = [arm for arm in sweep.runnable() if not runs[arm.label]]
     costs = {
-        arm.label: {sweep.seeds_of(arm)[0]: measured(sweep.overrides(arm), timed)}
+        arm.label: {sweep.seeds_of(arm)[0]: measure_costs(sweep.overrides(arm), timed)}
         for arm in progress_bar(without, "networks", len(without))
     }
     names = ", ".join(f"'{label}'" for label in costs)
@@ -49,7 +49,7 @@ def check_costs(sweep: Sweep) -> None:
         )
 
 
-def measured(overrides: tuple[str, ...], timed: bool) -> Measured:
+def measure_costs(overrides: tuple[str, ...], timed: bool) -> Measured:
     """Measure the network of some overrides, with random weights, and the ONNX file of its live step.
 
     Args:

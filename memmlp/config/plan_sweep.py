@@ -82,7 +82,7 @@ def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
     Raises:
         InputError: naming arm and key, where a config is wrong.
     """
-    path = sweep_folder(sweep, outputs) / "planned.json"
+    path = sweep_folder(sweep, outputs) / "plan_stamp.json"
     if not prepare and not path.parent.is_dir():
         return _plan(sweep, outputs, prepare)[0]
     stamp = _stamp(sweep, outputs)
@@ -118,7 +118,7 @@ def orphans(sweep: Sweep, plan: Plan) -> list[Entry]:
 
 def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[str, Any]] | None]:
     """Make the plan, and list the data that it relies on; None for the list where some is not prepared."""
-    cells: list[tuple[Entry, list[RunTask]]] = []
+    planned: list[tuple[Entry, list[RunTask]]] = []
     data: dict[str, dict[str, Any]] = {}
     complete = True
     for arm in sweep.runnable():
@@ -127,10 +127,10 @@ def _plan(sweep: Sweep, outputs: Path, prepare: bool) -> tuple[Plan, list[dict[s
             complete &= known is not None
             if known is not None:
                 found = tasks_of(experiment, known)
-                cells.append((Entry(arm.label, seed, found[-1].id, found[-1].stages), found))
-    cells.sort(key=lambda cell: sweep.seeds.index(cell[0].seed))  # a half-done sweep then has every arm
-    tasks = unique(task for _, found in cells for task in found)
-    plan = Plan(sweep.name, outputs, tuple(entry for entry, _ in cells), tasks)
+                planned.append((Entry(arm.label, seed, found[-1].id, found[-1].stages), found))
+    planned.sort(key=lambda one: sweep.seeds.index(one[0].seed))  # a half-done sweep then has every arm
+    tasks = unique(task for _, found in planned for task in found)
+    plan = Plan(sweep.name, outputs, tuple(entry for entry, _ in planned), tasks)
     return plan, list(data.values()) if complete else None
 
 

@@ -59,7 +59,7 @@ def measure_step(path: Path, steps: int = 200) -> dict[str, Any]:
     }
 
 
-def interleaved(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, np.ndarray]:
+def time_in_turn(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, np.ndarray]:
     """Time a step of each exported file on one thread, the files in turn in each round.
 
     A file's first steps of a round, in which the caches fill, do not count.

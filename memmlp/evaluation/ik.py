@@ -32,7 +32,7 @@ class NoIK:
     """No inverse kinematics: there is no third result beside the two branches."""
 
     def solutions(self, normalizer: Normalizer, motion: Tensor, sparse: Tensor) -> dict[str, Tensor]:
-        """Return no result."""
+        """Return an empty dict: there is no branch `combined`."""
         return {}
 
 

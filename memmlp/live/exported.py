@@ -17,7 +17,7 @@ AGAIN = "export it again with memmlp export RUN --out FILE.onnx"
 
 
 class ExportedNetwork(OnnxStream):
-    """An ONNX file of scope `step`.
+    """An ONNX file of scope `step`, whose steps are those of `OnnxStream`.
 
     Attributes:
         sparse: the input (1, 54), to be written before a step.

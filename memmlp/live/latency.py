@@ -34,7 +34,7 @@ def measure_pose(path: Path, steps: int) -> dict[str, float]:
     }
 
 
-def interleaved_poses(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, np.ndarray]:
+def time_poses_in_turn(paths: Mapping[Key, Path], rounds: int, steps: int) -> dict[Key, np.ndarray]:
     """Time whole poses of exported networks on one thread, the files in turn in each round.
 
     Returns:

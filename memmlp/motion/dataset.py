@@ -21,7 +21,7 @@ SHARE_STEPS = 2**52  # how finely sources' shares are kept
 
 
 class MotionDataset:
-    """All clips of one split, one after the other.
+    """All clips of one part, one after the other.
 
     Attributes:
         frames: [X | Theta] (F, 252), float32, world.
@@ -45,21 +45,21 @@ class MotionDataset:
         self.groups, self.sources = groups or list(names), sources
 
     @classmethod
-    def open(cls, cache: Path, split: str) -> MotionDataset:
-        """Open a split of a prepared cache, memory-mapped; `.to(device)` copies it to a device.
+    def open(cls, cache: Path, part: str) -> MotionDataset:
+        """Open a part (train, val, test) of a prepared cache, memory-mapped; `.to(device)` copies it.
 
         Raises:
-            InputError: if the cache is unfinished or damaged, or the split has no clip.
+            InputError: if the cache is unfinished or damaged, or the part has no clip.
         """
-        if split not in PARTS:
-            raise InputError(f"data: no split {split!r}; allowed: {', '.join(PARTS)}")
+        if part not in PARTS:
+            raise InputError(f"data: no part {part!r}; allowed: {', '.join(PARTS)}")
         manifest = Manifest.load(cache)
-        clips = manifest.part(split)
+        clips = manifest.part(part)
         if not clips:
-            raise InputError(f"{cache}: no {split} clips; prepare the data with a {split} part")
-        frames = _map(cache / f"{split}.npy")
+            raise InputError(f"{cache}: no {part} clips; prepare the data with a {part} part")
+        frames = _map(cache / f"{part}.npy")
         if frames.shape != (sum(clip.length for clip in clips), FRAME_DIM):
-            raise InputError(f"{cache}: {split}.npy is not the manifest's array; prepare the data again")
+            raise InputError(f"{cache}: {part}.npy is not the manifest's array; prepare the data again")
         starts = torch.tensor([clip.start for clip in clips])
         lengths = torch.tensor([clip.length for clip in clips])
         names, groups = [clip.name for clip in clips], [clip.group for clip in clips]
@@ -110,11 +110,11 @@ class WindowSampler:
     clip shorter than the window has one window, which ends at its last frame.
 
     Args:
-        frames: the clips.
+        dataset: the clips.
         batch: number of windows a draw.
         window: number of frames a window.
         seed: seed of the draws.
-        weighting: "frames" if every window of the split is equally likely (reading 23), "clips" if every clip
+        weighting: "frames" if every window of the part is equally likely (reading 23), "clips" if every clip
             is.
         shares: how often a window is of each source, relative to the others; within a source `weighting`
             says. None draws from all clips alike.
@@ -125,7 +125,7 @@ class WindowSampler:
 
     def __init__(
         self,
-        frames: MotionDataset,
+        dataset: MotionDataset,
         batch: int,
         window: int,
         seed: int,
@@ -134,12 +134,12 @@ class WindowSampler:
     ):
         if weighting not in WEIGHTINGS:
             raise InputError(f"data.weighting: {weighting!r}; allowed: {', '.join(WEIGHTINGS)}")
-        self.batch, self.seed, self.device = batch, seed, frames.frames.device
-        lengths = frames.lengths.cpu().numpy()
+        self.batch, self.seed, self.device = batch, seed, dataset.frames.device
+        lengths = dataset.lengths.cpu().numpy()
         self.first_end = np.minimum(window, lengths) - 1
         self.windows = np.maximum(lengths - window + 1, 1)
         weights = self.windows if weighting == "frames" else np.ones_like(self.windows)
-        self.bounds = np.cumsum(_shared(weights, frames.sources, shares) if shares else weights)
+        self.bounds = np.cumsum(_shared(weights, dataset.sources, shares) if shares else weights)
 
     def draw(self, step: int) -> tuple[Tensor, Tensor]:
         """Draw clips (B,) and the last frames (B,) of their windows, int64, on the dataset's device."""

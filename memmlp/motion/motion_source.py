@@ -36,12 +36,12 @@ class Prepared(NamedTuple):
         """The digest of the data, which stands for it in every identity."""
         return self.manifest.digest
 
-    def open(self, split: str) -> MotionDataset:
-        """Open a split of the cache, memory-mapped (`MotionDataset.open`)."""
+    def open(self, part: str) -> MotionDataset:
+        """Open a part of the cache, memory-mapped (`MotionDataset.open`)."""
         # Imported here, since it imports torch, which finding finished work does not need.
         from memmlp.motion.dataset import MotionDataset
 
-        return MotionDataset.open(self.cache, split)
+        return MotionDataset.open(self.cache, part)
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from torch import Tensor, nn
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.cells import CELLS, Cell
 from memmlp.networks.layers import in_float32
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import Learned
 from memmlp.networks.reaching import reached, tracked
+from memmlp.networks.recurrent_cells import CELLS, Cell
 from memmlp.networks.windowless_model import WindowlessModel
 
 

@@ -169,13 +169,13 @@ def upstream_run(experiment: Experiment, data: Prepared, last: str | None = None
     run: Run | None = None
     identities = experiment.upstream_identities(data.digest)
     for training, identity in zip(experiment.upstream, identities, strict=True):
-        run = made_upstream(experiment, training, identity, data, run)
+        run = find_or_train_upstream(experiment, training, identity, data, run)
         if run.id == last:
             break
     return run
 
 
-def made_upstream(
+def find_or_train_upstream(
     experiment: Experiment,
     training: UpstreamTraining,
     identity: Identity,

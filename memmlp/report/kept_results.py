@@ -92,7 +92,7 @@ class Kept:
         return run.id if run.id in self.named else f"{run.id}/{_errors_key(run)}"
 
     def merged(self, other: Kept) -> Kept:
-        """Return the results with another's runs added; where both have a cell, the other's stands.
+        """Return the results with another's runs added; where both have an arm and seed, the other's stands.
 
         Raises:
             InputError: where the two are not of one sweep with the same overrides, or a fixed number of seeds
@@ -110,15 +110,15 @@ class Kept:
         return replace(self, runs=runs, arms=arms, rounds=other.rounds, flags=flags, predicted=predicted)
 
     def check_runs(self, wanted: Mapping[tuple[str, int], str]) -> None:
-        """Check that the cells hold the runs that a sweep has in them today.
+        """Check that the arms and seeds have the runs that a sweep gives them today.
 
         The words of an arm may be the same while what they stand for has changed: a default or a recipe.
 
         Args:
-            wanted: the ids of the runs by the arm's label and the seed; other cells are not checked.
+            wanted: the ids of the runs by the arm's label and the seed; others are not checked.
 
         Raises:
-            InputError: where a cell holds another run.
+            InputError: where one has another run.
         """
         others = {
             label: sorted(seed for seed, run in runs.items() if wanted.get((label, seed), run.id) != run.id)

@@ -180,7 +180,7 @@ class Words:
         return "not printed" if printed is None else f"{printed:+.2f}".replace("-", MINUS)
 
     def seen(self, name: str, mode: str, metric: str, arm: str | None = None) -> str:
-        """Return the difference that the table could have seen with 80 % power, in an arm or in every one."""
+        """Return the smallest difference that 80 % power would detect, in an arm or in every one."""
         if arm is None:
             least = self._table(name).detectable(mode, metric)
         else:
@@ -226,7 +226,7 @@ class Words:
         return "\n".join(lines)
 
     def held(self, names: Sequence[str], mode: str = "stream") -> str:
-        """Return which of the paper's effects hold: verdicts, counted and in a line for each arm of the tables.
+        """Return which of the paper's effects hold: verdicts, counted and in a line for each arm.
 
         Effects whose sign the paper prints are counted, and shown with a verdict; the others as `-`.
 

@@ -134,7 +134,7 @@ def _panel(axis: Axes, trend: Trend, found: Trends) -> None:
 
 
 def _limits(trend: Trend, name: str, ahead: float | None) -> tuple[float, float]:
-    """Return the ends of a panel, beyond which a cell's bar may go on, and a wide prediction does."""
+    """Return the lower and upper limit of a panel; long bars and wide predictions are cut off there."""
     x = [point.values[name] for point in trend.points]
     ends = trend.curve([{name: min(x)}, {name: max(x)}])
     every = [0.0, *(point.effect.mean for point in trend.points), *ends.low, *ends.high]

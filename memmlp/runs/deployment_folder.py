@@ -82,7 +82,7 @@ class DeploymentFolder:
 
     @property
     def accurate_int8(self) -> Path | None:
-        """The ONNX file in integers, where there is one that is accurate enough for float32's place."""
+        """The ONNX file in int8, if there is one that is accurate enough to stand for float32; else None."""
         record = self.record
         accurate = [name for name in INT8_PRECISIONS if record.get(name, {}).get("default")]
         return next((self.file(name) for name in accurate if self.file(name).exists()), None)

@@ -1,4 +1,4 @@
-"""The origin of a training: the machine and code that made it."""
+"""The origin of a training that was resumed: every machine and code that had a share in it."""
 
 from __future__ import annotations
 

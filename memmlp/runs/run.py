@@ -121,7 +121,7 @@ class Run:
 
     @property
     def preferred_onnx(self) -> Path:
-        """The ONNX file to use: in integers, if there is one that is accurate enough (`export.precision`).
+        """The ONNX file to use: that in int8 if it is accurate enough (`export.precision`), else in float32.
 
         Raises:
             InputError: if the run is finished and has none (`export.graph=off`).

@@ -87,8 +87,8 @@ def _change(plan: Plan, task: RunTask, state: str) -> str:
 
 def name(plan: Plan, task: RunTask) -> str:
     """Return the task's name for people: arm and seed, or what it is and the seeds whose runs need it."""
-    cells = [f"{entry.label} seed {entry.seed}" for entry in plan.entries if entry.key == task.key]
-    return cells[0] if cells else f"{kind_words(task.kind)} {task.id}{_seeds(plan, task)}"
+    names = [f"{entry.label} seed {entry.seed}" for entry in plan.entries if entry.key == task.key]
+    return names[0] if names else f"{kind_words(task.kind)} {task.id}{_seeds(plan, task)}"
 
 
 def _seeds(plan: Plan, upstream: RunTask) -> str:

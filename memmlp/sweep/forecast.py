@@ -54,6 +54,6 @@ def seconds(run: Run) -> float | None:
 
 
 def _arm(plan: Plan, task: RunTask) -> set[str]:
-    """Return the runs of the arms that a task is of, of all seeds; none for what is upstream of arms."""
+    """Return the ids of all runs, of every seed, of the arms that use a task's run; none if upstream."""
     labels = {entry.label for entry in plan.entries if entry.id == task.id}
     return {entry.id for entry in plan.entries if entry.label in labels}

@@ -46,7 +46,7 @@ class RunTask:
 
 @dataclass(frozen=True)
 class Entry:
-    """A cell of the sweep: the run of an arm with a seed, and the stages that the arm shows of it."""
+    """An entry of a sweep: the run of an arm with a seed, and its stages after training."""
 
     label: str
     seed: int
@@ -66,7 +66,7 @@ class Plan:
     Attributes:
         name: the sweep's name.
         outputs: the folder of runs and caches.
-        entries: the cells of the sweep.
+        entries: the runs of the sweep's arms and seeds.
         tasks: the runs to be made.
         open: whether more tasks may come (a search), so that workers stay. A sweep's plan is closed.
         cancelled: ids of runs that no worker is to go on with.

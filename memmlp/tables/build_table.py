@@ -27,7 +27,7 @@ def finished_runs(sweep: Sweep, find: Find) -> dict[str, Runs]:
     }
 
 
-def collect(
+def make_table(
     sweep: Sweep,
     runs: Mapping[str, Runs],
     modes: Sequence[str] = MODES,
@@ -130,7 +130,7 @@ def titled(table: Table, source: str) -> Table:
 
 def without_runs(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
     """Make the table of a sweep whose runs can't be known: the paper's values, and the reason."""
-    return replace(collect(sweep, {arm.label: {} for arm in sweep.runnable()}, modes), flags=(reason,))
+    return replace(make_table(sweep, {arm.label: {} for arm in sweep.runnable()}, modes), flags=(reason,))
 
 
 def _row(sweep: Sweep, arm: Arm, runs: Runs | None, modes: Sequence[str], found: Mapping[Key, Effect]) -> Row:

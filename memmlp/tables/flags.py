@@ -26,7 +26,7 @@ ORIGIN = {
 
 
 def silent(arm: Arm, seed: int) -> None:
-    """Have nothing to say about a cell: the default where a `Say` is wanted."""
+    """Have nothing to say about a run: the default where a `Say` is wanted."""
 
 
 def flags(
@@ -72,7 +72,7 @@ def flags(
 
 
 def _other_data(sweep: Sweep) -> Iterable[str]:
-    """Flag a table of the paper with data of its own, a protocol on AMASS, that is shown for others."""
+    """Flag a table of the paper that names its data (a protocol on AMASS) and is shown for other data."""
     own, chosen = (
         next((word for word in reversed(words) if word.startswith("data=")), None)
         for words in (sweep.base, sweep.extra)
@@ -95,7 +95,7 @@ def _missing(sweep: Sweep, runs: Mapping[str, Runs], command: str, state: Say) -
 
 
 def _older(sweep: Sweep, runs: Mapping[str, Runs], older: Say) -> Iterable[str]:
-    """Flag missing cells for which there is a run of an earlier recipe."""
+    """Flag missing runs for which there is a run of an earlier recipe."""
     found = [
         f"'{arm.label}' seed {seed} ({run})"
         for arm in sweep.runnable()

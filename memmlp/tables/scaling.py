@@ -289,7 +289,7 @@ def _ids(runs: Runs) -> frozenset[str]:
 
 
 def _values(sweep: Sweep, arm: Arm, control: Runs) -> dict[str, float]:
-    """Return what is known of a cell of what effects are shown against: its words' numbers, its compute."""
+    """Return the values of the scale's keys in a cell: numbers of its overrides, and its compute."""
     assert sweep.scale is not None
     words = dict(word.split("=", 1) for word in arm.cell)
     found = {name: float(words[name]) for name in sweep.scale.against if name in words}

@@ -195,7 +195,7 @@ def _largest(table: Table, mode: str, metric: str) -> float:
 
 
 def _agreement(table: Table) -> str:
-    """Explain the paper's lines, and count its effects by verdict."""
+    """Explain the paper's rows below a table, and count their effects by verdict."""
     mode, costs = table.modes[0], set(table.metrics) & set(COSTS)
     found = table.verdicts(mode)
     counts = ", ".join(f"{found[verdict]} {verdict}" for verdict in Verdict if found[verdict])

@@ -121,7 +121,7 @@ LATENT_LOSSES = {"upper": upper_losses, "lower": lower_losses}
 
 
 def seen(net: SAGENet, frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Return rotations (B, T, 132) and inputs (B, T, 54) in network space of world windows (B, T, 252)."""
+    """Return world windows (B, T, 252) in network space: rotations (B, T, 132) and inputs (B, T, 54)."""
     sparse, motion = net.normalizer.encode(frames).tensor_split([SPARSE_DIM], -1)
     return motion[..., ROTATION], sparse
 

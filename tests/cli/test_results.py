@@ -75,10 +75,10 @@ def test_a_sweep_with_a_scale_has_a_figure_beside_its_page(
     sweep = parse_sweep("cells", fake_cells.content())
     steps = {arm.label: fake_cells.steps_of(arm.cell) for arm in sweep.arms}
     monkeypatch.setattr(
-        "memmlp.config.count_training.with_flops",
+        "memmlp.config.count_flops.with_flops",
         lambda found: {label: fake_cells.trained(runs, steps[label]) for label, runs in found.items()},
     )
-    monkeypatch.setattr("memmlp.config.count_training.predicted_flops", lambda sweep: {"profile=paper": 1e15})
+    monkeypatch.setattr("memmlp.config.count_flops.predicted_flops", lambda sweep: {"profile=paper": 1e15})
     Path("cells.yaml").write_text(json.dumps(fake_cells.content()))
     memmlp("results", "save", "cells.yaml", "--name", "small")
     assert memmlp("results", "docs").out == "1 pages, 1 written\n"

@@ -176,7 +176,7 @@ def test_a_plan_is_kept_until_the_data_changes(home: Path, monkeypatch: pytest.M
     monkeypatch.chdir(home)
     chosen = find_sweep("trial.yaml").with_overrides(TINY)
     outputs = (home / "outputs").absolute()
-    kept = json.loads(next(outputs.glob("sweeps/trial-*/planned.json")).read_text())
+    kept = json.loads(next(outputs.glob("sweeps/trial-*/plan_stamp.json")).read_text())
     assert kept["stamp"]
     first = make_plan(chosen, outputs)
     clip = next((home / "outputs" / "data").rglob("*.npz"))

@@ -31,7 +31,7 @@ def found(monkeypatch: pytest.MonkeyPatch) -> None:
         ("0,1", {"gpus_per_worker": 0, "count": 3}, ["auto"], [], 3),
         ("0,1", {"count": 3}, ["cpu"], [], 3),
         ("", {"count": 3}, ["auto"], [], 3),
-        ("0,1", {"engine": "slurm", "count": 3}, ["cuda"], [], 3),
+        ("0,1", {"executor": "slurm", "count": 3}, ["cuda"], [], 3),
     ],
 )
 def test_gpus_of_workers(found, monkeypatch, visible, options, wanted, shares, number):
@@ -42,7 +42,7 @@ def test_gpus_of_workers(found, monkeypatch, visible, options, wanted, shares, n
 
 
 @pytest.mark.parametrize(
-    ("wanted", "gpus", "engine", "line"),
+    ("wanted", "gpus", "executor", "line"),
     [
         (["cuda:1"], ("0", "1"), "local", "device=cuda:1: allowed is auto, cuda, cpu or mps"),
         (["cuda:1"], (), "slurm", "device=cuda:1: allowed is"),
@@ -84,7 +84,7 @@ class Shelf:
 
 
 @pytest.mark.parametrize(
-    ("engine", "gives", "wanted", "gpu"),
+    ("executor", "gives", "wanted", "gpu"),
     [
         ("local", True, ["auto"], True), ("local", False, ["auto"], False), ("slurm", True, ["cuda"], True),
         ("slurm", True, ["cpu"], False), ("ray", True, ["cpu", "auto"], True),

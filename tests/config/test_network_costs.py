@@ -14,7 +14,7 @@ from memmlp.config.network_costs import with_costs
 from memmlp.report.kept_results import Kept
 from memmlp.report.markdown import origin_words
 from memmlp.sweep.parsing import parse_sweep
-from memmlp.tables.build_table import collect
+from memmlp.tables.build_table import make_table
 from memmlp.tables.measured_run import load
 
 ARMS = {"Mem-MLP": [], "AvatarPoser": ["model=avatar_poser"], "printed alone": {"overrides": None}}
@@ -35,7 +35,7 @@ def test_networks_without_a_run_are_measured_and_said_to_be_untrained(tmp_path: 
     assert found.costs["parameters"] == pytest.approx(numbers / 1e6)
     assert found.costs["FLOPs"] == pytest.approx(2 * found.costs["MACs"])
     assert found.costs["size"] > 4 * found.costs["parameters"]
-    table = collect(SWEEP, runs)
+    table = make_table(SWEEP, runs)
     assert not [flag for flag in table.flags if "not evaluated" in flag or "missing" in flag]
     said = origin_words(Kept("sizes", ("profile=tiny",), {"AvatarPoser": runs["AvatarPoser"]}, {}))
     assert said.startswith("`memmlp table sizes profile=tiny --untrained`: 1 untrained network, ")

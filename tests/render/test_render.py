@@ -15,7 +15,7 @@ from PIL import Image
 from memmlp.common.errors import InputError
 from memmlp.evaluation.modes import joint_positions
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.motion.limbs import LIMBS, ends
+from memmlp.motion.limb_shapes import LIMBS, ends
 from memmlp.render import figure, film
 from memmlp.render.error_colours import HEAT, heat, scale
 from memmlp.render.raster import Camera, draw

@@ -18,7 +18,7 @@ from memmlp.report.markdown import KeptTable, Words, origin_words, pages
 from memmlp.report.unbacked_claims import NEVER, WORDS, claims
 from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.spec import Sweep
-from memmlp.tables.build_table import collect
+from memmlp.tables.build_table import make_table
 from memmlp.tables.statistics import Verdict, holm, paired_effects
 from memmlp.tables.table_text import MINUS
 
@@ -39,7 +39,7 @@ def kept(sweep: Sweep, tmp_path: Path) -> Kept:
 
 
 def source(sweep: Sweep, kept: Kept) -> KeptTable:
-    return KeptTable(kept, collect(sweep, kept.of(sweep), command=kept.command))
+    return KeptTable(kept, make_table(sweep, kept.of(sweep), command=kept.command))
 
 
 def test_kept_results_make_the_runs_table(sweep: Sweep, kept: Kept, tmp_path: Path):
@@ -49,7 +49,7 @@ def test_kept_results_make_the_runs_table(sweep: Sweep, kept: Kept, tmp_path: Pa
     assert (read.sweep, read.overrides, read.command) == (
         "table14", ("data=mocap",), "memmlp sweep table14 data=mocap",
     )  # fmt: skip
-    tables = [collect(sweep, one.of(sweep)) for one in (kept, read)]
+    tables = [make_table(sweep, one.of(sweep)) for one in (kept, read)]
     assert tables[0].flags == tables[1].flags
     for before, after in zip(tables[0].rows, tables[1].rows, strict=True):
         for mode in tables[0].modes:
@@ -71,7 +71,9 @@ def test_a_run_that_diverged_stays_one(sweep: Sweep, kept: Kept, tmp_path: Path,
     run.means["stream"]["combined"]["MPJPE"] = number
     save(tmp_path / "kept.json", kept)
     cells = [
-        next(row for row in collect(sweep, one.of(sweep)).rows if row.label == "2").cells["stream"]["MPJPE"]
+        next(row for row in make_table(sweep, one.of(sweep)).rows if row.label == "2").cells["stream"][
+            "MPJPE"
+        ]
         for one in (kept, load_kept(tmp_path / "kept.json"))
     ]
     for cell in cells:
@@ -150,7 +152,7 @@ def test_two_evaluations_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp
     assert read.count == len({run.id for runs in read.runs.values() for run in runs.values()})
     assert len(read.every) == read.count + len(solved)
     assert dumps(read) == (tmp_path / "kept.json").read_text()
-    table = collect(sweep, read.of(sweep))
+    table = make_table(sweep, read.of(sweep))
     assert not any("are one run" in flag and two in flag for flag in table.flags)
 
 

@@ -15,7 +15,7 @@ from memmlp.report.kept_results import Kept, dumps, load_kept, overrides_of, sav
 from memmlp.report.markdown import KeptTable, Words, pages
 from memmlp.report.scaling import bounds_words, power, scaling_section
 from memmlp.report.scaling_figure import figure_is_of, scaling_figure
-from memmlp.tables.build_table import collect
+from memmlp.tables.build_table import make_table
 from memmlp.tables.scaling import Bounds, Trends, trends
 from memmlp.tables.table_text import MINUS
 
@@ -68,7 +68,7 @@ def test_without_lines_it_says_why(found: Trends):
 
 def test_a_sweep_with_a_scale_has_the_section_before_its_table(kept: Kept, found: Trends, tmp_path: Path):
     sweep, _ = cells(tmp_path, lambda steps: 1.0)
-    table = collect(sweep, kept.runs)
+    table = make_table(sweep, kept.runs)
     text = pages({"cells": KeptTable(kept, table, (), found)}, {})["cells.md"]
     assert text.index("### Effects against compute") < text.index("### Memory with more steps")
     assert text.count("of 'none' from 'full' in the same cell") == 1

@@ -15,7 +15,7 @@ from processes import finished
 from memmlp.common.errors import InputError
 from memmlp.sweep.parsing import load_sweep, parse_sweep
 from memmlp.sweep.spec import Sweep
-from memmlp.tables.build_table import collect, on_source, without_runs
+from memmlp.tables.build_table import make_table, on_source, without_runs
 from memmlp.tables.measured_run import load
 
 
@@ -76,7 +76,7 @@ def test_arms_without_a_sources_clips_are_left_out_and_named(tmp_path: Path):
     assert part.flags == ("no test clip of new, so left out: 'one'",)
     waiting = on_source(sweep, runs | {"both": {}}, "new")  # an arm without a run is nothing to compare with
     assert (list(waiting.runs), waiting.sweep.control) == (["both", "more"], "more")
-    table = collect(part.sweep, part.runs)
+    table = make_table(part.sweep, part.runs)
     assert [row.label for row in table.rows] == ["both", "more"]
     assert not any("missing" in flag for flag in table.flags)
     old = on_source(sweep, runs, "old")
@@ -89,11 +89,11 @@ def test_arms_without_a_sources_clips_are_left_out_and_named(tmp_path: Path):
 def test_a_mode_in_which_nothing_was_measured_is_left_out(tmp_path: Path):
     sweep = parse_sweep("two", {"arms": {"one": [], "both": ["optim.lr=1"]}, "seeds": [0]})
     runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
-    assert collect(sweep, runs).modes == ("stream", "window")
+    assert make_table(sweep, runs).modes == ("stream", "window")
     streamed = {
         label: {seed: replace(run, means={"stream": run.means["stream"]}) for seed, run in found.items()}
         for label, found in runs.items()
     }
-    assert collect(sweep, streamed).modes == ("stream",)
-    assert collect(sweep, {**streamed, "both": runs["both"]}).modes == ("stream", "window")
-    assert collect(sweep, streamed, ["window"]).modes == ("window",)
+    assert make_table(sweep, streamed).modes == ("stream",)
+    assert make_table(sweep, {**streamed, "both": runs["both"]}).modes == ("stream", "window")
+    assert make_table(sweep, streamed, ["window"]).modes == ("window",)

@@ -14,7 +14,7 @@ from memmlp.report.kept_results import Kept, dumps, load_kept
 from memmlp.report.markdown import origin_words
 from memmlp.runs.evaluation_file import write_report
 from memmlp.sweep.spec import Sweep
-from memmlp.tables.build_table import collect
+from memmlp.tables.build_table import make_table
 from memmlp.tables.formats import FORMATS
 from memmlp.tables.measured_run import load
 from memmlp.tables.statistics import Verdict
@@ -26,9 +26,9 @@ def test_a_protocol_on_amass_with_other_data_is_flagged(sweep: Sweep):
     protocol = replace(sweep, table=1, base=("data=amass_s1",))
     other = replace(protocol, extra=("data=mocap", "data.root=mine"))
     flag = "a table of data=amass_s1, shown with data=mocap: its errors do not compare with the paper's"
-    assert flag in collect(other, runs).flags
+    assert flag in make_table(other, runs).flags
     alike = (protocol, replace(protocol, extra=("data=amass_s1",)), replace(other, base=()))
-    assert not any("a table of" in word for one in alike for word in collect(one, runs).flags)
+    assert not any("a table of" in word for one in alike for word in make_table(one, runs).flags)
 
 
 def test_missing_runs_are_shown_with_the_command(sweep: Sweep, tmp_path: Path):
@@ -275,7 +275,7 @@ def test_the_built_in_body_beside_smplh_numbers(
 def test_runs_of_an_older_recipe_are_named(sweep: Sweep, tmp_path: Path):
     runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
     runs["no | memory"] = {seed: run for seed, run in runs["no | memory"].items() if seed}
-    table = collect(sweep, runs, older=lambda arm, seed: "abc" if arm.label != "full_model" else None)
+    table = make_table(sweep, runs, older=lambda arm, seed: "abc" if arm.label != "full_model" else None)
     assert "made by an earlier recipe, left out and made again by the sweep: 'no | memory' seed 0 (abc)" in (
         table.flags
     )

@@ -12,7 +12,7 @@ import pytest
 
 from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.spec import Sweep
-from memmlp.tables.build_table import collect
+from memmlp.tables.build_table import make_table
 from memmlp.tables.effects import Runs
 from memmlp.tables.formats import markdown
 from memmlp.tables.measured_run import Measured, Origin
@@ -137,7 +137,7 @@ def test_what_is_decided_stays_though_later_data_would_reverse_it():
     assert rounds.counts(sweep) == {"full": 3, "other": 5, "unsure": 5}
     assert verdicts(rounds)["other"] == ("higher", 3)
     assert [f.label for f in rounds.taken[1].found] == ["unsure", "unsure"]  # it was not looked at again
-    table = collect(rounds.spent(sweep), world.runs, rounds=rounds)
+    table = make_table(rounds.spent(sweep), world.runs, rounds=rounds)
     cell = next(row for row in table.rows if row.label == "other").cells["stream"]["MPJPE"]
     assert (cell.effect.verdict, cell.effect.decided) == (Verdict.HIGHER, 3)
     assert cell.effect.significant
@@ -213,7 +213,7 @@ def test_corrections_are_over_all_that_nobody_has_claimed():
 def test_the_table_shows_rounds(tmp_path):
     world = World()
     rounds = world.to_the_end(begin(SWEEP, 5))
-    table = collect(rounds.spent(SWEEP), world.runs, rounds=rounds)
+    table = make_table(rounds.spent(SWEEP), world.runs, rounds=rounds)
     assert {row.label: (len(row.found), len(row.wanted)) for row in table.rows[:4]} == {
         "full": (5, 5), "worse": (3, 3), "same": (3, 3), "unsure": (5, 5)
     }  # fmt: skip
@@ -224,7 +224,9 @@ def test_the_table_shows_rounds(tmp_path):
     assert "p \\< its look's level by Holm's correction over the table's 6 comparisons" in text
     assert "missing" not in text
     del world.runs["unsure"][6]
-    assert "'unsure' seed 6; fill with" in markdown(collect(rounds.spent(SWEEP), world.runs, rounds=rounds))
+    assert "'unsure' seed 6; fill with" in markdown(
+        make_table(rounds.spent(SWEEP), world.runs, rounds=rounds)
+    )
 
 
 @functools.cache

@@ -72,14 +72,14 @@ VARIANTS = ("network", *DEPLOYED)
     "--json", "file", type=click.Path(path_type=Path), help="File to write the measured rows into, as JSON."
 )
 @click.option(
-    "--profile",
+    "--breakdown",
     help="Show instead where the time of one network goes: NETWORK:VARIANT, such as mem_mlp_41:int8.",
 )
 @click.argument("overrides", nargs=-1)
 @config_dir_option
 @plugins_option
 def latency(
-    rounds: int, steps: int, models: str, file: Path | None, profile: str | None, overrides: tuple[str, ...]
+    rounds: int, steps: int, models: str, file: Path | None, breakdown: str | None, overrides: tuple[str, ...]
 ) -> None:
     """Time a step of every network.
 
@@ -99,24 +99,24 @@ def latency(
         raise InputError(
             f"--models {models}: allowed are {', '.join(MODELS)}, with {BASE[0]} for the comparison"
         )
-    if profile and profile not in allowed:
-        raise InputError(f"--profile {profile}: allowed are {', '.join(allowed)}")
+    if breakdown and breakdown not in allowed:
+        raise InputError(f"--breakdown {breakdown}: allowed are {', '.join(allowed)}")
     if file and not file.absolute().parent.is_dir():
         raise InputError(f"--json {file}: there is no folder {file.parent}")
     with tempfile.TemporaryDirectory() as folder:
-        paths = dict(exported(chosen, overrides, Path(folder)))
+        paths = dict(export_all(chosen, overrides, Path(folder)))
         rows = timed(paths, rounds, steps)
         show(rows, rounds)
         if file:
             from memmlp.common.files import write_json
 
             write_json(file, rows)
-        if profile:
-            name, variant = profile.split(":")
-            show_profile(paths[name, variant])
+        if breakdown:
+            name, variant = breakdown.split(":")
+            show_breakdown(paths[name, variant])
 
 
-def exported(models: list[str], overrides: tuple[str, ...], folder: Path) -> Iterator[tuple[Timed, Path]]:
+def export_all(models: list[str], overrides: tuple[str, ...], folder: Path) -> Iterator[tuple[Timed, Path]]:
     """Export each model in all variants, with a progress bar, and yield (model, variant) with the file."""
     from memmlp.common.progress import progress_bar
     from memmlp.config.build import untrained
@@ -138,10 +138,10 @@ def exported(models: list[str], overrides: tuple[str, ...], folder: Path) -> Ite
         for variant, path in paths.items():
             yield (name, variant), path
         if name == CHECK[0]:
-            yield CHECK, exported_independently(overrides, folder / "independent.onnx")
+            yield CHECK, export_independently(overrides, folder / "independent.onnx")
 
 
-def exported_independently(overrides: tuple[str, ...], path: Path) -> Path:
+def export_independently(overrides: tuple[str, ...], path: Path) -> Path:
     """Export AvatarPoser of torch's own layers in the config's sizes, and return the file."""
     from memmlp.cli.bench.torch_avatar_poser import TorchAvatarPoser, export_plainly
     from memmlp.config.compose import composed
@@ -163,12 +163,12 @@ def calibration_clips() -> list[Any]:
 
 def timed(paths: dict[Timed, Path], rounds: int, steps: int) -> list[dict[str, Any]]:
     """Time all files in turn, their steps and then the whole poses of those that make any; see `summary`."""
-    from memmlp.deploy.latency import interleaved
-    from memmlp.live.latency import interleaved_poses
+    from memmlp.deploy.latency import time_in_turn
+    from memmlp.live.latency import time_poses_in_turn
 
-    seconds = interleaved(paths, rounds, steps)
+    seconds = time_in_turn(paths, rounds, steps)
     deployed = {key: path for key, path in paths.items() if key[1] in DEPLOYED}
-    poses = interleaved_poses(deployed, rounds, steps)
+    poses = time_poses_in_turn(deployed, rounds, steps)
     return [
         {"model": key[0], "variant": key[1]}
         | summary("", times, seconds[BASE])
@@ -229,7 +229,7 @@ def short(number: float) -> str:
     return f"{number:.2f}" if number < 10 else f"{number:.1f}" if number < 100 else f"{number:.0f}"
 
 
-def show_profile(path: Path) -> None:
+def show_breakdown(path: Path) -> None:
     """Print where a step's time goes, by the kind of operation and its shape."""
     from rich.console import Console
     from rich.table import Table

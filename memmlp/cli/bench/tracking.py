@@ -70,7 +70,7 @@ class PiecewiseRun(Run):
         self.since = time.perf_counter()
 
     def log(self, step: int, values: Mapping[str, float], phase: str = "train") -> None:
-        """Log, and end a piece."""
+        """Log the values; after those of a training step note its time, and pause or resume the follower."""
         super().log(step, values, phase)
         if phase == "train":
             self.seconds.append(time.perf_counter() - self.since)

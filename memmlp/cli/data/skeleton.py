@@ -54,9 +54,9 @@ def show(file: Path, which: str | None, out: Path) -> None:
     Beside it stands the built-in body in the same stance: where the two differ, the map is wrong.
     """
     from memmlp.motion.body import load_rest_joints
+    from memmlp.motion.importing.file_stance import find_stance
     from memmlp.motion.importing.files import read_recording
     from memmlp.motion.importing.skeleton import find_skeleton, load_skeleton
-    from memmlp.motion.importing.stance_of_file import find_stance
     from memmlp.render.picture import check_picture
     from memmlp.render.skeleton_map import skeleton_png
 

@@ -18,7 +18,7 @@ from memmlp.live.spaces import SPACES, Space
 from memmlp.live.stream import Pose, Stream
 from memmlp.motion.body import FPS, JOINTS, PARENTS
 from memmlp.motion.formats.humanoid import VRM
-from memmlp.motion.limbs import LIMBS
+from memmlp.motion.limb_shapes import LIMBS
 from memmlp.render.error_colours import HEAT
 
 PAGE_SPACE = SPACES["openxr"]  # the page's axes: those of three.js
@@ -85,7 +85,7 @@ def play(
             continue
         dropped += sample.dropped
         arrived = sample.arrived or time.perf_counter()
-        pose = stepped(stream, sample)
+        pose = take_step(stream, sample)
         if pose is None:
             refused += 1
             continue
@@ -107,7 +107,7 @@ def play(
         number += 1
 
 
-def stepped(stream: Stream, sample: SourceSample) -> Pose | None:
+def take_step(stream: Stream, sample: SourceSample) -> Pose | None:
     """Return the pose of a sample; None where the stream refuses it."""
     try:
         return stream.step(*sample.trackers, time=sample.time)

@@ -53,7 +53,7 @@ class SiteNetwork:
 
     @property
     def trained(self) -> bool:
-        """Whether it can be played and worn, and not timed alone."""
+        """Whether it is trained, so that it can be played and worn; any other is only timed."""
         return self.run != "random"
 
 

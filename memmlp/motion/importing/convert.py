@@ -62,7 +62,7 @@ def convert(
         floor: `auto`, found from the feet; `none`, left as it is; or its height in the file, metres.
 
     Raises:
-        InputError: as `recording.pick_joints` and `retarget.fit` do.
+        InputError: as `mapped_motion.pick_joints` and `retarget.fit` do.
     """
     settled = settle(recording, skeleton)
     performance = pick_joints(recording, settled)

@@ -27,9 +27,9 @@ class ClipRecord:
     Attributes:
         name: path below the data root without suffix.
         file: path below the data root.
-        split: "train", "val" or "test".
+        split: its part, "train", "val" or "test".
         group: name of the clip's group (`Grouping.names`); its own name where nothing ties it to another.
-        start: its first frame in that split's array.
+        start: its first frame in that part's array.
         length: its number of frames there.
         sha256: digest of the source file.
         content: digest of its frames in single precision, the same for every copy of them; `STILL`
@@ -138,9 +138,9 @@ class Manifest:
         """How much there is of what the split lists."""
         return Coverage.of(self.listed, (*self.missing, *self.damaged))
 
-    def part(self, split: str) -> list[ClipRecord]:
-        """Return the clips of a split, in the order of its array."""
-        return [clip for clip in self.clips if clip.split == split]
+    def part(self, part: str) -> list[ClipRecord]:
+        """Return the clips of a part, in the order of its array."""
+        return [clip for clip in self.clips if clip.split == part]
 
 
 def write_manifest(manifest: Manifest, out: Path) -> None:

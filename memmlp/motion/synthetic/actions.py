@@ -11,12 +11,10 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from memmlp.motion.synthetic.curves import Array, arc, ease, pulse, wander
-from memmlp.motion.synthetic.gait import GRAVITY
-from memmlp.motion.synthetic.puppet import Puppet
-from memmlp.motion.synthetic.stance import (
+from memmlp.motion.synthetic.footwork import (
     LEFT_RIGHT,
+    FootPlacement,
     Footwork,
-    Stance,
     Style,
     bend_knees,
     direction,
@@ -24,6 +22,8 @@ from memmlp.motion.synthetic.stance import (
     occasions,
     stand,
 )
+from memmlp.motion.synthetic.gait import GRAVITY
+from memmlp.motion.synthetic.puppet import Puppet
 
 ARM = 0.53  # metres, shoulder to wrist
 # Where the hands are from the shoulders (outward, up, forward, metres): ahead, before the chest, hanging.
@@ -141,7 +141,7 @@ def punching(rng: np.random.Generator, t: Array) -> Puppet:
     lead = int(rng.integers(2))
     bladed = -LEFT_RIGHT[lead] * rng.uniform(0.3, 0.6)
     stagger = LEFT_RIGHT[lead] * rng.uniform(0.12, 0.2)
-    work = Footwork(Stance(style.origin, style.heading, style.width + 0.04, style.splay, stagger))
+    work = Footwork(FootPlacement(style.origin, style.heading, style.width + 0.04, style.splay, stagger))
     for start, _ in occasions(rng, t, (0.8, 1.5), (0.5, 3.0)):
         shift, turn = rng.uniform(-0.2, 0.2, 2), rng.uniform(-0.3, 0.3)
         work.change(start, 0.28, 0.32, shift, turn, first=int(rng.integers(2)), lift=0.03)
@@ -213,7 +213,7 @@ class Leap:
 def jumping(rng: np.random.Generator, t: Array) -> Puppet:
     """Jump on the spot, ahead, aside and with a turn: crouch, take-off, flight, landing."""
     style = Style.draw(rng)
-    work = Footwork(Stance(style.origin, style.heading, style.width + 0.02, style.splay))
+    work = Footwork(FootPlacement(style.origin, style.heading, style.width + 0.02, style.splay))
     height, leaps = rng.uniform(0.1, 0.35), []
     for start, _ in occasions(rng, t, (2.3, 2.6), (0.0, 1.5)):
         rise, off = height * rng.uniform(0.8, 1.1), start + rng.uniform(0.7, 0.9)
@@ -250,7 +250,7 @@ def _leap(puppet: Puppet, t: Array, leap: Leap) -> None:
 def sidestepping(rng: np.random.Generator, t: Array) -> Puppet:
     """Step to the left and the right: the leading foot goes, the other follows."""
     style = Style.draw(rng)
-    work = Footwork(Stance(style.origin, style.heading, style.width + 0.02, style.splay))
+    work = Footwork(FootPlacement(style.origin, style.heading, style.width + 0.02, style.splay))
     pace, tempo = rng.uniform(0.15, 0.38), rng.uniform(0.38, 0.55)
     now, first = rng.uniform(0.2, 1.0), int(rng.integers(2))
     while now < t[-1]:
@@ -271,7 +271,7 @@ def sidestepping(rng: np.random.Generator, t: Array) -> Puppet:
 def idling(rng: np.random.Generator, t: Array) -> Puppet:
     """Stand, shift the weight, look around, and now and then turn on the spot."""
     style = Style.draw(rng)
-    work = Footwork(Stance(style.origin, style.heading, style.width, style.splay))
+    work = Footwork(FootPlacement(style.origin, style.heading, style.width, style.splay))
     for start, _ in occasions(rng, t, (1.6, 2.0), (2.0, 6.0)):
         turn = rng.uniform(-0.9, 0.9)
         first = int(turn < 0)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from memmlp.motion.synthetic.curves import Array, ease, pulse, smooth, wander
+from memmlp.motion.synthetic.footwork import FootPlacement, Style, direction, move_hand, occasions, stand
 from memmlp.motion.synthetic.puppet import Puppet
-from memmlp.motion.synthetic.stance import Stance, Style, direction, move_hand, occasions, stand
 from memmlp.motion.synthetic.steps import Feet, FootStep, tread
 
 GRAVITY = 9.81
@@ -136,7 +136,7 @@ def _course(rng: np.random.Generator, t: Array, gait: Gait, style: Style) -> Cou
 
 def _feet(t: Array, gait: Gait, style: Style, course: Course) -> Feet:
     """Make the steps: the left foot comes down at every whole phase, the right one half a cycle later."""
-    start = Stance(style.origin, float(course.heading[0]), style.width, style.splay)
+    start = FootPlacement(style.origin, float(course.heading[0]), style.width, style.splay)
     steps = []
     for side in (0, 1):
         first = np.ceil(course.phase[0] + 1 - gait.duty - side / 2) + side / 2
@@ -154,7 +154,7 @@ def _step(t: Array, gait: Gait, style: Style, course: Course, side: int, strike:
     pace = np.interp(0.5 * (off + on), t, course.pace) / gait.speed[1]
     effort = (0.2 + 0.8 * min(1.0, 1.4 * pace)) * style.uneven[side]
     width = style.width * (1 + (gait.width - 1) * course.go[frame])
-    stance = Stance(course.path[frame], float(course.heading[frame]), width, 0.7 * style.splay)
+    stance = FootPlacement(course.path[frame], float(course.heading[frame]), width, 0.7 * style.splay)
     cycle = (on - off) / (1 - gait.duty)
     return FootStep(
         side, off, on, stance.places[side], stance.yaws[side],

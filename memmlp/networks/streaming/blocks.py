@@ -8,10 +8,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from memmlp.networks.cells import gru_step
 from memmlp.networks.layers import MLPBlock, PlainFusion, ResidualFusion
 from memmlp.networks.memory import MemoryBlock
 from memmlp.networks.predictor import Branch
+from memmlp.networks.recurrent_cells import gru_step
 
 Selection = Callable[[Tensor], Tensor]
 

@@ -54,7 +54,7 @@ class Watch:
                 self.condition.wait_for(lambda: self.closed, pause)
 
     def close(self) -> None:
-        """End the loop, and all who wait."""
+        """End the loop, and wake everybody who waits."""
         with self.condition:
             self.closed = True
             self.condition.notify_all()

@@ -23,7 +23,7 @@ from memmlp.sweep.kept_sweep import kept
 from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
 from memmlp.sweep.spec import Arm, Sweep
-from memmlp.tables.build_table import collect, finished_runs
+from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import Measured, load
 from memmlp.tables.rounds import Rounds, standings, subject
@@ -211,7 +211,7 @@ class Sweeps:
                 flags.append(str(error))
                 return None
 
-        made = collect(sweep, finished_runs(sweep, find), rounds=rounds)
+        made = make_table(sweep, finished_runs(sweep, find), rounds=rounds)
         table = table_words(replace(made, flags=(*made.flags, *flags)))
         return Made(table, rounds_words(rounds, sweep) if rounds else None)
 

@@ -7,8 +7,8 @@ import logging
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from memmlp.common.collecting import collect_seldom
 from memmlp.common.errors import InputError
+from memmlp.common.garbage_collection import collect_seldom
 from memmlp.sweep.executors.executor import Work
 
 if TYPE_CHECKING:

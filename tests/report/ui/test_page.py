@@ -21,7 +21,7 @@ from memmlp.report.ui.server import Server
 from memmlp.runs.run import Run
 from memmlp.sweep.kept_sweep import kept
 from memmlp.sweep.plan import Plan
-from memmlp.tables.build_table import collect, finished_runs
+from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.measured_run import load
 from memmlp.tables.rounds import begin
 from memmlp.tables.runs_of_plan import finder
@@ -259,7 +259,7 @@ def test_a_file_without_a_server(browser: Browser, home: Path, tmp_path: Path):
     folder = home / "sweeps" / "mine"
     sweep, plan = kept(folder), Plan.load(folder / "plan.json")
     assert sweep is not None
-    table = collect(sweep, finished_runs(sweep, finder(plan, load)))
+    table = make_table(sweep, finished_runs(sweep, finder(plan, load)))
     text = page_text(Answers(home, predict, kept=False), [ReportedSweep("mine", table)], "<h1>Extra</h1>")
     assert EVIL not in text
     file = tmp_path / "report.html"

@@ -17,7 +17,7 @@ from memmlp.runs.run import Run
 from memmlp.sweep.kept_sweep import keep, kept
 from memmlp.sweep.plan import Plan, RunTask
 from memmlp.sweep.spec import Scale
-from memmlp.tables.build_table import collect, finished_runs
+from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import load
 from memmlp.tables.rounds import Rounds, begin
@@ -34,7 +34,7 @@ def test_the_table_is_that_of_the_command(outputs: Path):
     folder = outputs / "sweeps" / "mine"
     sweep, plan = kept(folder), Plan.load(folder / "plan.json")
     assert sweep is not None
-    table = json.loads(as_json(collect(sweep, finished_runs(sweep, finder(plan, load)))))
+    table = json.loads(as_json(make_table(sweep, finished_runs(sweep, finder(plan, load)))))
     shown = sweeps_of(outputs).page("mine")["table"]
     assert shown["rows"] == table["rows"]
     (row,) = [row for row in shown["rows"] if row["label"] == "gru"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from fake_runs import fake_sweep, runs_of
 
-from memmlp.config.kept_elsewhere import with_kept
+from memmlp.config.shared_results import with_kept
 from memmlp.report.kept_results import Kept, overrides_of, save
 from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.plan import Entry, Plan
@@ -40,7 +40,7 @@ def plan_today(monkeypatch: pytest.MonkeyPatch, runs: dict[str, Runs], **changed
         for entry in entries
     ]
     monkeypatch.setattr(
-        "memmlp.config.kept_elsewhere.make_plan",
+        "memmlp.config.shared_results.make_plan",
         lambda sweep, outputs: Plan(sweep.name, outputs, tuple(planned), ()),
     )
 
@@ -94,6 +94,6 @@ def test_a_file_without_such_runs_is_not_planned(
     def refused(*given: object) -> Plan:
         raise AssertionError("planned")
 
-    monkeypatch.setattr("memmlp.config.kept_elsewhere.make_plan", refused)
+    monkeypatch.setattr("memmlp.config.shared_results.make_plan", refused)
     plan = Plan("mine", Path(), (Entry("Mine", 0, "0" * 16, ("e1",)),), ())
     assert with_kept({"Mine": {}}, plan, [file]) == ({"Mine": {}}, ())

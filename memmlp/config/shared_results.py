@@ -23,7 +23,7 @@ def with_kept(
 ) -> tuple[Mapping[str, Runs], tuple[str, ...]]:
     """Return a sweep's runs with those added that are kept in files of other sweeps' results.
 
-    A kept run stands for a cell only if its file's sweep, planned today, has the same run with the same
+    A kept run stands for an entry only if its file's sweep, planned today, has the same run with the same
     evaluations and deployment there: their identities hold all that its numbers follow from.
 
     Args:
@@ -59,7 +59,7 @@ def _by_key(kept: Kept, outputs: Path) -> dict[str, Measured]:
     """Return the kept runs that their sweep has today, by the keys of the plan's entries."""
     seeds = sorted({seed for runs in kept.runs.values() for seed in runs})
     sweep = find_sweep(kept.sweep, [*kept.overrides, f"seed={','.join(map(str, seeds))}"])
-    cells = [
+    kept_runs = [
         (entry, kept.runs.get(entry.label, {}).get(entry.seed)) for entry in make_plan(sweep, outputs).entries
     ]
-    return {entry.key: run for entry, run in cells if run is not None and run.id == entry.id}
+    return {entry.key: run for entry, run in kept_runs if run is not None and run.id == entry.id}

@@ -67,7 +67,7 @@ def direction(yaw: float | Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Stance:
+class FootPlacement:
     """Both feet on the floor about a centre (2,): the left one to the left, and ahead by `stagger`."""
 
     center: Array
@@ -92,7 +92,7 @@ class Stance:
 class Footwork:
     """Changes of stance, one after the other, collected as steps."""
 
-    start: Stance
+    start: FootPlacement
     steps: list[FootStep] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -133,7 +133,7 @@ class Footwork:
 def stand(rng: np.random.Generator, t: Array, style: Style, work: Footwork | None = None) -> Puppet:
     """Stand with hanging arms, sway a little, follow the feet; the pelvis goes over the carrying foot."""
     fps = 1.0 / (t[1] - t[0])
-    work = work or Footwork(Stance(style.origin, style.heading, style.width, style.splay))
+    work = work or Footwork(FootPlacement(style.origin, style.heading, style.width, style.splay))
     feet = work.feet(t)
     frames = round(FOLLOW * fps)
     heading = smooth(feet.yaw.mean(1), frames) + 0.02 * wander(rng, t)

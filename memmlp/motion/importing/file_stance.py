@@ -17,7 +17,7 @@ from memmlp.motion.importing.skeleton import SkeletonMap
 
 
 @dataclass(frozen=True)
-class Stance:
+class FileStance:
     """A person who stands and faces +Z, Y up, left on +X, in metres; the root's place is that of the file.
 
     Attributes:
@@ -36,7 +36,7 @@ class Stance:
     source: str
 
 
-def find_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -> Stance:
+def find_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -> FileStance:
     """Return the stance that `import` reads a file's skeleton from.
 
     Args:
@@ -53,7 +53,7 @@ def find_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -
     turned = pose.rotations @ fit(recording, settled, performance, rest).corrections
     mapped = {joint: int(performance.nodes[JOINTS.index(joint)]) for joint in skeleton.joints}
     positions = _all_nodes(recording, settled, performance, pose)
-    return Stance(
+    return FileStance(
         recording.nodes, recording.node_parents, positions, mapped, _posed(turned, rest), pose.source
     )
 

@@ -11,13 +11,13 @@ from skeleton_families import walking
 
 from memmlp.motion.body import JOINTS, builtin_rest_joints
 from memmlp.motion.formats.bvh import read_bvh
+from memmlp.motion.importing.file_stance import FileStance, find_stance
 from memmlp.motion.importing.skeleton import find_skeleton
-from memmlp.motion.importing.stance_of_file import Stance, find_stance
 
 REST = builtin_rest_joints()
 
 
-def stance(folder: Path, name: str, turned: bool) -> Stance:
+def stance(folder: Path, name: str, turned: bool) -> FileStance:
     bvh = read_bvh(write(folder, walking(name, turned).text()))
     return find_stance(bvh, find_skeleton(bvh), REST)
 

@@ -10,7 +10,7 @@ import yaml
 
 from memmlp.common.errors import InputError
 from memmlp.config.compose import composed
-from memmlp.config.count_training import flops_of, predicted_flops, with_flops
+from memmlp.config.count_flops import flops_of, predicted_flops, with_flops
 from memmlp.runs.lookup import list_runs
 from memmlp.sweep.parsing import parse_sweep
 from memmlp.tables.measured_run import load
