@@ -50,10 +50,10 @@ def test_gpus_of_workers(found, monkeypatch, visible, options, wanted, shares, n
         (["auto"], ("0",), "local", "a worker is to have a GPU; torch .* finds none"),
     ],
 )
-def test_runs_that_could_not_have_their_gpu_are_refused(monkeypatch, wanted, gpus, engine, line):
+def test_runs_that_could_not_have_their_gpu_are_refused(monkeypatch, wanted, gpus, executor, line):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(InputError, match=line):
-        check_devices(wanted, gpus, engine)
+        check_devices(wanted, gpus, executor)
 
 
 def test_a_cluster_has_the_gpus_that_this_machine_lacks():
@@ -69,9 +69,9 @@ def test_options_of_local_workers_are_refused_elsewhere(option: str):
 @pytest.mark.parametrize("name", ["ray", "dask"])
 def test_words_of_an_executor_are_its_own(name: str):
     words = (f"executor={name}", f"{name}.address=head:1", f"{name}.resources.big=2", "seed=1")
-    engine, own, rest = split_executor(words)
-    assert (engine, rest) == (name, ("seed=1",))
-    assert Workers(engine, own).settings().address == "head:1"
+    executor, own, rest = split_executor(words)
+    assert (executor, rest) == (name, ("seed=1",))
+    assert Workers(executor, own).settings().address == "head:1"
     with pytest.raises(InputError, match=f"{name}.address: goes with executor={name}"):
         split_executor(words[1:])
 
@@ -92,11 +92,11 @@ class Shelf:
     ],
 )  # fmt: skip
 def test_workers_know_whether_they_are_to_have_a_gpu(
-    found, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine, gives, wanted, gpu
+    found, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, executor, gives, wanted, gpu
 ):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0" if gives else "")
     monkeypatch.setattr(workers_module, "executor", lambda *_, **__: Shelf(gives))
-    path, fleet = hire(tmp_path, Plan("s", tmp_path, (), ()), Workers(engine, count=1), wanted)
+    path, fleet = hire(tmp_path, Plan("s", tmp_path, (), ()), Workers(executor, count=1), wanted)
     assert fleet.work.args[-1] is gpu
     monkeypatch.setattr(devices, "missing_gpu", lambda: "none is there")
     monkeypatch.setattr(perform_task, "work_off", lambda *_: None)
