@@ -11,7 +11,7 @@ from fake_runs import CLIPS, fake_sweep, runs_of
 
 from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.spec import Sweep
-from memmlp.tables.effects import Runs
+from memmlp.tables.effects import RunsBySeed
 
 STEPS = (500, 1000, 2000, 4000, 8000)
 GROUPS = {clip: f"take {number // 2}" for number, clip in enumerate(CLIPS)}
@@ -38,7 +38,9 @@ def steps_of(cell: tuple[str, ...]) -> int:
     return int(dict(word.split("=") for word in cell)["optim.steps"])
 
 
-def cells(folder: Path, factor: Callable[[int], float], **changes: Any) -> tuple[Sweep, dict[str, Runs]]:
+def cells(
+    folder: Path, factor: Callable[[int], float], **changes: Any
+) -> tuple[Sweep, dict[str, RunsBySeed]]:
     """A sweep and its runs; without the memory errors are `factor(steps)` times as large."""
     sweep = parse_sweep("cells", content(**changes))
     effects = {arm.label: factor(steps_of(arm.cell)) for arm in sweep.arms if arm.series == "none"}
@@ -46,7 +48,7 @@ def cells(folder: Path, factor: Callable[[int], float], **changes: Any) -> tuple
     return sweep, {arm.label: trained(runs[arm.label], steps_of(arm.cell)) for arm in sweep.arms}
 
 
-def trained(runs: Runs, steps: int) -> Mapping[int, Any]:
+def trained(runs: RunsBySeed, steps: int) -> Mapping[int, Any]:
     """The runs with the FLOPs of so many steps."""
     return {
         seed: replace(run, training={**run.training, "flops": STEP * steps}) for seed, run in runs.items()

@@ -13,7 +13,7 @@ import numpy as np
 from memmlp.runs.run import Run
 from memmlp.sweep.spec import MODES, Arm, Sweep
 from memmlp.tables.build_table import finished_runs, make_table
-from memmlp.tables.effects import Runs
+from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.measured_run import Measured, load
 from memmlp.tables.table import Table
 
@@ -102,7 +102,7 @@ def fake_sweep(
     return find
 
 
-def runs_of(sweep: Sweep, find: Find, read: Callable[[Path], Measured] = load) -> dict[str, Runs]:
+def runs_of(sweep: Sweep, find: Find, read: Callable[[Path], Measured] = load) -> dict[str, RunsBySeed]:
     """The finished ones of the runs that are found."""
 
     def measured(arm: Arm, seed: int) -> Measured | None:

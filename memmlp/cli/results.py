@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from memmlp.report.kept_results import Kept
     from memmlp.report.markdown import KeptTable
     from memmlp.sweep.spec import Sweep
-    from memmlp.tables.effects import Runs
+    from memmlp.tables.effects import RunsBySeed
     from memmlp.tables.scaling import Trends
     from memmlp.tables.table import Table
 
@@ -80,7 +80,7 @@ def save_command(
 
     sweep = find_sweep(name, overrides)
     known = sweep_to_show(sweep, overrides, outputs.absolute())
-    found: Mapping[str, Runs] = finished_runs(known.sweep, finder(known.plan, functools.cache(load)))
+    found: Mapping[str, RunsBySeed] = finished_runs(known.sweep, finder(known.plan, functools.cache(load)))
     path = out / f"{stem or sweep.name}.json"
     origins: tuple[str, ...] = ()
     if also_kept:

@@ -14,7 +14,7 @@ from memmlp.common.errors import InputError
 if TYPE_CHECKING:
     from memmlp.sweep.plan import Plan
     from memmlp.sweep.spec import Sweep
-    from memmlp.tables.effects import Runs
+    from memmlp.tables.effects import RunsBySeed
     from memmlp.tables.rounds import Look, Rounds
 
 
@@ -116,7 +116,7 @@ def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
         kept = read(path)
         if kept is not None and len(kept.taken) > len(rounds.taken):
             return kept
-        runs: dict[str, Runs] = finished_runs(rounds.spent(sweep), finder(plan, load))
+        runs: dict[str, RunsBySeed] = finished_runs(rounds.spent(sweep), finder(plan, load))
         after = advanced(rounds, sweep, runs, names(rounds, sweep, plan))
         write_json(path, as_json(after))
     return after
@@ -228,7 +228,7 @@ def told(rounds: Rounds, sweep: Sweep, last: Look | None = None) -> list[str]:
     return [f"{head}{decided} of {len(rounds.family(sweep))} comparisons decided", *_lined(rows)]
 
 
-def closing(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs]) -> list[str]:
+def closing(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> list[str]:
     """Say why the rounds ended, what more seeds could do, and how many runs were spent."""
     latest = [finding for finding, _ in rounds.latest().values()]
     still = [finding for finding in latest if finding.verdict == "open"]
@@ -244,7 +244,7 @@ def closing(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs]) -> list[str]
     return [*lines, *_outlooks(rounds, sweep, runs), _spent(rounds, sweep)]
 
 
-def _outlooks(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs]) -> list[str]:
+def _outlooks(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> list[str]:
     """Return a line for each arm that has open comparisons and no next look."""
     from memmlp.tables.rounds import outlook
 

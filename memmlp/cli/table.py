@@ -19,7 +19,7 @@ from memmlp.sweep.spec import BRANCHES
 if TYPE_CHECKING:
     from memmlp.cli.rounds import SweepToShow
     from memmlp.sweep.spec import Sweep
-    from memmlp.tables.effects import Runs
+    from memmlp.tables.effects import RunsBySeed
     from memmlp.tables.runs_of_plan import Read
     from memmlp.tables.seeds_needed import Need
     from memmlp.tables.table import Table
@@ -133,7 +133,7 @@ class SweepTable(NamedTuple):
     """A sweep, the finished runs of its arms by seed, and its table."""
 
     sweep: Sweep
-    runs: dict[str, Runs]
+    runs: dict[str, RunsBySeed]
     table: Table
 
 

@@ -15,7 +15,7 @@ from memmlp.config.compose import composed
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.normalizer import Normalizer
 from memmlp.sweep.spec import Sweep
-from memmlp.tables.effects import Runs
+from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.measured_run import Measured
 from memmlp.training.network import NetworkTraining
 from memmlp.training.training_flops import training_flops
@@ -41,7 +41,7 @@ def flops_of(cfg: DictConfig) -> int:
         return training_flops(model, training.loss(model.branches), training.optim)
 
 
-def with_flops(runs: Mapping[str, Runs]) -> dict[str, Runs]:
+def with_flops(runs: Mapping[str, RunsBySeed]) -> dict[str, RunsBySeed]:
     """Return finished runs with the FLOPs of their trainings, each counted from its own config."""
     known: dict[str, int] = {}
 

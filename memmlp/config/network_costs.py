@@ -13,11 +13,11 @@ from memmlp.config.compose import composed
 from memmlp.deploy.deployment import GRAPHS, Deployment
 from memmlp.runs.environment import environment
 from memmlp.sweep.spec import COSTS, SIZES, Sweep
-from memmlp.tables.effects import Runs
+from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.measured_run import Measured, of_untrained
 
 
-def with_costs(sweep: Sweep, runs: Mapping[str, Runs]) -> tuple[dict[str, Runs], tuple[str, ...]]:
+def with_costs(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> tuple[dict[str, RunsBySeed], tuple[str, ...]]:
     """Measure untrained networks for a sweep's arms that have no finished run.
 
     Times are measured where the sweep's table shows some.

@@ -1,4 +1,4 @@
-"""Runs that one sweep's kept results share with another sweep.
+"""RunsBySeed that one sweep's kept results share with another sweep.
 
 It lies in config because planning a sweep composes its configs.
 """
@@ -14,13 +14,13 @@ from memmlp.config.plan_sweep import find_sweep, make_plan
 if TYPE_CHECKING:
     from memmlp.report.kept_results import Kept
     from memmlp.sweep.plan import Plan
-    from memmlp.tables.effects import Runs
+    from memmlp.tables.effects import RunsBySeed
     from memmlp.tables.measured_run import Measured
 
 
 def with_kept(
-    found: Mapping[str, Runs], plan: Plan, files: Iterable[Path]
-) -> tuple[Mapping[str, Runs], tuple[str, ...]]:
+    found: Mapping[str, RunsBySeed], plan: Plan, files: Iterable[Path]
+) -> tuple[Mapping[str, RunsBySeed], tuple[str, ...]]:
     """Return a sweep's runs with those added that are kept in files of other sweeps' results.
 
     A kept run stands for an entry only if its file's sweep, planned today, has the same run with the same

@@ -31,7 +31,7 @@ FARTHEST = 1e6  # metres; a tracker farther from the origin is taken as lost
 LATEST = 1e10  # seconds; at much later times floats can't tell frames of 1/60 s apart
 UNIT = 1e-2  # how far a quaternion's norm may be from 1, or a matrix from orthonormal
 
-Tracker = tuple[ArrayLike, ArrayLike] | None
+TrackerPose = tuple[ArrayLike, ArrayLike] | None
 RotationFormat = Literal["matrix", "quaternion"]
 
 
@@ -156,7 +156,9 @@ class Stream:
         self._trackers.reset()
         self._restart()
 
-    def step(self, head: Tracker, left: Tracker, right: Tracker, time: float | None = None) -> Pose:
+    def step(
+        self, head: TrackerPose, left: TrackerPose, right: TrackerPose, time: float | None = None
+    ) -> Pose:
         """Take in one sample of the trackers.
 
         Args:
@@ -197,7 +199,7 @@ class Stream:
         self._last = self._pose(frames[-1].time, frames[-1].positions[0], _names(lost), restarted)
         return self._last
 
-    def calibrate(self, head: Tracker, left: Tracker, right: Tracker) -> Offsets:
+    def calibrate(self, head: TrackerPose, left: TrackerPose, right: TrackerPose) -> Offsets:
         """Learn the offsets from a person who stands upright in T-pose, and use them from now on.
 
         The line from the right to the left tracker tells which way the person looks, and so every joint's
@@ -282,7 +284,7 @@ class Solver:
         return self.ik.solve(self.normalizer, motion, torch.from_numpy(sparse[None])).numpy().reshape(-1, 6)
 
 
-def read_trackers(trackers: Sequence[Tracker]) -> tuple[np.ndarray, np.ndarray, Lost]:
+def read_trackers(trackers: Sequence[TrackerPose]) -> tuple[np.ndarray, np.ndarray, Lost]:
     """Return positions (3, 3), rotations (3, 3, 3) and who is lost, of trackers as users give them.
 
     A lost tracker has the identity in place of its pose. Raises InputError where a tracker is malformed.

@@ -16,7 +16,7 @@ from memmlp.runs.identity import trained_by
 from memmlp.runs.metrics_log import Metrics
 from memmlp.sweep.spec import COSTS, Sweep
 from memmlp.tables.distributions import Distribution, distributions
-from memmlp.tables.effects import Runs
+from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.formats import as_html
 from memmlp.tables.measured_run import Measured
 from memmlp.tables.table import Table
@@ -32,7 +32,7 @@ class Chapter:
 
     sweep: Sweep
     table: Table
-    runs: Mapping[str, Runs]
+    runs: Mapping[str, RunsBySeed]
 
     @property
     def title(self) -> str:
@@ -94,7 +94,7 @@ def _sections(
         ("accuracy", "Accuracy and latency", _accuracy(chapters, published)),
         ("training", "Training curves", _training(chapters)),
         ("latency", "Latency", [_latency(entries)]),
-        ("runs", "Runs", [_runs(entries)]),
+        ("runs", "RunsBySeed", [_runs(entries)]),
     ]
 
 

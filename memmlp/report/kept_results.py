@@ -21,7 +21,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, plain
 from memmlp.sweep.spec import Sweep
-from memmlp.tables.effects import Runs
+from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.measured_run import Errors, Measured, Origin, known_mean
 
 DIGITS = 6
@@ -45,7 +45,7 @@ class Kept:
 
     sweep: str
     overrides: tuple[str, ...]
-    runs: Mapping[str, Runs]
+    runs: Mapping[str, RunsBySeed]
     arms: Mapping[str, tuple[str, ...]]
     rounds: Mapping[str, Any] | None = None
     flags: tuple[str, ...] = ()
@@ -147,7 +147,7 @@ class Kept:
         """The names of the sources of the test clips; empty where there is one."""
         return tuple(sorted({source for run in self.every for source in run.sources.values()}))
 
-    def of(self, sweep: Sweep) -> dict[str, Runs]:
+    def of(self, sweep: Sweep) -> dict[str, RunsBySeed]:
         """Return the runs of the arms and seeds that the sweep has today.
 
         Raises:

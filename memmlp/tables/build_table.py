@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from memmlp.common.errors import InputError
 from memmlp.sweep.spec import COSTS, MODES, Arm, Sweep
-from memmlp.tables.effects import Runs, control_arm, effects, paper_effect, with_existing_branches
+from memmlp.tables.effects import RunsBySeed, control_arm, effects, paper_effect, with_existing_branches
 from memmlp.tables.flags import Say, flags, silent
 from memmlp.tables.measured_run import Measured
 from memmlp.tables.table import Cell, Effect, Key, Row, Table
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Find = Callable[[Arm, int], Measured | None]
 
 
-def finished_runs(sweep: Sweep, find: Find) -> dict[str, Runs]:
+def finished_runs(sweep: Sweep, find: Find) -> dict[str, RunsBySeed]:
     """Return the finished runs of each runnable arm, by seed."""
     return {
         arm.label: {seed: run for seed in sweep.seeds_of(arm) if (run := find(arm, seed)) is not None}
@@ -29,7 +29,7 @@ def finished_runs(sweep: Sweep, find: Find) -> dict[str, Runs]:
 
 def make_table(
     sweep: Sweep,
-    runs: Mapping[str, Runs],
+    runs: Mapping[str, RunsBySeed],
     modes: Sequence[str] = MODES,
     command: str | None = None,
     state: Say = silent,
@@ -73,7 +73,7 @@ def make_table(
     )
 
 
-def _shown(modes: Sequence[str], runs: Mapping[str, Runs]) -> tuple[str, ...]:
+def _shown(modes: Sequence[str], runs: Mapping[str, RunsBySeed]) -> tuple[str, ...]:
     """Return those of the modes in which runs were evaluated; all where there are none."""
     measured = {mode for found in runs.values() for run in found.values() for mode in run.means}
     return tuple(mode for mode in modes if mode in measured) or tuple(modes)
@@ -89,11 +89,11 @@ class OnSource(NamedTuple):
     """
 
     sweep: Sweep
-    runs: dict[str, Runs]
+    runs: dict[str, RunsBySeed]
     flags: tuple[str, ...]
 
 
-def on_source(sweep: Sweep, runs: Mapping[str, Runs], source: str) -> OnSource:
+def on_source(sweep: Sweep, runs: Mapping[str, RunsBySeed], source: str) -> OnSource:
     """Restrict a sweep and its finished runs to one source's test clips.
 
     Where the control has none of them, the first arm that has some stands in its place.
@@ -101,7 +101,7 @@ def on_source(sweep: Sweep, runs: Mapping[str, Runs], source: str) -> OnSource:
     Raises:
         InputError: if no run has a test clip of the source.
     """
-    own: dict[str, Runs] = {
+    own: dict[str, RunsBySeed] = {
         label: {seed: parts[source] for seed, run in seeds.items() if source in (parts := run.by_source())}
         for label, seeds in runs.items()
     }
@@ -133,7 +133,9 @@ def without_runs(sweep: Sweep, modes: Sequence[str], reason: str) -> Table:
     return replace(make_table(sweep, {arm.label: {} for arm in sweep.runnable()}, modes), flags=(reason,))
 
 
-def _row(sweep: Sweep, arm: Arm, runs: Runs | None, modes: Sequence[str], found: Mapping[Key, Effect]) -> Row:
+def _row(
+    sweep: Sweep, arm: Arm, runs: RunsBySeed | None, modes: Sequence[str], found: Mapping[Key, Effect]
+) -> Row:
     """Return an arm's row; `runs` is None for a row that is the paper's alone."""
 
     def cell(mode: str, metric: str) -> Cell:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from memmlp.sweep.spec import COSTS, Arm, Sweep
-from memmlp.tables.effects import Runs, control_arm, with_existing_branches
+from memmlp.tables.effects import RunsBySeed, control_arm, with_existing_branches
 from memmlp.tables.statistics import interquartile_mean, probability_of_improvement
 
 
@@ -29,7 +29,7 @@ class Distribution(NamedTuple):
     improvement: float | None
 
 
-def distributions(sweep: Sweep, runs: Mapping[str, Runs], mode: str) -> dict[str, list[Distribution]]:
+def distributions(sweep: Sweep, runs: Mapping[str, RunsBySeed], mode: str) -> dict[str, list[Distribution]]:
     """Return the distributions of every arm, by metric, over the clips that all runs have.
 
     Metrics that no run has are left out.
@@ -43,14 +43,14 @@ def distributions(sweep: Sweep, runs: Mapping[str, Runs], mode: str) -> dict[str
 
 
 def _of_metric(
-    sweep: Sweep, runs: Mapping[str, Runs], clips: list[str], mode: str, metric: str
+    sweep: Sweep, runs: Mapping[str, RunsBySeed], clips: list[str], mode: str, metric: str
 ) -> list[Distribution]:
     arms = [arm for arm in sweep.runnable() if runs[arm.label]]
     errors = {arm.label: _errors(runs[arm.label], clips, mode, arm, metric) for arm in arms}
     return [_distribution(arm.label, errors, control_arm(sweep, arm)) for arm in arms]
 
 
-def _errors(runs: Runs, clips: list[str], mode: str, arm: Arm, metric: str) -> np.ndarray:
+def _errors(runs: RunsBySeed, clips: list[str], mode: str, arm: Arm, metric: str) -> np.ndarray:
     """Return errors (S, C), with NaN for a clip of which a run has none."""
     return np.array([run.by_clip(clips, mode, arm.branch, metric) for run in runs.values()])
 

@@ -17,7 +17,7 @@ from memmlp.tables.measured_run import Measured
 from memmlp.tables.statistics import detectable, equivalence_p, holm, paired_effects, verdict
 from memmlp.tables.table import Effect, Key
 
-Runs = Mapping[int, Measured]  # an arm's finished runs by seed
+RunsBySeed = Mapping[int, Measured]  # an arm's finished runs by seed
 
 
 class Shared(NamedTuple):
@@ -67,7 +67,7 @@ def paper_effect(sweep: Sweep, arm: Arm, metric: str) -> float | None:
 
 
 def paired(
-    sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str], labels: Container[str] | None = None
+    sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str], labels: Container[str] | None = None
 ) -> dict[Key, Paired]:
     """Return the differences of all arms, or of those with these labels, in all known error metrics."""
     found = {}
@@ -85,7 +85,7 @@ def paired(
     return {key: pair for key, pair in found.items() if pair.matrix.size}
 
 
-def effects(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dict[Key, Effect]:
+def effects(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
     """Return the effects of all arms, with p-values corrected over all of them.
 
     Of costs it has the bare differences, without p-values.
@@ -99,7 +99,7 @@ def effects(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dic
     )
 
 
-def one_and_the_same(arm: Arm, other: Arm, ours: Runs, theirs: Runs) -> bool:
+def one_and_the_same(arm: Arm, other: Arm, ours: RunsBySeed, theirs: RunsBySeed) -> bool:
     """Return whether two arms show the same errors of the same run, so that there is nothing to compare.
 
     One run may have several, such as those after inverse kinematics of two kinds.
@@ -121,8 +121,8 @@ def _compared(sweep: Sweep) -> Iterator[tuple[Arm, Arm]]:
 
 
 def _paired(
-    ours: Runs,
-    theirs: Runs,
+    ours: RunsBySeed,
+    theirs: RunsBySeed,
     shared: Shared,
     branches: tuple[str, str],
     mode: str,
@@ -140,7 +140,7 @@ def _paired(
     return Paired(matrix[:, known], groups[known], *map(tuple, zip(*left, strict=True)))
 
 
-def _shared(ours: Runs, theirs: Runs) -> Shared:
+def _shared(ours: RunsBySeed, theirs: RunsBySeed) -> Shared:
     """Return what an arm and its control share."""
     seeds = [seed for seed in ours if seed in theirs]
     known = [runs[seed].clips for runs in (ours, theirs) for seed in seeds]
@@ -196,7 +196,7 @@ def _judged(
     return judged
 
 
-def _costs(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dict[Key, Effect]:
+def _costs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str]) -> dict[Key, Effect]:
     """Return the differences of mean costs. They have no interval, for they are exact or this machine's."""
     found = {}
     for arm, other in _compared(sweep):
@@ -207,7 +207,7 @@ def _costs(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str]) -> dict
     return found
 
 
-def _mean_cost(runs: Runs, metric: str) -> float:
+def _mean_cost(runs: RunsBySeed, metric: str) -> float:
     costs = [run.costs[metric] for run in runs.values() if metric in run.costs]
     return statistics.mean(costs) if costs else math.nan  # equal costs have themselves as their mean
 
@@ -222,7 +222,7 @@ def or_nan(number: float | None) -> float:
     return math.nan if number is None else number
 
 
-def with_existing_branches(sweep: Sweep, runs: Mapping[str, Runs]) -> Sweep:
+def with_existing_branches(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Sweep:
     """Return the sweep with the rotation branch for arms whose networks have no other.
 
     A network without a position branch may still have been evaluated after inverse kinematics.

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 
 from memmlp.sweep.spec import COSTS, Arm, Sweep
-from memmlp.tables.effects import Runs, control_arm, one_and_the_same
+from memmlp.tables.effects import RunsBySeed, control_arm, one_and_the_same
 from memmlp.tables.measured_run import Measured
 
 Say = Callable[[Arm, int], str | None]
@@ -30,7 +30,7 @@ def silent(arm: Arm, seed: int) -> None:
 
 
 def flags(
-    sweep: Sweep, asked: Sweep, runs: Mapping[str, Runs], command: str, state: Say, older: Say
+    sweep: Sweep, asked: Sweep, runs: Mapping[str, RunsBySeed], command: str, state: Say, older: Say
 ) -> Iterable[str]:
     """Yield the flags of a table.
 
@@ -81,7 +81,7 @@ def _other_data(sweep: Sweep) -> Iterable[str]:
         yield f"a table of {own}, shown with {chosen}: its errors do not compare with the paper's"
 
 
-def _missing(sweep: Sweep, runs: Mapping[str, Runs], command: str, state: Say) -> Iterable[str]:
+def _missing(sweep: Sweep, runs: Mapping[str, RunsBySeed], command: str, state: Say) -> Iterable[str]:
     """Flag the runs that are missing, how far they are, and the command that makes them."""
     gaps = []
     for arm in sweep.runnable():
@@ -94,7 +94,7 @@ def _missing(sweep: Sweep, runs: Mapping[str, Runs], command: str, state: Say) -
         yield f"missing: {_listed(gaps)}; fill with: {command}"
 
 
-def _older(sweep: Sweep, runs: Mapping[str, Runs], older: Say) -> Iterable[str]:
+def _older(sweep: Sweep, runs: Mapping[str, RunsBySeed], older: Say) -> Iterable[str]:
     """Flag missing runs for which there is a run of an earlier recipe."""
     found = [
         f"'{arm.label}' seed {seed} ({run})"
@@ -106,11 +106,11 @@ def _older(sweep: Sweep, runs: Mapping[str, Runs], older: Say) -> Iterable[str]:
         yield f"made by an earlier recipe, left out and made again by the sweep: {_listed(found)}"
 
 
-def _gaps(sweep: Sweep, arm: Arm, runs: Mapping[str, Runs]) -> list[int]:
+def _gaps(sweep: Sweep, arm: Arm, runs: Mapping[str, RunsBySeed]) -> list[int]:
     return [seed for seed in sweep.seeds_of(arm) if seed not in runs[arm.label]]
 
 
-def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, Runs], command: str) -> Iterable[str]:
+def _branches(sweep: Sweep, asked: Sweep, runs: Mapping[str, RunsBySeed], command: str) -> Iterable[str]:
     """Flag rows that show another branch than the table's, and rows not evaluated in the one they show."""
     wanted = {arm.label: arm.branch for arm in asked.arms}
     fallen = [arm for arm in sweep.runnable() if arm.branch != wanted[arm.label]]
@@ -130,7 +130,7 @@ def _offline(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
         yield f"offline, no stream, for frames are made with later ones: {_quoted(found)}"
 
 
-def _unequal_clips(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+def _unequal_clips(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     """Flag arms that don't have the same test clips as their controls."""
     for arm in sweep.runnable():
         other = control_arm(sweep, arm)
@@ -157,7 +157,7 @@ def _unequal_groups(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
         yield f"runs differ in the groups of test clips (data.split.groups): {_quoted(several)}"
 
 
-def _no_numbers(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+def _no_numbers(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     """Flag runs that have no number for clips for which others have one, because their network diverged.
 
     A clip for which no run has a number is too short for the metric.
@@ -186,7 +186,7 @@ def _lacking(run: Measured, mode: str, branch: str, metric: str) -> set[str]:
     return {name for name, there in zip(names, known, strict=True) if not there}
 
 
-def _calmer_than_truth(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+def _calmer_than_truth(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     """Flag arms whose motion is calmer than the true one, as it is where a network hardly follows at all."""
     calmer: dict[str, list[str]] = defaultdict(list)
     truths: dict[str, float] = {}
@@ -218,7 +218,7 @@ def _differing(what: str, found: Iterable[tuple[str, str]]) -> Iterable[str]:
         yield f"{what} differs: {'; '.join(parts)}"
 
 
-def _seen(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+def _seen(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     """Flag arms that saw more or fewer frames in training than their controls, whatever the reason."""
     every = [(label, run.training.get("frames")) for label, found in runs.items() for run in found.values()]
     frames = {label: number for label, number in every if number}
@@ -233,7 +233,7 @@ def _seen(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
         yield f"number of frames seen in training differs: {_listed(unequal)}"
 
 
-def _busy(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+def _busy(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     """Flag arms that were timed beside other work, which shows in their times."""
     found = []
     for arm in sweep.runnable():
@@ -270,7 +270,7 @@ def _own_code(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
         yield from _differing(f"code of {name}", having)
 
 
-def _replicates(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+def _replicates(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     """Flag what the intervals don't speak of: seeds, groups of clips or VQ-VAEs, if there is only one."""
     measured = {label: list(found.values()) for label, found in runs.items() if found}
     if len(measured) < 2:
@@ -289,7 +289,7 @@ def _replicates(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
         yield f"all seeds share one VQ-VAE, which they so do not replicate: {_quoted(shared)}"
 
 
-def _same(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+def _same(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     """Flag arms that are one run, because under these overrides nothing tells them apart."""
     for arm in sweep.runnable():
         other = control_arm(sweep, arm)
@@ -297,7 +297,7 @@ def _same(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
             yield f"'{arm.label}' and '{other.label}' are one run: what tells them apart has no effect here"
 
 
-def _single(sweep: Sweep, runs: Mapping[str, Runs]) -> Iterable[str]:
+def _single(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     """Flag comparisons that have one seed where others have more."""
     pairs = [(arm.label, other.label) for arm in sweep.runnable() if (other := control_arm(sweep, arm))]
     shared = {one: len(runs[one].keys() & runs[two].keys()) for one, two in pairs}

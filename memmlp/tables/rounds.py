@@ -19,7 +19,7 @@ import numpy as np
 
 from memmlp.sweep.spec import COSTS, MODES, Arm, Sweep
 from memmlp.tables.effects import (
-    Runs,
+    RunsBySeed,
     control_arm,
     or_nan,
     or_none,
@@ -191,7 +191,9 @@ def begin(sweep: Sweep, most: int = MOST) -> Rounds:
     return Rounds(subject(sweep), seeds, schedule, spending(len(schedule)))
 
 
-def advanced(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], named: Mapping[str, str]) -> Rounds:
+def advanced(
+    rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed], named: Mapping[str, str]
+) -> Rounds:
     """Return the rounds after the next look that can be taken; the same rounds where none can.
 
     A look at an arm can be taken when the arm and its control have all seeds of its next look. Where runs
@@ -214,7 +216,7 @@ def advanced(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], named: Mapp
     return replace(rounds, taken=(*rounds.taken, replace(look, found=tuple(found))))
 
 
-def outlook(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs]) -> dict[Key, int | None]:
+def outlook(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> dict[Key, int | None]:
     """Return how many seeds would decide each open comparison of arms that have no next look.
 
     The numbers are for 80 % power if the effect is as measured, at a single look, corrected over what nobody
@@ -301,7 +303,7 @@ def _keys(sweep: Sweep, arm: Arm) -> list[Key]:
     return [Key(arm.label, mode, metric) for mode, metric in itertools.product(MODES, metrics)]
 
 
-def _ready(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], label: str, number: int) -> bool:
+def _ready(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed], label: str, number: int) -> bool:
     """Return whether all runs that an arm's look needs are finished."""
     wanted = set(rounds.seeds[: rounds.looks[number]])
     return all(wanted <= set(runs[one]) for one in pair_of(sweep, label))
@@ -312,7 +314,7 @@ def pair_of(sweep: Sweep, label: str) -> tuple[str, str]:
     return next((arm.label, other.label) for arm, other in _compared(sweep) if arm.label == label)
 
 
-def _found(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], look: Look) -> list[Finding]:
+def _found(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed], look: Look) -> list[Finding]:
     """Return what a look finds of the comparisons of its arms that are not decided yet."""
     before = {key: finding.verdict for key, (finding, _) in rounds.latest().items()}
     seen = _seen(rounds, sweep, runs, look)
@@ -332,7 +334,7 @@ def _found(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], look: Look) -
     return found
 
 
-def _seen(rounds: Rounds, sweep: Sweep, runs: Mapping[str, Runs], look: Look) -> dict[Key, Effect]:
+def _seen(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed], look: Look) -> dict[Key, Effect]:
     """Return all comparisons of a look's arms, over exactly the look's seeds."""
     seeds = rounds.seeds[: look.seeds]
     cut = {label: {s: found[s] for s in seeds if s in found} for label, found in runs.items()}

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from memmlp.sweep.spec import COMPUTE, COSTS, Arm, Sweep
-from memmlp.tables.effects import Paired, Runs, control_arm, paired
+from memmlp.tables.effects import Paired, RunsBySeed, control_arm, paired
 from memmlp.tables.statistics import holm, paired_effects
 from memmlp.tables.statistics.effects import LEVEL
 from memmlp.tables.statistics.scaling import Estimate, Line, fit
@@ -189,7 +189,9 @@ class Trends:
         return (min(every), max(every)) if every else None
 
 
-def trends(sweep: Sweep, runs: Mapping[str, Runs], predicted: Mapping[str, float] | None = None) -> Trends:
+def trends(
+    sweep: Sweep, runs: Mapping[str, RunsBySeed], predicted: Mapping[str, float] | None = None
+) -> Trends:
     """Return the effects of a sweep against its scale, in stream mode.
 
     Args:
@@ -225,7 +227,7 @@ def _in_cells(sweep: Sweep) -> list[tuple[Arm, Arm]]:
 
 
 def _trend(
-    sweep: Sweep, runs: Mapping[str, Runs], pairs: Mapping[Key, Paired], series: str, metric: str
+    sweep: Sweep, runs: Mapping[str, RunsBySeed], pairs: Mapping[Key, Paired], series: str, metric: str
 ) -> Trend:
     """Return an effect in a metric, whose slopes have no verdicts yet."""
     assert sweep.scale is not None
@@ -264,7 +266,7 @@ class _Cell(NamedTuple):
 
 def _cells(
     sweep: Sweep,
-    runs: Mapping[str, Runs],
+    runs: Mapping[str, RunsBySeed],
     pairs: Mapping[str, Paired | None],
     own: Sequence[tuple[Arm, Arm]],
 ) -> list[_Cell]:
@@ -284,11 +286,11 @@ def _slopes(line: Line, varied: Sequence[str]) -> dict[str, Slope]:
     return {name: Slope(_bounds(one)[0], float(one.p[0]), None) for name, one in estimates.items()}
 
 
-def _ids(runs: Runs) -> frozenset[str]:
+def _ids(runs: RunsBySeed) -> frozenset[str]:
     return frozenset(run.id for run in runs.values())
 
 
-def _values(sweep: Sweep, arm: Arm, control: Runs) -> dict[str, float]:
+def _values(sweep: Sweep, arm: Arm, control: RunsBySeed) -> dict[str, float]:
     """Return the values of the scale's keys in a cell: numbers of its overrides, and its compute."""
     assert sweep.scale is not None
     words = dict(word.split("=", 1) for word in arm.cell)

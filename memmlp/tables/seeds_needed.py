@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from memmlp.sweep.spec import MODES, Sweep
-from memmlp.tables.effects import Runs, paired, paper_effect, with_existing_branches
+from memmlp.tables.effects import RunsBySeed, paired, paper_effect, with_existing_branches
 from memmlp.tables.statistics import seeds_needed
 
 
@@ -30,7 +30,7 @@ class Need(NamedTuple):
     seeds: int | None
 
 
-def needs(sweep: Sweep, runs: Mapping[str, Runs], modes: Sequence[str] = MODES) -> list[Need]:
+def needs(sweep: Sweep, runs: Mapping[str, RunsBySeed], modes: Sequence[str] = MODES) -> list[Need]:
     """Return the needs of every arm and metric whose effect the paper prints, in the table's order.
 
     The correction is over the comparisons that the runs allow today. With fewer than two seeds or two groups

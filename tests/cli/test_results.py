@@ -14,7 +14,7 @@ from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.spec import Sweep
 from memmlp.tables.build_table import finished_runs
-from memmlp.tables.effects import Runs
+from memmlp.tables.effects import RunsBySeed
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def test_results_of_an_earlier_default_do_not_stand_beside_todays(
     del content["digest"]
     path.write_text(json.dumps(content))
 
-    def but_one(*given: object) -> dict[str, Runs]:
+    def but_one(*given: object) -> dict[str, RunsBySeed]:
         found = finished_runs(*given)
         return {**found, "2": {seed: run for seed, run in found["2"].items() if seed != 1}}
 

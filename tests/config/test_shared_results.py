@@ -1,4 +1,4 @@
-"""Runs taken from other sweeps' kept results: the very same, and no others."""
+"""RunsBySeed taken from other sweeps' kept results: the very same, and no others."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from memmlp.config.shared_results import with_kept
 from memmlp.report.kept_results import Kept, overrides_of, save
 from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.plan import Entry, Plan
-from memmlp.tables.effects import Runs
+from memmlp.tables.effects import RunsBySeed
 
 SWEEP = load_sweep(Path(__file__).parents[2] / "sweeps" / "table14.yaml")
 
 
 @pytest.fixture
-def runs(tmp_path: Path) -> dict[str, Runs]:
+def runs(tmp_path: Path) -> dict[str, RunsBySeed]:
     return runs_of(SWEEP, fake_sweep(tmp_path / "runs", SWEEP))
 
 
 @pytest.fixture
-def file(runs: dict[str, Runs], tmp_path: Path) -> Path:
+def file(runs: dict[str, RunsBySeed], tmp_path: Path) -> Path:
     save(tmp_path / "table14.json", Kept("table14", ("data=mocap",), runs, overrides_of(SWEEP)))
     return tmp_path / "table14.json"
 
 
-def plan_today(monkeypatch: pytest.MonkeyPatch, runs: dict[str, Runs], **changed: str) -> None:
+def plan_today(monkeypatch: pytest.MonkeyPatch, runs: dict[str, RunsBySeed], **changed: str) -> None:
     """Plan Table 14 as the kept runs have it; `changed` gives the arm "2" other ids or stages."""
     entries = [
         Entry(label, seed, run.id, ("e1",)) for label, one in runs.items() for seed, run in one.items()
@@ -45,13 +45,15 @@ def plan_today(monkeypatch: pytest.MonkeyPatch, runs: dict[str, Runs], **changed
     )
 
 
-def wanted(runs: dict[str, Runs], label: str = "2") -> Plan:
+def wanted(runs: dict[str, RunsBySeed], label: str = "2") -> Plan:
     """The plan of another sweep, which wants the arm's runs under another name, one of them twice."""
     entries = [Entry("Mine", seed, run.id, ("e1",)) for seed, run in runs[label].items()]
     return Plan("mine", Path(), (*entries, replace(entries[0], label="Twin")), ())
 
 
-def test_the_very_same_runs_are_taken(monkeypatch: pytest.MonkeyPatch, runs: dict[str, Runs], file: Path):
+def test_the_very_same_runs_are_taken(
+    monkeypatch: pytest.MonkeyPatch, runs: dict[str, RunsBySeed], file: Path
+):
     plan_today(monkeypatch, runs)
     found, origins = with_kept({"Mine": {}, "Twin": {}}, wanted(runs), [file])
     assert {seed: run.id for seed, run in found["Mine"].items()} == {
@@ -61,7 +63,7 @@ def test_the_very_same_runs_are_taken(monkeypatch: pytest.MonkeyPatch, runs: dic
     assert origins == ("table14",)
 
 
-def test_runs_of_the_outputs_stay(monkeypatch: pytest.MonkeyPatch, runs: dict[str, Runs], file: Path):
+def test_runs_of_the_outputs_stay(monkeypatch: pytest.MonkeyPatch, runs: dict[str, RunsBySeed], file: Path):
     plan_today(monkeypatch, runs)
     own = runs["2, 4"][0]
     found, _ = with_kept({"Mine": {0: own}}, wanted(runs), [file])
@@ -70,7 +72,7 @@ def test_runs_of_the_outputs_stay(monkeypatch: pytest.MonkeyPatch, runs: dict[st
 
 
 def test_a_run_of_an_earlier_default_is_not_taken(
-    monkeypatch: pytest.MonkeyPatch, runs: dict[str, Runs], file: Path
+    monkeypatch: pytest.MonkeyPatch, runs: dict[str, RunsBySeed], file: Path
 ):
     """Both sweeps have another run in the cell today, and it is the same one in both."""
     plan_today(monkeypatch, runs, id="f" * 16)
@@ -82,14 +84,14 @@ def test_a_run_of_an_earlier_default_is_not_taken(
 
 
 def test_another_evaluation_of_a_run_is_not_taken(
-    monkeypatch: pytest.MonkeyPatch, runs: dict[str, Runs], file: Path
+    monkeypatch: pytest.MonkeyPatch, runs: dict[str, RunsBySeed], file: Path
 ):
     plan_today(monkeypatch, runs, stage="e2")
     assert with_kept({"Mine": {}}, wanted(runs), [file]) == ({"Mine": {}, "Twin": {}}, ())
 
 
 def test_a_file_without_such_runs_is_not_planned(
-    monkeypatch: pytest.MonkeyPatch, runs: dict[str, Runs], file: Path
+    monkeypatch: pytest.MonkeyPatch, runs: dict[str, RunsBySeed], file: Path
 ):
     def refused(*given: object) -> Plan:
         raise AssertionError("planned")

@@ -13,7 +13,7 @@ import pytest
 from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.spec import Sweep
 from memmlp.tables.build_table import make_table
-from memmlp.tables.effects import Runs
+from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.formats import markdown
 from memmlp.tables.measured_run import Measured, Origin
 from memmlp.tables.rounds import Rounds, advanced, as_json, begin, of_json, outlook
@@ -67,7 +67,7 @@ class World:
         self.failing: set[tuple[str, int]] = set()
         self.runs: dict[str, dict[int, Measured]] = {arm.label: {} for arm in sweep.runnable()}
 
-    def spend(self, rounds: Rounds) -> Mapping[str, Runs]:
+    def spend(self, rounds: Rounds) -> Mapping[str, RunsBySeed]:
         spent = rounds.spent(self.sweep)
         for arm in spent.runnable():
             for seed in set(spent.seeds_of(arm)) - self.runs[arm.label].keys():

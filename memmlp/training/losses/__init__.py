@@ -1,7 +1,16 @@
 """The training losses: Mem-MLP's, the baselines', and a library of terms that any network's loss can take."""
 
 from memmlp.training.losses.baselines import AGRoLLoss, AvatarPoserLoss, OwnLoss
-from memmlp.training.losses.loss import Fixed, Learned, Loss, Manual, Terms, Uncertainty, Weighting, joints
+from memmlp.training.losses.loss import (
+    Fixed,
+    LearnedWeights,
+    Loss,
+    Manual,
+    Terms,
+    Uncertainty,
+    Weighting,
+    joints,
+)
 from memmlp.training.losses.mem_mlp import HandFK, HandPosition, MotionLoss, NoHand, Term, l1
 from memmlp.training.losses.terms import TermsLoss
 
@@ -11,7 +20,7 @@ __all__ = [
     "Fixed",
     "HandFK",
     "HandPosition",
-    "Learned",
+    "LearnedWeights",
     "Loss",
     "Manual",
     "MotionLoss",

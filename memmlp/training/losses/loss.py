@@ -102,7 +102,7 @@ class Uncertainty(nn.Module):
         return {name: float((-s.detach()).exp()) for name, s in self.s.items()}
 
 
-class Learned(Uncertainty):
+class LearnedWeights(Uncertainty):
     """Weights by uncertainty that begin at given values instead of 1.
 
     Args:

@@ -16,7 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_POSITION
 from memmlp.motion.geometry import forward_kinematics, geodesic_angle, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
-from memmlp.training.losses.loss import Fixed, Learned, Loss, Terms, Weighting, joints
+from memmlp.training.losses.loss import Fixed, LearnedWeights, Loss, Terms, Weighting, joints
 
 FEET = (7, 8, 10, 11)  # both ankles, both toes
 TOES = (10, 11)
@@ -199,7 +199,7 @@ TERMS: dict[str, tuple[Callable[[Comparison, Error], Tensor], int]] = {
 
 WEIGHTINGS: dict[str, Callable[[dict[str, float], float], Weighting]] = {
     "fixed": lambda weights, lr: Fixed(weights),
-    "learned": Learned,
+    "learned": LearnedWeights,
 }
 
 
