@@ -1,4 +1,4 @@
-"""RunsBySeed that one sweep's kept results share with another sweep.
+"""Runs that one sweep's kept results share with another sweep.
 
 It lies in config because planning a sweep composes its configs.
 """

@@ -1,4 +1,4 @@
-"""RunsBySeed taken from other sweeps' kept results: the very same, and no others."""
+"""Runs taken from other sweeps' kept results: the very same, and no others."""
 
 from __future__ import annotations
 
