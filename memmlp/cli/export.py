@@ -212,19 +212,23 @@ def write_exact(
     import numpy as np
 
     from memmlp.deploy.parity import TOLERANCE, parity, tolerated
-    from memmlp.live.full_graph import full_parity
+    from memmlp.live.full_graph import full_parity, full_tolerated
 
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
         path = Path(folder) / "step.onnx"
         write_graph(network, path, run_id, form)
         if form.full:
-            apart = [full_parity(model, path, clip, form.full[0]) for clip in clips]
+            space = form.full[0]
+            apart = [full_parity(model, path, clip, space) for clip in clips]
+            checked = [full_tolerated(model, path, *one, space) for one in zip(clips, apart, strict=True)]
         else:
             apart = [parity(model, path, clip) for clip in clips]
+            checked = [tolerated(model, *one) for one in zip(clips, apart, strict=True)]
         worst = float(np.max(apart))  # NaN as soon as one is NaN, unlike max()
         said = f"differs from torch by {worst:.1e} at most on {len(clips)} test clips"
-        if not all(tolerated(model, clip, found) for clip, found in zip(clips, apart, strict=True)):
-            raise click.ClickException(f"{said}, more than {TOLERANCE:.0e}: not written")
+        if not all(checked):
+            wrong = f"{out}: {said}, more than {TOLERANCE:.0e}: not written"
+            raise click.ClickException(f"{wrong}; please report it with the run's config.yaml")
         path.replace(out)
     click.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {said}")
 

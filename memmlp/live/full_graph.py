@@ -14,6 +14,7 @@ All are in the frame of reference that was chosen (memmlp.live.spaces). Lost tra
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from memmlp.common.errors import InputError
 from memmlp.deploy.export import metadata, save
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.opsets import NATIVE
-from memmlp.deploy.parity import in_torch
+from memmlp.deploy.parity import ROUNDING, TOLERANCE, in_torch
 from memmlp.live.rotations import BodyTree, quaternion_to_matrix
 from memmlp.live.spaces import Space, space_of
 from memmlp.motion.body import (
@@ -209,19 +210,50 @@ def full_parity(model: MotionModel, path: Path, clip: Tensor, space: str = "amas
     Each of them has its own history. Torch goes the way of evaluation: the features of the same trackers, the
     network, and `Normalizer.pose`. Quaternions are compared as the matrices that they stand for.
     """
-    model, there, stream = model.cpu().eval(), space_of(space), OnnxStream(path)
-    positions, rotations = trackers_of(clip[:, :SPARSE_DIM].cpu())
-    given = [there.positions_out(positions.numpy()), there.rotations_out(rotations.numpy())]
-    sparse = sparse_features(rotations, positions)
+    trackers, there = trackers_of(clip[:, :SPARSE_DIM].cpu()), space_of(space)
+    found = _streamed(path, trackers, there)
+    return float("inf") if found is None else _apart(_in_torch(model, trackers, there), found)
+
+
+def full_tolerated(model: MotionModel, path: Path, clip: Tensor, apart: float, space: str = "amass") -> bool:
+    """Return whether a difference between torch and the file over a clip (N, 252) is rounding.
+
+    Up to TOLERANCE it is. Up to ROUNDING it may be, where 6D columns are almost parallel, so that a matrix
+    magnifies what was rounded before: then the file has to be within TOLERANCE of torch in float64, or no
+    farther from it than twice as far as torch in float32 is.
+    """
+    if not TOLERANCE < apart <= ROUNDING:
+        return apart <= TOLERANCE
+    trackers, there = trackers_of(clip[:, :SPARSE_DIM].cpu()), space_of(space)
+    found = _streamed(path, trackers, there)
+    positions, rotations = trackers
+    exact = _in_torch(copy.deepcopy(model).double(), (positions.double(), rotations.double()), there)
+    rounding = _apart(exact, _in_torch(model, trackers, there))
+    return found is not None and _apart(exact, found) <= max(TOLERANCE, 2 * rounding)
+
+
+def _streamed(path: Path, trackers: tuple[Tensor, Tensor], space: Space) -> list[np.ndarray] | None:
+    """Return rotations, positions and joints that the file makes of trackers; None for wrong quaternions."""
+    stream, (positions, rotations) = OnnxStream(path), trackers
+    given = [space.positions_out(positions.numpy()), space.rotations_out(rotations.numpy())]
     made = [stream.step(*(part[index : index + 1] for part in given)) for index in range(len(positions))]
     found = [np.concatenate(parts) for parts in zip(*made[1:], strict=True)]
     if found[0].shape[-1] == 4:
-        unit = np.abs(np.linalg.norm(found[0], axis=-1) - 1).max()
+        if not np.abs(np.linalg.norm(found[0], axis=-1) - 1).max() <= UNIT:
+            return None
         found[0] = quaternion_to_matrix(found[0].astype(np.float64))
-        if not unit <= UNIT:
-            return float("inf")
-    expected = _expected(model.normalizer, in_torch(model, sparse), sparse, there)
-    return float(np.max([np.abs(a - b).max() for a, b in zip(expected, found, strict=True)]))
+    return found
+
+
+def _in_torch(model: MotionModel, trackers: tuple[Tensor, Tensor], space: Space) -> list[np.ndarray]:
+    """Return the rotations, positions and joints that the model makes of trackers, in a space."""
+    positions, rotations = trackers
+    sparse = sparse_features(rotations, positions)
+    return _expected(model.normalizer, in_torch(model.cpu().eval(), sparse), sparse, space)
+
+
+def _apart(some: list[np.ndarray], others: list[np.ndarray]) -> float:
+    return float(np.max([np.abs(one - other).max() for one, other in zip(some, others, strict=True)]))
 
 
 def _expected(normalizer: Normalizer, motion: Tensor, sparse: Tensor, space: Space) -> list[np.ndarray]:
