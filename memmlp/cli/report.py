@@ -47,8 +47,10 @@ def report(
     from memmlp.runs.environment import environment
     from memmlp.sweep.parsing import load_sweep
 
-    names = [word for word in words if "=" not in word and not word.startswith("~")] or EVERY
-    chapters = chapters_of(names, [word for word in words if word not in names], outputs)
+    chosen = [word for word in words if "=" not in word and not word.startswith("~")]
+    chapters = chapters_of(chosen or EVERY, [word for word in words if word not in chosen], outputs)
+    if not chosen:  # tables without a run stand below those with some
+        chapters.sort(key=lambda chapter: not any(chapter.runs.values()))
     folder = packaged("sweeps")
     systems = published(load_sweep(folder / "table01.yaml"), load_sweep(folder / "table17.yaml"))
     git = environment()["git"] or {}

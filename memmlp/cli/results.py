@@ -143,7 +143,9 @@ def docs(folder: Path, check: bool) -> None:
     else:
         _write(folder, made, stale)
         _draw(folder, drawn)
-    click.echo(f"{len(made)} pages, {len(differing)} {'differ' if check else 'written'}")
+    click.echo(
+        f"{len(made)} page{'s' * (len(made) != 1)}, {len(differing)} {'differ' if check else 'written'}"
+    )
 
 
 def sources(folder: Path) -> dict[str, KeptTable]:
@@ -232,7 +234,9 @@ def _merged(path: Path, before: Kept, kept: Kept, ids: Mapping[tuple[str, int], 
         merged.check_runs(planned)
         return merged
     except InputError as error:
-        raise InputError(f"{path}: {error}; allowed is another --name, or a file without them") from None
+        raise InputError(
+            f"{path}: {error}; allowed is another --name or --out, or a file without them"
+        ) from None
 
 
 def _templates(folder: Path) -> dict[str, str]:

@@ -61,7 +61,7 @@ def of_tests(clips: Sequence[ClipRecord]) -> str:
     counts = f"test clips: {len(tested)}, in groups: {len(set(tested))}"
     if len(set(tested)) > 1:
         return counts
-    return f"{counts}, which decides nothing; more motion or a larger data.split.test tests on more"
+    return f"{counts}, too few to tell networks apart; more motion or a larger data.split.test tests on more"
 
 
 def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:

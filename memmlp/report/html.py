@@ -78,8 +78,10 @@ def page(chapters: Sequence[Chapter], published: Sequence[Point], generated: str
 def fragment(chapters: Sequence[Chapter], published: Sequence[Point], generated: str, commit: str) -> str:
     """Return the report as part of a page that has a head and a style of its own."""
     about = f"{generated}, code {commit}, {_counted(_entries(chapters))}"
-    body = "\n".join(_section(*section) for section in _sections(chapters, published))
-    return f'<h1>Measured and published</h1>\n<p class="about">{_text(about)}</p>\n{body}'
+    sections = _sections(chapters, published)
+    contents = f"<details><summary>Contents</summary>\n{_contents(sections, chapters)}\n</details>"
+    body = "\n".join(_section(*section) for section in sections)
+    return f'<h1>Measured and published</h1>\n<p class="about">{_text(about)}</p>\n{contents}\n{body}'
 
 
 def _sections(
@@ -94,7 +96,7 @@ def _sections(
         ("accuracy", "Accuracy and latency", _accuracy(chapters, published)),
         ("training", "Training curves", _training(chapters)),
         ("latency", "Latency", [_latency(entries)]),
-        ("runs", "RunsBySeed", [_runs(entries)]),
+        ("runs", "Runs", [_runs(entries)]),
     ]
 
 

@@ -70,8 +70,9 @@ def data_labels(records: Sequence[Record]) -> list[str]:
 def differing(configs: Sequence[Mapping[str, Any]], data: Sequence[str] = ()) -> list[str]:
     """Return the config keys that change a result and differ among these configs.
 
-    Where the option in a slot differs, its name stands for its keys that the others don't have. Of the data
-    the keys count in which two data of one name differ; data of several names are told apart by these.
+    Where the option in a slot differs, its name stands for its keys that the others don't have, unless runs
+    with that option differ in them. Of the data the keys count in which two data of one name differ; data of
+    several names are told apart by these.
 
     Args:
         configs: the configs.
@@ -87,7 +88,8 @@ def differing(configs: Sequence[Mapping[str, Any]], data: Sequence[str] = ()) ->
         key.removesuffix(".name")
         for key in different
         if key.endswith(".name")
-        or not (key.split(".")[0] in changed and any(key not in flat for flat in flats))
+        or key.split(".")[0] not in changed
+        or len({repr(flat[key]) for flat in flats if key in flat}) > 1
     ]
 
 

@@ -95,7 +95,7 @@ def parse_sweep(name: str, content: Any) -> Sweep:
         raise InputError("arms: none to run; allowed is at least one arm with overrides, or axes")
     control = str(content.get("control", runnable[0]))
     if control not in runnable:
-        raise InputError(f"control: '{control}' is no arm; allowed are {', '.join(runnable)}")
+        raise InputError(f"control: '{control}' is no arm; allowed are {', '.join(map(repr, runnable))}")
     _check_controls(arms, runnable)
     source = content.get("branch_source")
     return Sweep(
@@ -138,7 +138,8 @@ def _check_controls(arms: Sequence[Arm], runnable: Sequence[str]) -> None:
         others = [label for label in runnable if label != arm.label]
         if arm.against is not None and arm.against not in others:
             raise InputError(
-                f"arms.{arm.label}.against: '{arm.against}' is no other arm; allowed are {', '.join(others)}"
+                f"arms.{arm.label}.against: '{arm.against}' is no other arm; "
+                f"allowed are {', '.join(map(repr, others))}"
             )
 
 

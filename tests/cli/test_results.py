@@ -81,7 +81,7 @@ def test_a_sweep_with_a_scale_has_a_figure_beside_its_page(
     monkeypatch.setattr("memmlp.config.count_flops.predicted_flops", lambda sweep: {"profile=paper": 1e15})
     Path("cells.yaml").write_text(json.dumps(fake_cells.content()))
     memmlp("results", "save", "cells.yaml", "--name", "small")
-    assert memmlp("results", "docs").out == "1 pages, 1 written\n"
+    assert memmlp("results", "docs").out == "1 page, 1 written\n"
     page, figure = Path("docs/results/small.md"), Path("docs/results/small.png")
     assert "(small.png)" in page.read_text()
     figure.write_bytes(b"")

@@ -261,7 +261,7 @@ def test_a_single_group_of_test_clips_is_told_to_decide_nothing():
     train = [SimpleNamespace(split="train", group="c")]
     assert run_stages.of_tests([*train, *clips("a", "b", "b")]) == "test clips: 3, in groups: 2"
     assert (
-        "in groups: 1, which decides nothing; more motion or a larger data.split.test"
+        "in groups: 1, too few to tell networks apart; more motion or a larger data.split.test"
         in run_stages.of_tests([*train, *clips("a", "a")])
     )
 

@@ -97,6 +97,14 @@ def test_the_keys_that_differ_without_neutral_ones():
     assert differing([first, first]) == []
 
 
+def test_a_slots_keys_differ_where_runs_with_one_option_do():
+    """One option's keys are told by its name, until two runs have that option with other values."""
+    vq = {"memory": {"name": "vq", "layers": [2]}}
+    none, other = {"memory": {"name": "none"}}, {"memory": {"name": "vq", "layers": [2, 4]}}
+    assert differing([vq, none]) == ["memory"]
+    assert differing([vq, none, other]) == ["memory", "memory.layers"]
+
+
 def test_the_data_differs_where_its_digest_does():
     first, second = ({"data": {"root": root, "weighting": "frames"}} for root in ("here", "/x/here"))
     assert differing([first, second], ["d", "d"]) == []
