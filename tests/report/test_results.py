@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 from dataclasses import replace
@@ -300,10 +301,16 @@ def test_every_word_of_the_rule_is_found():
         assert len(claims(f"It {word} 0.3 cm.")) == 1
 
 
+@functools.cache
+def kept_tables() -> dict[str, KeptTable]:
+    """The tables of the clone's kept results, computed once for the tests that read them."""
+    return sources(DOCS)
+
+
 @pytest.mark.slow
 def test_pages_of_the_clone_are_made_again_byte_for_byte():
     templates = {path.name: path.read_text(encoding="utf-8") for path in (DOCS / "templates").glob("*.md")}
-    made = pages(sources(DOCS), templates)
+    made = pages(kept_tables(), templates)
     assert "README.md" in made
     for name, text in made.items():
         assert (DOCS / name).read_bytes() == text.encode(), name
@@ -312,7 +319,7 @@ def test_pages_of_the_clone_are_made_again_byte_for_byte():
 @pytest.mark.slow
 def test_every_interval_of_the_clone_follows_from_what_is_kept():
     """As many intervals as the pages print are computed here from the per-clip results, and are equal."""
-    for name, one in sources(DOCS).items():
+    for name, one in kept_tables().items():
         text, printed = (DOCS / f"{name}.md").read_text(encoding="utf-8"), []
         content = json.loads((DOCS / "data" / f"{name}.json").read_text())
         sources_of = [None, *(one.kept.sources if one.by_source else ())]
