@@ -1,0 +1,195 @@
+"""Results kept with the code: what is written, read again, merged and refused."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_runs import fake_run, nothing, runs_of
+
+from memmlp.common.errors import InputError
+from memmlp.report.kept_results import Kept, dumps, load_kept, overrides_of, save, without_paths
+from memmlp.sweep.spec import Sweep
+from memmlp.tables.build_table import make_table
+
+
+def test_kept_results_make_the_runs_table(sweep: Sweep, kept: Kept, tmp_path: Path):
+    """The table is the same to six digits, with every origin and every group."""
+    save(tmp_path / "kept.json", kept)
+    read = load_kept(tmp_path / "kept.json")
+    assert (read.sweep, read.overrides, read.command) == (
+        "table14", ("data=mocap",), "memmlp sweep table14 data=mocap",
+    )  # fmt: skip
+    tables = [make_table(sweep, one.of(sweep)) for one in (kept, read)]
+    assert tables[0].flags == tables[1].flags
+    for before, after in zip(tables[0].rows, tables[1].rows, strict=True):
+        for mode in tables[0].modes:
+            for metric, cell in before.cells[mode].items():
+                again = after.cells[mode][metric]
+                assert again.mean == pytest.approx(cell.mean, rel=1e-5)
+                if cell.effect:
+                    assert again.effect.low == pytest.approx(cell.effect.low, rel=1e-4, abs=1e-4)
+                    assert (again.effect.verdict, again.effect.groups) == (cell.effect.verdict, 6)
+    assert [run.origin for run in read.every] == [run.origin for run in kept.every]
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_a_run_that_diverged_stays_one(sweep: Sweep, kept: Kept, tmp_path: Path, number: float):
+    """It is no run less: its arm has no mean, and no other arm's looks better for it."""
+    run = kept.runs["2"][1]
+    for clip in run.clips:
+        run.clips[clip]["stream"]["combined"]["MPJPE"] = number
+    run.means["stream"]["combined"]["MPJPE"] = number
+    save(tmp_path / "kept.json", kept)
+    cells = [
+        next(row for row in make_table(sweep, one.of(sweep)).rows if row.label == "2").cells["stream"][
+            "MPJPE"
+        ]
+        for one in (kept, load_kept(tmp_path / "kept.json"))
+    ]
+    for cell in cells:
+        assert sorted(cell.values) == [0, 1, 2]
+        assert not np.isfinite(cell.mean)
+
+
+def test_a_run_on_a_part_of_its_list_stays_marked(kept: Kept, tmp_path: Path):
+    """And files of runs on the whole of it are as they were before there were parts."""
+    run = kept.runs["2"][1]
+    kept.runs["2"][1] = replace(run, origin=replace(run.origin, partial="3 of 5 clips", offline=True))
+    save(tmp_path / "kept.json", kept)
+    assert (tmp_path / "kept.json").read_text().count('"partial"') == 1
+    found = load_kept(tmp_path / "kept.json").runs["2"][1].origin
+    assert (found.partial, found.offline) == ("3 of 5 clips", True)
+
+
+def test_kept_results_that_were_cut_are_refused(kept: Kept, tmp_path: Path):
+    """A clip's error lost by hand or in a merge would shift the others to the wrong clips."""
+    content = json.loads(dumps(kept))
+    del content["digest"]
+    next(iter(content["runs"].values()))["errors"]["stream"]["rotation"]["MPJPE"].insert(0, 5.0)
+    (tmp_path / "kept.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="has not as many errors as clips"):
+        load_kept(tmp_path / "kept.json")
+
+
+def test_kept_results_that_were_edited_are_refused(kept: Kept, tmp_path: Path):
+    text = dumps(kept)
+    number = re.search(r'"MPJPE": \[(\S+),', text)
+    (tmp_path / "kept.json").write_text(text.replace(number[1], "9.99", 1))
+    with pytest.raises(InputError, match="edited since it was saved"):
+        load_kept(tmp_path / "kept.json")
+
+
+def test_kept_results_have_the_same_bytes(kept: Kept, tmp_path: Path):
+    """The bytes don't depend on the order of the runs, or on being read and written again."""
+    turned = {label: dict(reversed(runs.items())) for label, runs in reversed(kept.runs.items())}
+    assert dumps(replace(kept, runs=turned)) == dumps(kept)
+    save(tmp_path / "kept.json", kept)
+    assert dumps(load_kept(tmp_path / "kept.json")) == dumps(kept)
+    assert max(map(len, dumps(kept).splitlines())) < 1000  # a line a list, so that changes can be read
+
+
+def test_words_of_kept_results_stay_as_they_are(kept: Kept, tmp_path: Path):
+    """Spaces and brackets in the names of clips, and in flags, are no layout."""
+    word = "Subject 1  take [ 2 ]\u2028"
+    runs = {
+        label: {seed: replace(run, clips={f"{clip}{word}": rows for clip, rows in run.clips.items()})
+                for seed, run in of_arm.items()}
+        for label, of_arm in kept.runs.items()
+    }  # fmt: skip
+    save(tmp_path / "kept.json", replace(kept, runs=runs, flags=(word, "two  spaces")))
+    read = load_kept(tmp_path / "kept.json")
+    assert read.flags == (word, "two  spaces")
+    assert [set(run.clips) for run in read.every] == [
+        {f"{clip}{word}" for clip in run.clips} for run in kept.every
+    ]
+
+
+def test_two_evaluations_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp_path: Path):
+    """Arms may show inverse kinematics of two kinds of one training."""
+    one, two = list(kept.runs)[:2]
+    solved = {
+        seed: replace(run, id=kept.runs[one][seed].id, sources={}) for seed, run in kept.runs[two].items()
+    }
+    save(tmp_path / "kept.json", replace(kept, runs=kept.runs | {two: solved}))
+    read = load_kept(tmp_path / "kept.json")
+    for label in (one, two):
+        for seed, run in kept.runs[label].items():
+            found = read.runs[label][seed]
+            assert found.id == kept.runs[one][seed].id
+            assert found.value("stream", "combined", "MPJPE") == pytest.approx(
+                run.value("stream", "combined", "MPJPE"), rel=1e-5
+            )
+    assert read.count == len({run.id for runs in read.runs.values() for run in runs.values()})
+    assert len(read.every) == read.count + len(solved)
+    assert dumps(read) == (tmp_path / "kept.json").read_text()
+    table = make_table(sweep, read.of(sweep))
+    assert not any("are one run" in flag and two in flag for flag in table.flags)
+
+
+def test_results_of_several_machines_add_up(sweep: Sweep, kept: Kept, tmp_path: Path):
+    """Arms and seeds of both are there. A cell that both have is the newer one's; the other run is gone."""
+    one = {label: {0: runs[0]} for label, runs in kept.runs.items()}
+    newer = fake_run(tmp_path, "again", 0)
+    other = runs_of(replace(sweep, seeds=(0,)), lambda arm, seed: newer if arm.label == "2" else None)
+    rest = {label: {seed: runs[seed] for seed in (1, 2)} for label, runs in kept.runs.items()}
+    merged = replace(kept, runs=one).merged(replace(kept, runs=rest)).merged(replace(kept, runs=other))
+    assert {label: sorted(runs) for label, runs in merged.runs.items()} == {
+        label: [0, 1, 2] for label in kept.runs
+    }
+    ids = set(json.loads(dumps(merged))["runs"])
+    assert newer.id in ids
+    assert kept.runs["2"][0].id not in ids
+    with pytest.raises(InputError, match="holds the results of"):
+        kept.merged(replace(kept, overrides=("data=synthetic",)))
+
+
+def test_kept_results_hold_no_path_of_a_machine():
+    words = ("data.root=/home/me/data/cmu", "data.root=outputs/data/cmu", "+data.body=/x/model.npz")
+    assert without_paths(words) == (
+        "data.root=.../cmu",
+        "data.root=outputs/data/cmu",
+        "+data.body=.../model.npz",
+    )
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"sweep": "a"}', '{"runs": {"a": {}}}'])
+def test_damaged_results_are_one_line(tmp_path: Path, text: str):
+    path = tmp_path / "bad.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match="memmlp results save"):
+        load_kept(path)
+
+
+def test_results_of_an_arm_that_was_another_are_refused(sweep: Sweep, kept: Kept):
+    """Otherwise its numbers would stand under a label that means something else now."""
+    arms = [replace(arm, overrides=("memory=gru",)) if arm.label == "2" else arm for arm in sweep.arms]
+    other = replace(sweep, arms=tuple(arms))
+    with pytest.raises(InputError, match="arm '2' was made with the overrides"):
+        kept.of(other)
+    with pytest.raises(InputError, match="arm '2' was made with the overrides"):
+        kept.merged(replace(kept, arms=overrides_of(other)))
+
+
+def test_runs_that_an_arm_would_not_have_today_are_refused(kept: Kept):
+    """Its words are the same where a default has changed, and its runs are not."""
+    today = {(label, seed): run.id for label, runs in kept.runs.items() for seed, run in runs.items()}
+    kept.check_runs(today)
+    kept.check_runs({("2", 9): "of a seed that is not kept"})
+    with pytest.raises(InputError, match=r"arm '2' has other runs than .* make \(seed 1, 2\)"):
+        kept.check_runs(today | {("2", 2): "f" * 16, ("2", 1): "e" * 16})
+
+
+def test_nothing_to_keep(sweep: Sweep):
+    assert Kept("table14", (), runs_of(sweep, nothing), {}).every == []
+
+
+def test_an_arm_that_was_never_run_may_become_another(sweep: Sweep, kept: Kept):
+    waiting = replace(kept, runs={**kept.runs, "2": {}})
+    other = {**kept.arms, "2": ("memory=gru",)}
+    waiting.check(other)
+    assert waiting.merged(replace(kept, arms=other)).arms["2"] == ("memory=gru",)

@@ -1,0 +1,193 @@
+"""Pages of results: tables, and templates whose numbers and verdicts come from the tables."""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_runs import fake_sweep, runs_of
+from report.conftest import GROUPS
+
+from memmlp.cli.results import sources
+from memmlp.common.errors import InputError
+from memmlp.report.kept_results import Kept, dumps, overrides_of
+from memmlp.report.markdown import KeptTable, Words, origin_words, pages
+from memmlp.sweep.spec import Sweep
+from memmlp.tables.build_table import make_table
+from memmlp.tables.statistics import Verdict, holm, paired_effects
+from memmlp.tables.table_text import MINUS
+
+ROOT = Path(__file__).parent.parent.parent
+DOCS = ROOT / "docs" / "results"
+
+
+def source(sweep: Sweep, kept: Kept) -> KeptTable:
+    return KeptTable(kept, make_table(sweep, kept.of(sweep), command=kept.command))
+
+
+def test_a_template_takes_numbers_and_verdicts_from_the_table(sweep: Sweep, kept: Kept):
+    made = source(sweep, kept)
+    template = (
+        'MPJPE {{ effect("t", "2", "stream", "MPJPE") }}; paper {{ paper("t", "2", "MPJPE") }}; '
+        '{{ value("t", "2", "stream", "MPJPE") }}. {{ verdict("t", "2, 4, 6", "window", "Jitter") }} '
+        '{{ seen("t", "stream", "MPJPE") }} {% if has("u") %}never{% endif %}\n'
+        '{{ title("t") }}\n{{ origin("t") }}\n{{ summary("t") }}\n{{ table("t") }}\n'
+    )
+    text = pages({"t": made}, {"README.md": template})["README.md"]
+    row = next(row for row in made.table.rows if row.label == "2")
+    effect = row.cells["stream"]["MPJPE"].effect
+    assert effect.verdict == Verdict.HOLDS
+    assert f"MPJPE +{effect.mean:.2f} [{effect.low:.2f}, {effect.high:.2f}], holds; paper +0.09" in text
+    assert f"{row.cells['stream']['MPJPE'].mean:.2f} ± " in text
+    assert f"{made.table.detectable('stream', 'MPJPE'):.2g} cm" in text
+    assert "`memmlp sweep table14 data=mocap`: 12 runs, commit 0123456, torch 2.0.0" in text
+    assert text.count("holds; paper +0.09") == 2
+    assert "never" not in text
+    assert "### Table 14: Placement of memory blocks in the backbone" in text
+
+
+def test_what_holds_of_the_paper_is_counted_and_listed(sweep: Sweep, kept: Kept):
+    """Counted anew from the cells; an effect without a sign in the paper is not."""
+    made = source(sweep, kept)
+    text = pages({"t": made}, {"README.md": '{{ held(["t"]) }}\n'})["README.md"]
+    cells = [row.cells["stream"][metric] for row in made.table.rows for metric in made.table.measured_metrics]
+    signed = [cell for cell in cells if cell.paper_effect]
+    holds = sum(cell.effect.verdict == Verdict.HOLDS for cell in signed)
+    assert 0 < holds < len(signed) == 12
+    assert f"Of {len(signed)} effects with a sign in the paper, in stream mode: holds {holds}, " in text
+    line = next(line for line in text.splitlines() if line.startswith("| [14](t.md) | 2 |"))
+    row = next(row for row in made.table.rows if row.label == "2")
+    words = [str(row.cells["stream"][metric].effect.verdict) for metric in made.table.measured_metrics]
+    assert line == f"| [14](t.md) | 2 | 2, 4, 6, 8 | {' | '.join(words)} |"
+
+
+def test_each_commit_is_named_once(kept: Kept):
+    runs = kept.runs["2"]
+    for seed, code in zip(runs, ("e2f8fc0", "92ecce3, e2f8fc0", "e2f8fc0, 92ecce3"), strict=False):
+        runs[seed] = replace(runs[seed], origin=replace(runs[seed].origin, code=code))
+    assert ", commit 0123456, 92ecce3 and e2f8fc0, torch" in origin_words(kept)
+
+
+@pytest.mark.parametrize(
+    ("template", "words"),
+    [
+        ('{{ effect("u", "2", "stream", "MPJPE") }}', "'u' is no results; allowed are t"),
+        ('{{ effect("t", "3", "stream", "MPJPE") }}', "'3' is no arm of t; allowed are 2, 2, 4"),
+        ('{{ effect("t", "2", "live", "MPJPE") }}', "'live' is no mode; allowed are stream, window"),
+        ('{{ effect("t", "2", "stream", "MPJ") }}', "'MPJ' is no metric of t"),
+        ("{{ nothing }}", "'nothing' is undefined"),
+        ("{{ effect(", "README.md"),
+        ('Memory lowers it: {{ effect("t", "2", "stream", "MPJPE") }}', "placeholders"),
+    ],
+)
+def test_bad_templates_are_one_line(sweep: Sweep, kept: Kept, template: str, words: str):
+    with pytest.raises(InputError, match=re.escape(words)) as raised:
+        pages({"t": source(sweep, kept)}, {"README.md": template})
+    assert str(raised.value).startswith("README.md")
+    assert "\n" not in str(raised.value)
+
+
+def test_a_template_cannot_stand_for_a_tables_page(sweep: Sweep, kept: Kept):
+    with pytest.raises(InputError, match=r"t\.md"):
+        pages({"t": source(sweep, kept)}, {"t.md": "words"})
+
+
+@functools.cache
+def kept_tables() -> dict[str, KeptTable]:
+    """The tables of the clone's kept results, computed once for the tests that read them."""
+    return sources(DOCS)
+
+
+@pytest.mark.slow
+def test_pages_of_the_clone_are_made_again_byte_for_byte():
+    templates = {path.name: path.read_text(encoding="utf-8") for path in (DOCS / "templates").glob("*.md")}
+    made = pages(kept_tables(), templates)
+    assert "README.md" in made
+    for name, text in made.items():
+        assert (DOCS / name).read_bytes() == text.encode(), name
+
+
+@pytest.mark.slow
+def test_every_interval_of_the_clone_follows_from_what_is_kept():
+    """As many intervals as the pages print are computed here from the per-clip results, and are equal."""
+    for name, one in kept_tables().items():
+        text, printed = (DOCS / f"{name}.md").read_text(encoding="utf-8"), []
+        content = json.loads((DOCS / "data" / f"{name}.json").read_text())
+        sources_of = [None, *(one.kept.sources if one.by_source else ())]
+        for source_name, table in zip(sources_of, (one.table, *one.by_source), strict=True):
+            for row in table.rows:
+                for mode, cells in row.cells.items():
+                    for metric, cell in cells.items():
+                        if cell.effect is not None and cell.effect.low is not None:
+                            interval = by_hand(content, row, table, mode, metric, source_name)
+                            assert (cell.effect.low, cell.effect.high) == pytest.approx(interval)
+                            printed.append(interval)
+        assert len(re.findall(r"\\\[[^\]]*\d, [^\]]*\d\\\]", text)) == len(printed)
+
+
+def by_hand(
+    content: dict, row, table, mode: str, metric: str, source: str | None = None
+) -> tuple[float, float]:
+    """Compute the interval of a row's difference from its control, from a file's content alone.
+
+    source: whose clips count; None for all.
+    """
+    branches = {other.label: other.branch for other in table.rows}
+    seeds = sorted(set(content["cells"][row.label]) & set(content["cells"][row.against]))
+    every = {
+        label: [content["runs"][content["cells"][label][seed]] for seed in seeds]
+        for label in (row.label, row.against)
+    }
+    clips = [
+        {clip: (group, *rest) for clip, group, *rest in content["clips"][runs[0]["clips"]]}
+        for runs in every.values()
+    ]
+    groups = {
+        clip: group
+        for clip, (group, *rest) in clips[0].items()
+        if clip in clips[1] and (source is None or rest == [source])
+    }
+    sides = []
+    for (label, runs), names in zip(every.items(), clips, strict=True):
+        places = [list(names).index(clip) for clip in groups]
+        errors = [run["errors"][mode][branches[label]][metric] for run in runs]
+        sides.append(np.array(errors)[:, places])
+    effects = paired_effects((sides[0] - sides[1])[None], np.array(list(groups.values())))
+    return float(effects.low[0]), float(effects.high[0])
+
+
+def test_the_way_from_the_first_arm_to_the_last_is_the_sum_of_its_steps(sweep: Sweep, tmp_path: Path):
+    """Errors grow from arm to arm of a chain; a share is shown where the interval leaves 0 out."""
+    labels = [arm.label for arm in sweep.arms]
+    against = {labels[0]: labels[1], labels[1]: labels[2], labels[2]: labels[0]}  # the control, two before it
+    arms = tuple(replace(arm, against=against.get(arm.label)) for arm in sweep.arms)
+    chained = replace(sweep, arms=arms, control=labels[0])
+    find = fake_sweep(tmp_path, chained, {labels[1]: 1.1, labels[2]: 1.3}, groups=GROUPS)
+    words = Words({"t": source(chained, Kept("table14", (), runs_of(chained, find), overrides_of(chained)))})
+    rows = [line.split(" | ") for line in words.way("t").splitlines()[2:]]
+    assert [row[0].strip("| ") for row in rows] == [
+        labels[1], labels[0], f"**the whole way, from {labels[2]}**"
+    ]  # fmt: skip
+    column = 1 + chained.metrics.index("MPJPE")
+    parts = [[word.replace(MINUS, "-") for word in row[column].split(", ")] for row in rows]
+    assert float(parts[0][0]) + float(parts[1][0]) == pytest.approx(float(parts[2][0]), abs=0.011)
+    assert [part[1] for part in parts[:2]] == ["67 %", "33 %"]  # 1.3 to 1.1 to 1
+    assert parts[2][1].split("; paper ")[0] == str(words.verdict("t", labels[2], "stream", "MPJPE"))
+    plain = Words({"t": source(sweep, Kept("table14", (), runs_of(sweep, find), overrides_of(sweep)))})
+    assert plain.way("t") == ""
+
+
+def test_by_hand_is_what_a_page_has(sweep: Sweep, kept: Kept):
+    """What the test of the committed pages computes is checked on results made here, too."""
+    content, table = json.loads(dumps(kept)), source(sweep, kept).table
+    row = table.rows[0]
+    effect = row.cells["stream"]["MPJPE"].effect
+    assert by_hand(content, row, table, "stream", "MPJPE") == pytest.approx(
+        (effect.low, effect.high), abs=1e-4
+    )
+    assert holm(np.array([effect.p]))[0] <= effect.holm
