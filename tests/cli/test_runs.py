@@ -141,7 +141,7 @@ def test_diff_cuts_no_number(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.
     rows = [("deployment.onnx.parameters_with_vq_and_more", *numbers)]
     monkeypatch.setattr("memmlp.cli.runs.compare.result_rows", lambda first, second: rows)
     said = memmlp("runs", "diff", A, B).out
-    assert all(number in said for number in [*numbers, A, B])
+    assert all(number in said for number in [*numbers, A[:8], B[:8]])
     assert "".join(word for word in said.split() if word in rows[0][0]) == rows[0][0]
 
 

@@ -14,6 +14,7 @@ from memmlp.evaluation.units import UNITS
 if TYPE_CHECKING:
     from memmlp.runs.run import Run
 
+SHORT = 8  # characters of an id above a column of numbers, which leave the keys a line of 80
 ORIGIN = (
     "device",
     "gpu",
@@ -45,8 +46,9 @@ def diff(a: str, b: str, outputs: Path) -> None:
         if not rows:
             click.echo(f"{title}: no difference")
             continue
-        table = plain_table(title, first.id, second.id, *(["B - A", "unit"] if title == "results" else []))
-        for column in table.columns[1:] if title == "results" else table.columns[:1]:
+        ids = (first.id, second.id) if title == "config" else (first.id[:SHORT], second.id[:SHORT])
+        table = plain_table(title, *ids, *(["B - A", "unit"] if title == "results" else []))
+        for column in table.columns if title == "results" else table.columns[:1]:
             column.no_wrap = True  # a number in two lines is none, and half of one is another
         for row in rows:
             table.add_row(*row)
