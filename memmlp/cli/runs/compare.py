@@ -48,7 +48,7 @@ def diff(a: str, b: str, outputs: Path) -> None:
             continue
         ids = (first.id, second.id) if title == "config" else (first.id[:SHORT], second.id[:SHORT])
         table = plain_table(title, *ids, *(["B - A", "unit"] if title == "results" else []))
-        for column in table.columns if title == "results" else table.columns[:1]:
+        for column in table.columns[1:] if title == "results" else table.columns[:1]:
             column.no_wrap = True  # a number in two lines is none, and half of one is another
         for row in rows:
             table.add_row(*row)
