@@ -83,6 +83,8 @@ def test_it_says_what_it_waits_for_and_when_the_command_has_ended(browser: Brows
     with Server(Hub(greeting(ClipSource(clip, 60), "tiny")), 0) as server:
         browser.open(server.url)
         browser.wait("document.querySelector('#status').textContent == 'waiting for trackers'")
+        assert browser.value("document.querySelector('#error').hidden")  # of no frame there is no error
+        browser.wait("document.querySelector('#trackers').classList.contains('waiting')")
         server.hub.publish({"dropped": 0, "malformed": 3})
         browser.wait("document.querySelector('#status').textContent.endsWith('3 packets malformed')")
     browser.wait("document.querySelector('#status').textContent == 'not connected'")

@@ -100,6 +100,7 @@ function status() {
 function tell(frame) {
   const [kind, words] = status();
   $('status').className = kind;
+  $('trackers').classList.toggle('waiting', words.startsWith('waiting'));
   $('status').textContent = words;
   $('pause').textContent = history.paused ? 'Play' : 'Pause';
   $('pause').setAttribute('aria-pressed', history.paused);
