@@ -49,7 +49,7 @@ def results() -> None:
     "--kept",
     "also_kept",
     is_flag=True,
-    help="Take runs that the outputs lack from other sweeps' files in --out, if these have the very same.",
+    help="Take runs that the outputs lack from other sweeps' files in --out that hold the same ones.",
 )
 @click.option("--name", "stem", help="Name of the file, without its ending.  [default: the sweep's name]")
 @config_dir_option
@@ -82,11 +82,14 @@ def save_command(
     known = sweep_to_show(sweep, overrides, outputs.absolute())
     found: Mapping[str, RunsBySeed] = finished_runs(known.sweep, finder(known.plan, functools.cache(load)))
     path = out / f"{stem or sweep.name}.json"
-    origins: tuple[str, ...] = ()
+    files: tuple[str, ...] = ()
     if also_kept:
         from memmlp.config.shared_results import with_kept
 
-        found, origins = with_kept(found, known.plan, sorted(set(out.glob("*.json")) - {path}))
+        found, files, flags, skipped = with_kept(found, known.plan, sorted(set(out.glob("*.json")) - {path}))
+        known = known._replace(flags=(*known.flags, *flags))
+        for line in skipped:
+            click.echo(line, err=True)
     if untrained:
         from memmlp.config.network_costs import with_costs
 
@@ -105,7 +108,7 @@ def save_command(
     ids = {(entry.label, entry.seed): entry.id for entry in known.plan.entries}
     merged = _merged(path, load_kept(path), kept, ids) if path.exists() else kept
     save(path, merged)
-    here = f"from here{''.join(f' and {origin}' for origin in origins)}"
+    here = f"from here{''.join(f' and {origin}' for origin in files)}"
     click.echo(f"{path}: {merged.count} runs, {kept.count} of them {here}")
 
 
@@ -227,8 +230,8 @@ def _outdated(kept: Kept) -> list[str]:
 
 
 def _merged(path: Path, before: Kept, kept: Kept, ids: Mapping[tuple[str, int], str]) -> Kept:
-    """Return what a file has with what is kept now, whose cells need not be those that are planned."""
-    planned = {cell: run for cell, run in ids.items() if cell[1] not in kept.runs.get(cell[0], {})}
+    """Return what a file has with what is kept now, whose runs need not be those that are planned."""
+    planned = {one: run for one, run in ids.items() if one[1] not in kept.runs.get(one[0], {})}
     try:
         merged = before.merged(kept)
         merged.check_runs(planned)

@@ -42,11 +42,15 @@ def flops_of(cfg: DictConfig) -> int:
 
 
 def with_flops(runs: Mapping[str, RunsBySeed]) -> dict[str, RunsBySeed]:
-    """Return finished runs with the FLOPs of their trainings, each counted from its own config."""
+    """Return finished runs with the FLOPs of their trainings, each counted from its own config.
+
+    Those of a run that is kept without its folder stay as they are.
+    """
     known: dict[str, int] = {}
 
     def count(run: Measured) -> Measured:
-        assert run.run is not None
+        if run.run is None:
+            return run
         cfg = config_of(run.run)
         config = OmegaConf.to_container(cfg, resolve=True)
         assert isinstance(config, dict)

@@ -84,7 +84,7 @@ def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
     """
     path = sweep_folder(sweep, outputs) / "plan_stamp.json"
     if not prepare and not path.parent.is_dir():
-        return _plan(sweep, outputs, prepare)[0]
+        return plan_anew(sweep, outputs)
     stamp = _stamp(sweep, outputs)
     keep(sweep, path.parent)
     kept = read_json(path)
@@ -95,6 +95,15 @@ def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
     write_json(path, {"stamp": stamp if data is not None else None, "data": data or []})
     _remember(sweep, plan, path.with_name("entries.json"))
     return plan
+
+
+def plan_anew(sweep: Sweep, outputs: Path) -> Plan:
+    """Return the plan of a sweep as far as its data is prepared, and leave nothing in the outputs.
+
+    Raises:
+        InputError: as `make_plan` does.
+    """
+    return _plan(sweep, outputs, prepare=False)[0]
 
 
 def orphans(sweep: Sweep, plan: Plan) -> list[Entry]:

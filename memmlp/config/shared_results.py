@@ -7,59 +7,87 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from memmlp.config.plan_sweep import find_sweep, make_plan
+from memmlp.common.errors import InputError
+from memmlp.config.plan_sweep import find_sweep, plan_anew
+from memmlp.runs.recipe_numbers import outdated
 
 if TYPE_CHECKING:
     from memmlp.report.kept_results import Kept
-    from memmlp.sweep.plan import Plan
+    from memmlp.sweep.plan import Entry, Plan
     from memmlp.tables.effects import RunsBySeed
     from memmlp.tables.measured_run import Measured
 
 
-def with_kept(
-    found: Mapping[str, RunsBySeed], plan: Plan, files: Iterable[Path]
-) -> tuple[Mapping[str, RunsBySeed], tuple[str, ...]]:
+class Shared(NamedTuple):
+    """A sweep's runs with those of other sweeps' kept results among them.
+
+    Attributes:
+        runs: the runs by the arm's label and the seed.
+        files: the names of the files that some were taken from.
+        flags: what a reader has to know of these.
+        skipped: a line for each file that could not be used, and why.
+    """
+
+    runs: Mapping[str, RunsBySeed]
+    files: tuple[str, ...]
+    flags: tuple[str, ...]
+    skipped: tuple[str, ...]
+
+
+def with_kept(found: Mapping[str, RunsBySeed], plan: Plan, files: Iterable[Path]) -> Shared:
     """Return a sweep's runs with those added that are kept in files of other sweeps' results.
 
     A kept run stands for an entry only if its file's sweep, planned today, has the same run with the same
-    evaluations and deployment there: their identities hold all that its numbers follow from.
+    evaluations and deployment there, and no recipe of it has changed since. An evaluation's defaults that
+    changed without a recipe are not seen.
 
     Args:
         found: the sweep's own finished runs by the arm's label and the seed.
         plan: the plan of its runs.
         files: files of kept results.
 
-    Returns:
-        the runs, and the names of the files that some were taken from.
-
     Raises:
-        InputError: where a file holds no results, or its sweep can't be planned.
+        InputError: where a file holds no results.
     """
     from memmlp.report.kept_results import load_kept
 
-    missing = [entry for entry in plan.entries if entry.seed not in found.get(entry.label, {})]
-    merged: dict[str, dict[int, Measured]] = {label: dict(runs) for label, runs in found.items()}
-    taken: list[str] = []
+    runs: dict[str, dict[int, Measured]] = {label: dict(seeds) for label, seeds in found.items()}
+    taken, flags, skipped = [], [], []
     for path in files:
+        missing = [entry for entry in plan.entries if entry.seed not in runs.get(entry.label, {})]
         kept = load_kept(path)
         if not {run.id for run in kept.every} & {entry.id for entry in missing}:
             continue
-        known = _by_key(kept, plan.outputs)
-        for entry in missing:
-            runs = merged.setdefault(entry.label, {})
-            if entry.key in known and entry.seed not in runs:
-                runs[entry.seed] = known[entry.key]
-                taken.append(path.stem)
-    return merged, tuple(dict.fromkeys(taken))
+        try:
+            known = _by_key(kept, plan.outputs)
+        except InputError as error:  # such as data that is not on this machine
+            skipped.append(f"{path}: not used, as its sweep cannot be planned here: {error}")
+            continue
+        used = [entry for entry in missing if entry.key in known]
+        for entry in used:
+            runs.setdefault(entry.label, {})[entry.seed] = known[entry.key]
+        taken += [path.stem] if used else []
+        flags += [_of_rounds(path.stem, used)] if used and kept.rounds else []
+    return Shared(runs, tuple(taken), tuple(flags), tuple(skipped))
+
+
+def _of_rounds(name: str, entries: Iterable[Entry]) -> str:
+    """Say of which arms seeds were spent in rounds, which no interval of a fixed number of seeds knows."""
+    labels = ", ".join(dict.fromkeys(f"'{entry.label}'" for entry in entries))
+    return f"seeds of {labels} were spent in rounds of {name}, so that these verdicts do not keep the 5 %"
 
 
 def _by_key(kept: Kept, outputs: Path) -> dict[str, Measured]:
     """Return the kept runs that their sweep has today, by the keys of the plan's entries."""
     seeds = sorted({seed for runs in kept.runs.values() for seed in runs})
     sweep = find_sweep(kept.sweep, [*kept.overrides, f"seed={','.join(map(str, seeds))}"])
-    kept_runs = [
-        (entry, kept.runs.get(entry.label, {}).get(entry.seed)) for entry in make_plan(sweep, outputs).entries
+    pairs = [
+        (entry, kept.runs.get(entry.label, {}).get(entry.seed)) for entry in plan_anew(sweep, outputs).entries
     ]
-    return {entry.key: run for entry, run in kept_runs if run is not None and run.id == entry.id}
+    return {
+        entry.key: run
+        for entry, run in pairs
+        if run is not None and run.id == entry.id and not outdated(run.origin.recipes)
+    }

@@ -253,6 +253,7 @@ def _in_torch(model: MotionModel, trackers: tuple[Tensor, Tensor], space: Space)
 
 
 def _apart(some: list[np.ndarray], others: list[np.ndarray]) -> float:
+    """Return the largest difference between two lists of arrays."""
     return float(np.max([np.abs(one - other).max() for one, other in zip(some, others, strict=True)]))
 
 

@@ -237,8 +237,9 @@ class Words:
         rows = [(name, row) for name in names for row in self._table(name).rows if row.found and row.against]
         metrics = list(dict.fromkeys(m for name in names for m in self._table(name).measured_metrics))
         words = [[self._held(name, row, mode, metric) for metric in metrics] for name, row in rows]
-        counts = Counter(word for cells in words for word in cells if word != MISSING)
-        said = ", ".join(f"{word} {counts[word]}" for word in map(str, Verdict) if counts[word])
+        verdicts = tuple(map(str, Verdict))
+        counts = Counter(word for cells in words for word in cells if word in verdicts)
+        said = ", ".join(f"{word} {counts[word]}" for word in verdicts if counts[word])
         lines = [
             f"Of {counts.total()} effects with a sign in the paper, in {mode} mode: {said}.",
             "",
@@ -254,8 +255,10 @@ class Words:
 
     def _held(self, name: str, row: Row, mode: str, metric: str) -> str:
         """Return the verdict on an effect whose sign the paper prints; a dash for any other."""
-        cell = row.cells[mode].get(metric)
-        return self.verdict(name, row.label, mode, metric) if cell and cell.paper_effect else MISSING
+        if metric not in self._table(name).measured_metrics:
+            return MISSING
+        printed = self._cell(name, row.label, mode, metric).paper_effect
+        return self.verdict(name, row.label, mode, metric) if printed else MISSING
 
     def way(self, name: str, mode: str = "stream") -> str:
         """Return a table of how each step of a chain of arms changes each metric, with its share of the way.

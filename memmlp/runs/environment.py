@@ -25,8 +25,6 @@ NOT_NUMBERS = (
     "live",
     "render",
     "report",
-    "search",
-    "statistics",
     "sweep",
     "tables",
     "tracking",

@@ -24,7 +24,7 @@ COLOURS = {
     "trained": "yellow",
 }  # fmt: skip
 WORDS = {
-    "new": "waiting", "trained": "trained, not evaluated or exported",
+    "new": "waiting", "trained": "trained, unfinished",
     "stopped": "waiting, begun", "lost": "lost, to be taken over",
 }  # fmt: skip
 
@@ -105,8 +105,7 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
     tasks = {task.key: task for task in plan.tasks}
     seeds = sorted({entry.seed for entry in plan.entries})
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=f"sweep {plan.name}", title_justify="left")
-    widest = max((len(entry.label) for entry in plan.entries), default=0)
-    table.add_column("arm", overflow="fold", min_width=min(widest, 24))
+    table.add_column("arm", overflow="fold")
     for seed in seeds:
         table.add_column(f"seed {seed}", no_wrap=True)
     for label in dict.fromkeys(entry.label for entry in plan.entries):

@@ -8,10 +8,13 @@ from pathlib import Path
 import pytest
 from fake_runs import fake_sweep, runs_of
 
+from memmlp.common.errors import InputError
+from memmlp.config import shared_results
 from memmlp.config.shared_results import with_kept
 from memmlp.report.kept_results import Kept, overrides_of, save
 from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.plan import Entry, Plan
+from memmlp.sweep.spec import Sweep
 from memmlp.tables.effects import RunsBySeed
 
 SWEEP = load_sweep(Path(__file__).parents[2] / "sweeps" / "table14.yaml")
@@ -39,8 +42,9 @@ def plan_today(monkeypatch: pytest.MonkeyPatch, runs: dict[str, RunsBySeed], **c
         else entry
         for entry in entries
     ]
+    monkeypatch.setattr("memmlp.config.shared_results.outdated", lambda recipes: [])
     monkeypatch.setattr(
-        "memmlp.config.shared_results.make_plan",
+        "memmlp.config.shared_results.plan_anew",
         lambda sweep, outputs: Plan(sweep.name, outputs, tuple(planned), ()),
     )
 
@@ -55,18 +59,18 @@ def test_the_very_same_runs_are_taken(
     monkeypatch: pytest.MonkeyPatch, runs: dict[str, RunsBySeed], file: Path
 ):
     plan_today(monkeypatch, runs)
-    found, origins = with_kept({"Mine": {}, "Twin": {}}, wanted(runs), [file])
+    found, files, *_ = with_kept({"Mine": {}, "Twin": {}}, wanted(runs), [file])
     assert {seed: run.id for seed, run in found["Mine"].items()} == {
         seed: run.id for seed, run in runs["2"].items()
     }
     assert [run.id for run in found["Twin"].values()] == [runs["2"][0].id]
-    assert origins == ("table14",)
+    assert files == ("table14",)
 
 
 def test_runs_of_the_outputs_stay(monkeypatch: pytest.MonkeyPatch, runs: dict[str, RunsBySeed], file: Path):
     plan_today(monkeypatch, runs)
     own = runs["2, 4"][0]
-    found, _ = with_kept({"Mine": {0: own}}, wanted(runs), [file])
+    found, *_ = with_kept({"Mine": {0: own}}, wanted(runs), [file])
     assert found["Mine"][0] is own
     assert sorted(found["Mine"]) == sorted(runs["2"])
 
@@ -74,11 +78,11 @@ def test_runs_of_the_outputs_stay(monkeypatch: pytest.MonkeyPatch, runs: dict[st
 def test_a_run_of_an_earlier_default_is_not_taken(
     monkeypatch: pytest.MonkeyPatch, runs: dict[str, RunsBySeed], file: Path
 ):
-    """Both sweeps have another run in the cell today, and it is the same one in both."""
+    """Both sweeps have another run there today, and it is the same one in both."""
     plan_today(monkeypatch, runs, id="f" * 16)
     other = runs["2, 4"][0].id
     entries = (Entry("Mine", 0, "f" * 16, ("e1",)), Entry("Other", 0, other, ("e1",)))
-    found, _ = with_kept({"Mine": {}, "Other": {}}, Plan("mine", Path(), entries, ()), [file])
+    found, *_ = with_kept({"Mine": {}, "Other": {}}, Plan("mine", Path(), entries, ()), [file])
     assert found["Mine"] == {}
     assert found["Other"][0].id == other
 
@@ -87,7 +91,7 @@ def test_another_evaluation_of_a_run_is_not_taken(
     monkeypatch: pytest.MonkeyPatch, runs: dict[str, RunsBySeed], file: Path
 ):
     plan_today(monkeypatch, runs, stage="e2")
-    assert with_kept({"Mine": {}}, wanted(runs), [file]) == ({"Mine": {}, "Twin": {}}, ())
+    assert with_kept({"Mine": {}}, wanted(runs), [file]) == ({"Mine": {}}, (), (), ())
 
 
 def test_a_file_without_such_runs_is_not_planned(
@@ -96,6 +100,46 @@ def test_a_file_without_such_runs_is_not_planned(
     def refused(*given: object) -> Plan:
         raise AssertionError("planned")
 
-    monkeypatch.setattr("memmlp.config.shared_results.make_plan", refused)
+    monkeypatch.setattr("memmlp.config.shared_results.plan_anew", refused)
     plan = Plan("mine", Path(), (Entry("Mine", 0, "0" * 16, ("e1",)),), ())
-    assert with_kept({"Mine": {}}, plan, [file]) == ({"Mine": {}}, ())
+    assert with_kept({"Mine": {}}, plan, [file]) == ({"Mine": {}}, (), (), ())
+
+
+def test_a_run_of_an_earlier_recipe_is_not_taken(
+    monkeypatch: pytest.MonkeyPatch, runs: dict[str, RunsBySeed], file: Path
+):
+    plan_today(monkeypatch, runs)
+    monkeypatch.setattr("memmlp.config.shared_results.outdated", lambda recipes: ["metrics 1"])
+    assert with_kept({"Mine": {}}, wanted(runs), [file]) == ({"Mine": {}}, (), (), ())
+
+
+def test_a_file_that_cannot_be_planned_here_is_named_and_the_others_are_used(
+    monkeypatch: pytest.MonkeyPatch, runs: dict[str, RunsBySeed], file: Path
+):
+    """Its data is on another machine, say."""
+    plan_today(monkeypatch, runs)
+    other = file.with_name("a.json")
+    save(other, Kept("table04", ("data=mocap",), runs, {}))
+    planned = shared_results.plan_anew
+
+    def plan(sweep: Sweep, outputs: Path) -> Plan:
+        if sweep.name == "table04":
+            raise InputError("data.root=mine: allowed is an existing folder")
+        return planned(sweep, outputs)
+
+    monkeypatch.setattr("memmlp.config.shared_results.plan_anew", plan)
+    found = with_kept({"Mine": {}}, wanted(runs), [other, file])
+    assert found.files == ("table14",)
+    assert sorted(found.runs["Mine"]) == sorted(runs["2"])
+    assert "a.json: not used" in found.skipped[0]
+    assert "data.root=mine" in found.skipped[0]
+
+
+def test_seeds_that_were_spent_in_rounds_are_flagged(
+    monkeypatch: pytest.MonkeyPatch, runs: dict[str, RunsBySeed], tmp_path: Path
+):
+    plan_today(monkeypatch, runs)
+    kept = Kept("table14", ("data=mocap",), runs, overrides_of(SWEEP), rounds={"seeds": [0, 1, 2]})
+    save(tmp_path / "rounds.json", kept)
+    (flag,) = with_kept({"Mine": {}}, wanted(runs), [tmp_path / "rounds.json"]).flags
+    assert flag.startswith("seeds of 'Mine', 'Twin' were spent in rounds of rounds")

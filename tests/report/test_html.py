@@ -254,6 +254,9 @@ def test_command_takes_all_by_default(memmlp: Memmlp, planned: None):
     text = Path("outputs/report.html").read_text()
     assert len(re.findall(r'class="result" id="table\d\d"', text)) == 17
     assert 'id="memory_control"' in text
+    tables = re.findall(r'class="result" id="(table\d\d)"', text)
+    assert tables[:3] == ["table05", "table06", "table01"]  # those that were measured come first
+    assert "<details><summary>Contents</summary>" in text
 
 
 @pytest.mark.slow

@@ -255,16 +255,22 @@ def test_a_replay_says_that_the_other_run_s_is_being_computed(browser: Browser, 
         assert browser.value("document.querySelector('.view .wait')") is None
 
 
+EXTRA = "<h1>Extra</h1><a href='#low'>Low</a><p style='height: 5000px'></p><h2 id='low'>Low</h2>"
+
+
 def test_a_file_without_a_server(browser: Browser, home: Path, tmp_path: Path):
     folder = home / "sweeps" / "mine"
     sweep, plan = kept(folder), Plan.load(folder / "plan.json")
     assert sweep is not None
     table = make_table(sweep, finished_runs(sweep, finder(plan, load)))
-    text = page_text(Answers(home, predict, kept=False), [ReportedSweep("mine", table)], "<h1>Extra</h1>")
+    text = page_text(Answers(home, predict, kept=False), [ReportedSweep("mine", table)], EXTRA)
     assert EVIL not in text
     file = tmp_path / "report.html"
     file.write_text(text)
     go(browser, file.as_uri(), "", "document.querySelector('main h1').textContent == 'Extra'")
+    browser.click("a[href='#low']")  # a part of the page, and no room of the file
+    browser.wait("document.querySelector('#low').getBoundingClientRect().top < window.innerHeight")
+    assert browser.value("document.querySelector('main h1').textContent") == "Extra"
     go(browser, file.as_uri(), "runs", f"{NAMES}.length == 6")
     best = min(
         (run_of(home, "gru", seed) for seed in range(3)),

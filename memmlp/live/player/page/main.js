@@ -11,7 +11,7 @@ const wearer = new Wearer();
 let stage = null;
 let avatar = null;
 let greeting = null;
-let arrived = 0;
+let arrived = -Infinity;
 let malformed = 0;
 let foreign = 0;
 
@@ -100,7 +100,7 @@ function status() {
 function tell(frame) {
   const [kind, words] = status();
   $('status').className = kind;
-  $('trackers').classList.toggle('waiting', words.startsWith('waiting'));
+  $('trackers').classList.toggle('waiting', kind !== 'live' && !history.paused);
   $('status').textContent = words;
   $('pause').textContent = history.paused ? 'Play' : 'Pause';
   $('pause').setAttribute('aria-pressed', history.paused);

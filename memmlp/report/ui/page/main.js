@@ -19,7 +19,15 @@ let shown = null;
 
 // The tables and figures that memmlp report made, as it made them.
 function extra() {
-  return { title: 'Tables and figures', element: h('div', { class: 'extra' }, template.content.cloneNode(true)) };
+  const element = h('div', { class: 'extra' }, template.content.cloneNode(true));
+  element.addEventListener('click', event => { // a link to a part of it: what follows # is a room of this page
+    const link = event.target.closest('a[href^="#"]');
+    const part = link && element.querySelector(`[id="${CSS.escape(link.getAttribute('href').slice(1))}"]`);
+    if (!part) return;
+    event.preventDefault();
+    part.scrollIntoView();
+  });
+  return { title: 'Tables and figures', element };
 }
 
 async function show() {
