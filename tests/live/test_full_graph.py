@@ -137,9 +137,11 @@ def test_a_difference_of_torchs_own_rounding_is_tolerated_and_no_other(network, 
     file, clip = folder / "unity.onnx", PERSON.frames
 
     class Rounded(type(network)):
+        off = {torch.float32: 5e-6, torch.float64: 0.0}
+
         def advance(self, *given):
             motion, state = super().advance(*given)
-            return motion + 5e-6 * (motion.dtype is torch.float32), state
+            return motion + self.off[motion.dtype], state
 
     rounded = copy.deepcopy(network)
     rounded.__class__ = Rounded
@@ -147,6 +149,10 @@ def test_a_difference_of_torchs_own_rounding_is_tolerated_and_no_other(network, 
     assert TOLERANCE < apart < ROUNDING
     assert full_tolerated(rounded, file, clip, apart, "unity")
     assert not full_tolerated(rounded, file, clip, 1.1 * ROUNDING, "unity")
+    Rounded.off = {torch.float32: 0.0, torch.float64: 5e-6}  # as far from exact as torch in float32
+    assert full_tolerated(rounded, file, clip, 2 * TOLERANCE, "unity")
+    Rounded.off = {torch.float32: 4e-6, torch.float64: 5e-6}  # five times as far
+    assert not full_tolerated(rounded, file, clip, 2 * TOLERANCE, "unity")
     other = copy.deepcopy(network)
     with torch.no_grad():
         other.stem.bias += 2e-5
