@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from pathlib import Path
+from typing import ClassVar
 
 import exported
 import numpy as np
@@ -137,7 +138,7 @@ def test_a_difference_of_torchs_own_rounding_is_tolerated_and_no_other(network, 
     file, clip = folder / "unity.onnx", PERSON.frames
 
     class Rounded(type(network)):
-        off = {torch.float32: 5e-6, torch.float64: 0.0}
+        off: ClassVar = {torch.float32: 5e-6, torch.float64: 0.0}
 
         def advance(self, *given):
             motion, state = super().advance(*given)
