@@ -244,7 +244,8 @@ def test_bad_input_is_one_line(tmp_path: Path, words: list[str], line: str):
 
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (memmlp[ray])")
-def test_a_sweep_on_a_local_ray(tmp_path: Path):
+def test_a_sweep_on_a_local_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # by default they wait for whatever else is tested
     write(tmp_path, {"none": ["memory=none"]})
     assert "1 of 1 runs done" in run_apart(tmp_path, "sweep", "trial.yaml", *TINY, "executor=ray")
 
