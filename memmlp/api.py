@@ -100,7 +100,7 @@ class Runs(Sequence["TrainedRun"]):
         return f"Runs({self._runs})"
 
     def per_clip(self) -> pd.DataFrame:
-        """The rows of all runs in one frame (`TrainedRun.per_clip`)."""
+        """The rows of all runs in one DataFrame (`TrainedRun.per_clip`)."""
         return _frame(row for run in self._runs for row in run._rows())
 
 

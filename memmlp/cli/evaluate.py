@@ -56,7 +56,7 @@ def evaluate(
     click.echo(f"run {found.run.id}: {said}")
     if partial := found.run.manifest.get("partial"):
         click.echo(f"on a part of the data: {partial}")
-    for table in (metrics_table(results), *source_tables(found.run)):
+    for table in (metrics_table(results), *source_tables(found.run, experiment.stages)):
         Console(highlight=False).print(table)
     if json_path is not None:
         write_json(json_path, {"mean": results, "clips": clip_rows(experiment, found.run)})

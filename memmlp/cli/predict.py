@@ -19,7 +19,7 @@ from memmlp.cli.options import (
 if TYPE_CHECKING:
     from memmlp.config.open_run import OpenedRun
     from memmlp.evaluation.evaluation import Evaluation
-    from memmlp.evaluation.predictions import Predictor
+    from memmlp.evaluation.predictions import ClipPredictor
     from memmlp.motion.exporting.folder import ExportReport
 
 
@@ -62,14 +62,14 @@ def predict(
     """
     from memmlp.cli.data.texts import show_exported
     from memmlp.config.open_run import OpenedRun, data_of, experiment_of, trained_network
-    from memmlp.evaluation.predictions import Predictor
+    from memmlp.evaluation.predictions import ClipPredictor
     from memmlp.motion.exporting.folder import plan_export
     from memmlp.runs.lookup import find_run
 
     found = find_run(outputs, run)
     experiment = experiment_of(found, device, [] if ik is None else [f"evaluation.ik={ik}"])
     chosen = chosen_branch(experiment.evaluation, branch)
-    predictor = Predictor(trained_network(found, experiment), mode, chosen, experiment.evaluation)
+    predictor = ClipPredictor(trained_network(found, experiment), mode, chosen, experiment.evaluation)
     if Path(source).exists():
         report = predictor.export(plan_export(Path(source), out, format_), strict=strict)
     else:
@@ -97,7 +97,7 @@ def chosen_branch(evaluation: Evaluation, branch: str | None) -> str:
 
 
 def predict_test_clip(
-    predictor: Predictor, run: OpenedRun, name: str, out: Path, format_: str | None
+    predictor: ClipPredictor, run: OpenedRun, name: str, out: Path, format_: str | None
 ) -> ExportReport:
     """Write what the network makes of a test clip.
 

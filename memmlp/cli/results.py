@@ -204,7 +204,8 @@ def _table(kept: Kept, source: str | None = None) -> Table:
     from memmlp.tables.build_table import make_table, on_source
     from memmlp.tables.rounds import of_json
 
-    sweep = find_sweep(kept.sweep)
+    words = tuple(word for word in kept.overrides if not word.startswith("seed="))
+    sweep = replace(find_sweep(kept.sweep), command_line=words)  # tables say where it is on other data
     left_out: tuple[str, ...] = ()
     rounds = of_json(kept.rounds) if kept.rounds else None
     other = of_another(rounds, sweep) if rounds else None

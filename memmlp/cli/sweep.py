@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 )
 @click.option("--retry", is_flag=True, help="Run again what failed before.")
 @click.option(
-    "--again", is_flag=True, help="Train the sweep's finished networks again, not what they build on."
+    "--again", is_flag=True, help="Train the sweep's networks again, begun ones too; not what they build on."
 )
 @click.option("--fail-fast", is_flag=True, help="End the sweep with the first run that fails.")
 @click.option(
@@ -95,12 +95,12 @@ def sweep(
     work = partial(run_workers, workers=workers)
     if known:
         known, plan = rounds.run_until_decided(chosen, outputs, known, work, fail_fast)
-        report(rounds.SweepToShow(known.spent(chosen), plan, known), [name, *overrides], chosen)
+        show_outcome(rounds.SweepToShow(known.spent(chosen), plan, known), [name, *overrides], chosen)
         return
     plan = replace(plan, fail_fast=fail_fast)
     if plan.left():
         work(chosen, plan)
-    report(
+    show_outcome(
         rounds.SweepToShow(chosen, plan, None, rounds.spent_before(chosen, outputs)),
         [name, *overrides],
         chosen,
@@ -168,7 +168,7 @@ def show_forecast(chosen: Sweep, plan: Plan, workers: int) -> None:
     click.echo(line)
 
 
-def report(shown: SweepToShow, words: Sequence[str], chosen: Sweep) -> None:
+def show_outcome(shown: SweepToShow, words: Sequence[str], chosen: Sweep) -> None:
     """Print the table, what is done, what failed, and the next command.
 
     Exits with 1 where something failed.

@@ -29,7 +29,7 @@ def show(outcome: Outcome) -> None:
     if changed := run.changed_sources:
         console.print(older_code(run, changed), style="yellow", soft_wrap=True)
     console.print(metrics_table(results))
-    for table in source_tables(run):
+    for table in source_tables(run, outcome.stages):
         console.print(table)
     if "latency" in results:
         show_latency(console, results["latency"])
@@ -105,9 +105,14 @@ def older_code(run: Run, changed: Sequence[str]) -> str:
     )
 
 
-def source_tables(run: Run) -> Iterator[Table]:
-    """Yield a table of the metrics on each source's test clips, where the run's data has several sources."""
-    for source, measured in load(run.folder).by_source().items():
+def source_tables(run: Run, stages: Sequence[str]) -> Iterator[Table]:
+    """Yield a table of the metrics on each source's test clips, where the run's data has several sources.
+
+    Args:
+        run: the run.
+        stages: the identities of the evaluations that are shown.
+    """
+    for source, measured in load(run.folder, stages).by_source().items():
         yield metrics_table(measured.means, f"test clips of {source} ({len(measured.clips)})")
 
 

@@ -28,7 +28,7 @@ from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK
 from memmlp.evaluation.metrics import OwnMetric
 from memmlp.motion.body import builtin_rest_joints
-from memmlp.motion.coordinates import Heading, HeadRelative, World
+from memmlp.motion.coordinates import Coordinates, Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.architecture import (
     VQVAE_SETTINGS,
@@ -52,7 +52,11 @@ from memmlp.training.optim import Optim, vqvae_optim
 from memmlp.training.refiner import RefinerTraining
 from memmlp.training.vqvae import VQVAETraining
 
-COORDINATES: dict[str, type[World]] = {"head_relative": HeadRelative, "world": World, "heading": Heading}
+COORDINATES: dict[str, type[Coordinates]] = {
+    "head_relative": HeadRelative,
+    "world": World,
+    "heading": Heading,
+}
 
 
 def build_experiment(cfg: DictConfig, elsewhere: bool = False) -> Experiment:
@@ -176,14 +180,14 @@ def build_network(cfg: DictConfig) -> Architecture:
     )
 
 
-def build_coordinates(name: str) -> World:
+def build_coordinates(name: str) -> Coordinates:
     """Build the coordinates of that name, or of that path of a class of one's own."""
     if name in COORDINATES:
         return COORDINATES[name]()
     found = located(name, "frame.coordinates")
-    if not (isinstance(found, type) and issubclass(found, World)):
+    if not (isinstance(found, type) and issubclass(found, Coordinates)):
         raise InputError(
-            f"frame.coordinates={name}: allowed is a class that extends {World.__module__}.World"
+            f"frame.coordinates={name}: allowed is a class that extends {Coordinates.__module__}.Coordinates"
         )
     return found()
 
@@ -235,7 +239,7 @@ def build_ik(cfg: DictConfig) -> IK:
 def build_vqvae_optim(cfg: DictConfig, frames: int) -> Optim:
     """Build the optimisation of the VQ-VAE, whose length may be given in epochs.
 
-    An epoch is as many training frames as there are in the training split (`frames`).
+    An epoch is as many training frames as there are in the training part (`frames`).
     """
     own, often = cfg.vqvae, {name: cfg.optim[name] for name in ("checkpoint_every", "log_every")}
     steps = own.steps or math.ceil(own.epochs * frames / own.batch)

@@ -17,6 +17,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.sweep.spec import Sweep
 from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.measured_run import Measured
+from memmlp.tables.scaling import in_cells
 from memmlp.training.network import NetworkTraining
 from memmlp.training.training_flops import training_flops
 
@@ -63,14 +64,23 @@ def with_flops(runs: Mapping[str, RunsBySeed]) -> dict[str, RunsBySeed]:
 
 
 def predicted_flops(sweep: Sweep) -> dict[str, float]:
-    """Count the FLOPs of the control's training with `scale.predict` in place of its cell.
+    """Count the FLOPs of the training of the effects' control, with `scale.predict` in place of its cell.
 
     Returns:
         The number by these overrides as one line; empty where nothing is to be predicted.
+
+    Raises:
+        InputError: where effects have different controls, whose trainings would not be one number.
     """
     words = sweep.scale.predict if sweep.scale else ()
-    if not words:
+    controls = {other.own_overrides: other for _, other in in_cells(sweep)}
+    if not words or not controls:
         return {}
-    control = next(arm for arm in sweep.arms if arm.label == sweep.control)
-    elsewhere = replace(control, overrides=(*control.own_overrides, *words))
+    if len(controls) > 1:
+        known = ", ".join(f"'{control.label}'" for control in controls.values())
+        raise InputError(
+            f"sweep {sweep.name}: scale.predict: allowed is one control, not {known}; put it first"
+        )
+    ((own, control),) = controls.items()
+    elsewhere = replace(control, overrides=(*own, *words))
     return {" ".join(words): float(flops_of(composed(list(sweep.overrides(elsewhere)))))}

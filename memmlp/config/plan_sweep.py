@@ -64,7 +64,7 @@ def is_path(name: str) -> bool:
 
 def sweep_folder(sweep: Sweep, outputs: Path) -> Path:
     """Return the folder of a sweep with its overrides, where its plan and its workers' logs are kept."""
-    key = f"-{digest(sweep.extra)[:8]}" if sweep.extra else ""
+    key = f"-{digest(sweep.command_line)[:8]}" if sweep.command_line else ""
     return outputs / "sweeps" / f"{sweep.name}{key}"
 
 
@@ -184,12 +184,15 @@ def _data_digest(experiment: Experiment, prepare: bool, known: dict[str, dict[st
         found = experiment.data.prepare().digest if prepare else experiment.data.digest()
         if found is None:
             return None
-        known[key] = {"config": config, "digest": found}
+        known[key] = {"config": config, "digest": found, "groups": experiment.data.groups_digest}
     return known[key]["digest"]
 
 
 def _fresh(data: dict[str, Any], prepare: bool) -> bool:
-    """Return whether the data that a kept plan relies on is unchanged, and if `prepare`, fit to train on."""
+    """Return whether the data that a kept plan relies on is unchanged, and if `prepare`, fit to train on.
+
+    Which of its clips belong together counts, too: evaluations have their identity from it.
+    """
     from omegaconf import OmegaConf
 
     from memmlp.config.build_motion import build_motion
@@ -197,7 +200,8 @@ def _fresh(data: dict[str, Any], prepare: bool) -> bool:
     cfg: DictConfig = OmegaConf.create(data["config"])
     try:
         motion = build_motion(cfg)
-        return (motion.prepare().digest if prepare else motion.digest()) == data["digest"]
+        found = motion.prepare().digest if prepare else motion.digest()
+        return (found, motion.groups_digest) == (data["digest"], data.get("groups"))
     except InputError:
         return False
 

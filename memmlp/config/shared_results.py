@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from memmlp.tables.measured_run import Measured
 
 
-class Shared(NamedTuple):
+class SharedRuns(NamedTuple):
     """A sweep's runs with those of other sweeps' kept results among them.
 
     Attributes:
@@ -36,7 +36,7 @@ class Shared(NamedTuple):
     skipped: tuple[str, ...]
 
 
-def with_kept(found: Mapping[str, RunsBySeed], plan: Plan, files: Iterable[Path]) -> Shared:
+def with_kept(found: Mapping[str, RunsBySeed], plan: Plan, files: Iterable[Path]) -> SharedRuns:
     """Return a sweep's runs with those added that are kept in files of other sweeps' results.
 
     A kept run stands for an entry only if its file's sweep, planned today, has the same run with the same
@@ -70,7 +70,7 @@ def with_kept(found: Mapping[str, RunsBySeed], plan: Plan, files: Iterable[Path]
             runs.setdefault(entry.label, {})[entry.seed] = known[entry.key]
         taken += [path.stem] if used else []
         flags += [_of_rounds(path.stem, used)] if used and kept.rounds else []
-    return Shared(runs, tuple(taken), tuple(flags), tuple(skipped))
+    return SharedRuns(runs, tuple(taken), tuple(flags), tuple(skipped))
 
 
 def _of_rounds(name: str, entries: Iterable[Entry]) -> str:

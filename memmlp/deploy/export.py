@@ -2,7 +2,8 @@
 
 Inputs: `sparse` (1, 54), the world features of the newest frame (order: memmlp.motion.body), and `state.*`,
 all zeros for a fresh start. Outputs: `rotation6d` (1, 22, 6) local rotations, `position` (1, 22, 3) metres in
-the world, and the new `state.*` under the same names with the suffix `.next`.
+the world (the position branch's; of networks without one by forward kinematics), and the new `state.*` under
+the same names with the suffix `.next`.
 """
 
 from __future__ import annotations

@@ -62,9 +62,9 @@ def parity(model: MotionModel, path: Path, clip: Tensor) -> float:
 def tolerated(model: MotionModel, clip: Tensor, apart: float) -> bool:
     """Return whether a difference between torch and ONNX Runtime over a clip (N, 252) is rounding.
 
-    Up to TOLERANCE it is. Up to ROUNDING it may be, where a rotation hangs on next to nothing, as that of a
-    hip does whose swivel is counted about a straight leg from an axis along it (MANIKIN): then torch's own
-    rotations in float32 differ from those in float64 by half as much or more.
+    Up to TOLERANCE it is. Up to ROUNDING it may be, where a rotation is ill-conditioned, as that of a hip is
+    whose swivel is counted about a straight leg from an axis along it (MANIKIN): then torch's own rotations
+    in float32 differ from those in float64 by half as much or more.
     """
     if not TOLERANCE < apart <= ROUNDING:
         return apart <= TOLERANCE

@@ -10,6 +10,7 @@ that makes the windows of a clip together (`MotionModel.joint`) gets the whole c
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -51,7 +52,11 @@ class Evaluable(Protocol):
         """Return the state of a fresh start."""
 
     def advance(self, sparse: Tensor, state: State, newest: int | None = None) -> tuple[Tensor, State]:
-        """Map new inputs (B, n, 54) to motion (B, newest or T, 198) in the world, and the new state."""
+        """Map new inputs (B, n, 54) to motion in the world, and the new state.
+
+        The motion (B, newest, 198) is that of the newest frames; by default that of all frames that the
+        network makes of its window.
+        """
 
     def whole(self, sparse: Tensor) -> Tensor:
         """Map the inputs of a clip (N, 54), N >= T, to its motion (N, 198) in the world."""
@@ -137,13 +142,13 @@ def evaluate(
     ik: IK | None = None,
     own: metrics.OwnMetrics | None = None,
 ) -> dict[str, Any]:
-    """Compute the metrics of a split: `{"mean": {mode: {branch: {metric: value}}}, "clips": [...]}`.
+    """Compute the metrics of a dataset: `{"mean": {mode: {branch: {metric: value}}}, "clips": [...]}`.
 
     The mean is over clips of each clip's mean over frames.
 
     Args:
         network: the network to evaluate.
-        dataset: the split.
+        dataset: the part.
         modes: the evaluation modes.
         batch: how many clips are evaluated side by side, at most.
         ik: inverse kinematics, whose result is a further branch.
@@ -213,7 +218,7 @@ def joint_positions(motion: Tensor) -> Tensor:
 
 
 def chunks(dataset: MotionDataset, length: int, least: int) -> list[Tensor]:
-    """Cut a split's clips into pieces of `length` frames.
+    """Cut a dataset's clips into pieces of `length` frames.
 
     Pieces under `least` frames are left out, unless all of them are so short.
     """
@@ -238,9 +243,17 @@ def _at_least(sparse: Tensor, size: int) -> Tensor:
 
 
 def _mean(rows: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
-    """Return each branch's metrics, mean over clips; a clip too short for a metric does not count in it."""
-    first = rows[0]
+    """Return each branch's metrics, mean over clips; a clip too short for a metric does not count in it.
+
+    A clip on which the network's numbers are none counts: all means of that branch are NaN then.
+    """
     return {
-        branch: {name: float(torch.tensor([row[branch][name] for row in rows]).nanmean()) for name in values}
-        for branch, values in first.items()
+        branch: {name: _mean_of([row[branch] for row in rows], name) for name in values}
+        for branch, values in rows[0].items()
     }
+
+
+def _mean_of(rows: Sequence[dict[str, float]], name: str) -> float:
+    if any(math.isnan(row["MPJPE"]) for row in rows):  # which has a number on the shortest clip
+        return math.nan
+    return float(torch.tensor([row[name] for row in rows]).nanmean())

@@ -55,10 +55,15 @@ def predict_clip(model: MotionModel, clip: Tensor, mode: str) -> dict[str, np.nd
 
 
 def prediction_arrays(normalizer: Normalizer, clip: Tensor, motion: Tensor, ik: IK) -> dict[str, np.ndarray]:
-    """Return the content of a prediction file: metres in the world, local rotation matrices, float32.
+    """Return the content of a prediction file, float32.
 
-    `predicted_positions` (N, 22, 3) are those of the rotation branch by forward kinematics, the head on its
-    tracker. The result of inverse kinematics, if any, is in `combined_positions` and `combined_rotations`.
+    `*_positions` (N, 22, 3) are metres in the world; `*_rotations` (N, 22, 3, 3) local, the root's global.
+
+    Returns:
+        `predicted_positions` by forward kinematics of `predicted_rotations`, the head on its tracker;
+        `predicted_positions_of_position_branch`, the same for a network without such a branch;
+        `true_positions` and `true_rotations`; `combined_positions` and `combined_rotations` of inverse
+        kinematics, if any.
     """
     sparse, truth = clip[:, :SPARSE_DIM], clip[:, SPARSE_DIM:]
     arrays = {
@@ -88,7 +93,7 @@ def motion_clip(name: str, rotations: np.ndarray, positions: np.ndarray, rest: n
 
 
 @dataclass(frozen=True)
-class Predictor:
+class ClipPredictor:
     """A trained network that makes clips of clips.
 
     Attributes:

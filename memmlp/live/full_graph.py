@@ -119,7 +119,7 @@ class FullStep(nn.Module):
         return own | self.model.initial_state(1)
 
     def forward(self, positions: Tensor, rotations: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        """Map positions, rotations and states to the outputs and new states of this file's beginning."""
+        """Return the outputs and the new states that the module's docstring lists, in that order."""
         seen, last_positions, last_rotations = state[: len(OWN)]
         positions = positions @ self.world.T
         rotations = self.world @ rotations * self.body
@@ -150,9 +150,9 @@ class FullStep(nn.Module):
         return self.rotated(turned), positions @ self.world, joints @ self.world
 
     def reached(self, local: Tensor) -> Tensor:
-        """Return positions (1, 22, 3) relative to the root, as `BodyTree.positions` computes them.
+        """Return positions (1, 22, 3) relative to the root, by the products of `BodyTree.positions`.
 
-        It takes few operations on large arrays, which are quicker in a graph than many small ones.
+        They are few operations on large arrays, which are quicker in a graph than many small ones.
         """
         bottom = torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(1, N_JOINTS, 1, 4)
         transforms = torch.cat([torch.cat([local, self.offsets], -1), bottom], -2)

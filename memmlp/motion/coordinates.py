@@ -18,8 +18,8 @@ from memmlp.motion.body import (
 )
 
 
-class World:
-    """The world's own coordinates: the most literal reading of the paper. Also the slot's interface.
+class Coordinates:
+    """The slot's interface, with the world's own coordinates where it is not overridden.
 
     `origin` says, from a frame's inputs alone, where its local coordinates lie; `sparse_in`, `motion_in` and
     `motion_out` convert inputs and motion to and from them.
@@ -47,7 +47,11 @@ class World:
         return rotations
 
 
-class HeadRelative(World):
+class World(Coordinates):
+    """The world's own coordinates: the most literal reading of the paper."""
+
+
+class HeadRelative(Coordinates):
     """Coordinates whose horizontal origin is the head of the same frame; heights stay (reading 20)."""
 
     def origin(self, sparse: Tensor) -> Tensor:

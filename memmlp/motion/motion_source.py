@@ -63,13 +63,13 @@ class MotionSource:
     @property
     def cache(self) -> Path:
         """The folder of the cache, one for each source, split and body."""
-        key = repr(replace(self.source, root=self.source.root.resolve())) + (self.grouped or "")
+        key = repr(replace(self.source, root=self.source.root.resolve())) + (self.groups_digest or "")
         return self.caches / f"{self.source.root.name}-{hashlib.sha256(key.encode()).hexdigest()[:8]}"
 
     @property
-    def grouped(self) -> str | None:
+    def groups_digest(self) -> str | None:
         """A digest of the column file that says which clips belong together; None without one."""
-        return self.source.split.grouped
+        return self.source.split.groups_digest
 
     def prepare(self) -> Prepared:
         """Return the cache with its manifest; it is made if it is missing or out of date.

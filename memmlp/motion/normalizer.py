@@ -18,7 +18,7 @@ from memmlp.motion.body import (
     SPARSE_DIM,
     SPARSE_POSITION,
 )
-from memmlp.motion.coordinates import World
+from memmlp.motion.coordinates import Coordinates
 from memmlp.motion.geometry import bone_chains, forward_kinematics, matrix_to_sixd, sixd_to_matrix
 
 Change = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -43,7 +43,7 @@ class Normalizer(nn.Module):
     std: Tensor
     chains: Tensor
 
-    def __init__(self, coordinates: World, rest: Tensor, mean: Tensor, std: Tensor):
+    def __init__(self, coordinates: Coordinates, rest: Tensor, mean: Tensor, std: Tensor):
         super().__init__()
         self.coordinates = coordinates
         self.register_buffer("rest", rest.float())
@@ -52,12 +52,12 @@ class Normalizer(nn.Module):
         self.register_buffer("chains", bone_chains(), persistent=False)
 
     @classmethod
-    def raw(cls, coordinates: World, rest: Tensor) -> Normalizer:
+    def raw(cls, coordinates: Coordinates, rest: Tensor) -> Normalizer:
         """Make a normalizer that changes the coordinates alone, without z-scores."""
         return cls(coordinates, rest, torch.zeros(FRAME_DIM), torch.ones(FRAME_DIM))
 
     @classmethod
-    def fit(cls, coordinates: World, rest: Tensor, frames: Tensor, chunk: int = 65536) -> Normalizer:
+    def fit(cls, coordinates: Coordinates, rest: Tensor, frames: Tensor, chunk: int = 65536) -> Normalizer:
         """Make a normalizer with the z-scores of training frames (F, 252), which are read chunk by chunk."""
         plain = cls.raw(coordinates, rest).to(frames.device)
         count = len(frames)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from memmlp.motion.coordinates import World
+from memmlp.motion.coordinates import Coordinates
 from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.preparing.manifest import Manifest
 from memmlp.networks import checkpoint
@@ -34,7 +34,7 @@ class Architecture:
         vqvae: makes a VQ-VAE with fresh weights.
     """
 
-    coordinates: World
+    coordinates: Coordinates
     normalize: bool
     vqvae: Callable[[], VQVAE]
 

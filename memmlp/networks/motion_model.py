@@ -142,7 +142,7 @@ class MotionModel(nn.Module):
         return Learned(*self.advance(sparse, state), {})
 
     def count_parameters(self) -> int:
-        """Count the trainable parameters, which the tables call #Params.
+        """Count the trainable parameters, which tables show as parameters, in millions.
 
         A frozen VQ-VAE is not counted; one that is trained with the network is, its decoder included.
         """

@@ -53,7 +53,7 @@ class RecurrentBlock(nn.Module):
         return h + self.mlp(self.norm(h))
 
 
-class Output(nn.Module):
+class RotationOutput(nn.Module):
     """What a member's rotations (..., 132) stand for; the interface of the option `model.output`."""
 
     def begin(self, head: nn.Linear, normalizer: Normalizer) -> None:
@@ -68,7 +68,7 @@ class Output(nn.Module):
         return self.posed(made, sparse, normalizer)
 
 
-class LocalRotations(Output):
+class LocalRotations(RotationOutput):
     """Each joint's rotation in its parent's frame."""
 
     def posed(self, made: Tensor, sparse: Tensor, normalizer: Normalizer) -> Tensor:
@@ -76,7 +76,7 @@ class LocalRotations(Output):
         return normalizer.posed(made, sparse)
 
 
-class GlobalRotations(Output):
+class GlobalRotations(RotationOutput):
     """Each joint's rotation in the frame of the network's space.
 
     No joint inherits its ancestors' errors, and the positions are sums of turned bones.
@@ -115,7 +115,7 @@ class ReachingArms(GlobalRotations):
         return super().posed(made, sparse, normalizer)
 
 
-OUTPUTS: dict[str, type[Output]] = {
+OUTPUTS: dict[str, type[RotationOutput]] = {
     "local": LocalRotations,
     "global": GlobalRotations,
     "reaching": ReachingArms,

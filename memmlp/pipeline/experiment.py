@@ -90,7 +90,9 @@ class Experiment:
     @property
     def evaluations(self) -> dict[str, str]:
         """The identity of the evaluation in each mode."""
-        return {mode: evaluation_id(self.config, mode, self.data.grouped) for mode in self.evaluation.modes}
+        return {
+            mode: evaluation_id(self.config, mode, self.data.groups_digest) for mode in self.evaluation.modes
+        }
 
     @property
     def deployments(self) -> dict[str, Deployment]:

@@ -48,11 +48,13 @@ class Outcome:
         run: the network's run.
         made: the stages that were made just now, of "training", "evaluation" and "deployment".
         results: mode -> branch -> metric, and "latency".
+        stages: the identities of the evaluations and the deployment that these are of.
     """
 
     run: Run
     made: tuple[str, ...]
     results: dict[str, Any]
+    stages: tuple[str, ...]
 
 
 def of_tests(clips: Sequence[ClipRecord]) -> str:
@@ -91,7 +93,7 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
             model = experiment.architecture.load(run.weights()).to(experiment.device)
             test = data.open("test").to(experiment.device)
             save_predictions(experiment.evaluation, model, test, experiment.predictions)
-    return Outcome(run, tuple(made), results_of(experiment, run))
+    return Outcome(run, tuple(made), results_of(experiment, run), experiment.stages)
 
 
 def complete_stages(
@@ -261,7 +263,7 @@ def evaluate_run(experiment: Experiment, run: Run, data: Prepared, modes: Sequen
         model = experiment.architecture.load(run.weights()).to(experiment.device)
         test = data.open("test").to(experiment.device)
         for mode in modes:
-            settings = evaluation_settings(experiment.config, mode, experiment.data.grouped)
+            settings = evaluation_settings(experiment.config, mode, experiment.data.groups_digest)
             name = experiment.evaluations[mode]
             report = {"mode": mode, "run": run.manifest["id"], "name": name, "settings": settings}
             report |= {"recipes": evaluation_recipes(settings), **machine(experiment), **own_code(experiment)}

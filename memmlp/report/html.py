@@ -20,7 +20,7 @@ from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.formats import as_html
 from memmlp.tables.measured_run import Measured
 from memmlp.tables.table import Table
-from memmlp.tables.table_text import caption
+from memmlp.tables.table_text import better, caption
 
 ERROR = "MPJRE"  # the error in Fig. 1, by Sec. 4.3
 MOST_POINTS = 200  # about how many points a curve has at most
@@ -116,19 +116,20 @@ def published(accuracies: Sweep, latencies: Sweep) -> list[Point]:
 
 
 def _entries(chapters: Sequence[Chapter]) -> list[ReportedRun]:
-    """Return each finished run once, with all rows in which it stands."""
-    entries: dict[str, ReportedRun] = {}
+    """Return each finished run once for each of its deployments, with all rows in which it stands."""
+    entries: dict[tuple[str, str], ReportedRun] = {}
     for chapter in chapters:
         for label, runs in chapter.runs.items():
             for seed, measured in runs.items():
-                entry = entries.setdefault(measured.id, ReportedRun(measured))
+                key = measured.id, str(sorted(measured.costs.items()))
+                entry = entries.setdefault(key, ReportedRun(measured))
                 entry.places.append(f"{chapter.sweep.name}: {label}, seed {seed}")
     return list(entries.values())
 
 
 def _counted(entries: Sequence[ReportedRun]) -> str:
     """Say how many runs the tables have; other finished runs may lack an evaluation that these ask for."""
-    return f"{len(entries)} finished runs stand in these tables"
+    return f"{len({entry.measured.id for entry in entries})} finished runs stand in these tables"
 
 
 def _section(name: str, title: str, parts: Sequence[str]) -> str:
@@ -155,10 +156,17 @@ def _effects(chapters: Iterable[Chapter]) -> list[str]:
             note = (
                 f"Difference from '{chapter.table.control}', or from the arm's own control, with its 95 % "
                 "interval; filled where it is significant after Holm's correction; the shaded band is the "
-                "smallest effect of interest, the diamond the paper's difference. Left is better."
+                "smallest effect of interest, the diamond the paper's difference. Left is better"
+                f"{_but(chapter.table, 'right')}."
             )
             parts.append(_figure(chapter.title, svg, note))
     return parts
+
+
+def _but(table: Table, side: str) -> str:
+    """Say which of a table's metrics are better on the other side, where any are."""
+    higher = [metric for metric in table.measured_metrics if better(metric) == "higher"]
+    return f", of {', '.join(map(_text, higher))} {side}" if higher else ""
 
 
 def _distributions(chapters: Iterable[Chapter]) -> list[str]:
@@ -170,7 +178,8 @@ def _distributions(chapters: Iterable[Chapter]) -> list[str]:
             svg = figures.profiles(chapter.sweep.name, found)
             note = (
                 f"{chapter.table.modes[0].capitalize()} mode: the fraction of all runs' test clips whose "
-                "error is at most this; further up and left is better."
+                "value is at most this. Further up and left is better"
+                f"{_but(chapter.table, 'further down and right')}."
             )
             parts += [_figure(chapter.title, svg, note), _robust(found)]
     return parts
@@ -186,7 +195,7 @@ def _robust(found: Mapping[str, Sequence[Distribution]]) -> str:
     ]
     note = (
         "IQM: the mean of the middle half of all seeds and clips. P(better): how often a run of the arm has "
-        "a smaller error than one of its control on the same clip. Neither is a test."
+        "a better value than one of its control on the same clip. Neither is a test."
     )
     return _rows(head, rows, note)
 

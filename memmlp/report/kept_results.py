@@ -40,7 +40,8 @@ class Kept:
         arms: the overrides of each arm with which the runs were made.
         rounds: the rounds in which seeds were spent, as JSON holds them; None where they were not.
         flags: what a reader has to know of how the seeds came about.
-        predicted: the FLOPs of a training with other overrides in place of the axes', by these overrides.
+        predicted: the FLOPs of the control's training at the scale that the sweep predicts for, by the
+            overrides of that scale as one line.
     """
 
     sweep: str
@@ -63,7 +64,7 @@ class Kept:
 
     @property
     def every(self) -> list[Measured]:
-        """The runs, each once for each of its evaluations that arms show, in the order of their names."""
+        """The runs, once for each evaluation and deployment that arms show, in the order of their names."""
         return [run for _, run in sorted(self.named.items())]
 
     @property
@@ -76,20 +77,32 @@ class Kept:
         """The runs by their names in the file.
 
         That is the id; where arms show several evaluations of one run, such as inverse kinematics of two
-        kinds, it is the id and a digest of the errors.
+        kinds, it is the id and a digest of the errors; where they show several deployments, one of the costs
+        stands behind that.
         """
-        found: dict[str, dict[str, Measured]] = {}
+        found: dict[tuple[str, str, str], Measured] = {}
         for run in (run for runs in self.runs.values() for run in runs.values()):
-            found.setdefault(run.id, {})[_errors_key(run)] = run
-        return {
-            run.id if len(same) == 1 else f"{run.id}/{key}": run
-            for same in found.values()
-            for key, run in same.items()
-        }
+            found[_key(run)] = run
+        return {self._name(key, found): run for key, run in found.items()}
 
     def name(self, run: Measured) -> str:
         """Return a run's name in the file."""
-        return run.id if run.id in self.named else f"{run.id}/{_errors_key(run)}"
+        run_id, errors, costs = _key(run)
+        return next(
+            name
+            for name in (run_id, f"{run_id}/{errors}", f"{run_id}/{errors}-{costs}")
+            if name in self.named
+        )
+
+    @staticmethod
+    def _name(key: tuple[str, str, str], every: Iterable[tuple[str, str, str]]) -> str:
+        """Return the name of what has that id, errors and costs among all that are kept."""
+        run_id, errors, costs = key
+        same = [one[1:] for one in every if one[0] == run_id]
+        if len(same) == 1:
+            return run_id
+        alike = [one for one in same if one[0] == errors]
+        return f"{run_id}/{errors}" if len(alike) == 1 else f"{run_id}/{errors}-{costs}"
 
     def merged(self, other: Kept) -> Kept:
         """Return the results with another's runs added; where both have an arm and seed, the other's stands.
@@ -166,7 +179,7 @@ class Kept:
 
 def overrides_of(sweep: Sweep) -> dict[str, tuple[str, ...]]:
     """Return the overrides that a sweep's file gives each arm, the base's included."""
-    bare = replace(sweep, extra=())
+    bare = replace(sweep, command_line=())
     return {arm.label: without_paths(bare.overrides(arm)) for arm in sweep.runnable()}
 
 
@@ -254,15 +267,27 @@ def _errors(run: Measured) -> dict[str, Any]:
     }
 
 
-def _errors_key(run: Measured) -> str:
-    return hashlib.sha256(json.dumps(_errors(run), sort_keys=True).encode()).hexdigest()[:8]
+def _key(run: Measured) -> tuple[str, str, str]:
+    """Return a run's id, and digests of the errors and the costs that are kept of it."""
+    parts = (json.dumps(part, sort_keys=True) for part in (_errors(run), _shortened_costs(run)))
+    errors, costs = (hashlib.sha256(part.encode()).hexdigest()[:8] for part in parts)
+    return run.id, errors, costs
+
+
+def _shortened_costs(run: Measured) -> dict[str, Any]:
+    return {name: _short(cost) for name, cost in run.costs.items()}
 
 
 def _record(run: Measured) -> dict[str, Any]:
     """Return what is kept of a run."""
-    costs = {name: _short(cost) for name, cost in run.costs.items()}
+    costs = _shortened_costs(run)
     origin = plain(asdict(run.origin))
-    for name in ("partial", "processes", "offline"):  # files from before there were these have none
+    for name in (
+        "partial",
+        "processes",
+        "offline",
+        "deployed",
+    ):  # files from before there were these have none
         if origin[name] == getattr(Origin, name):
             del origin[name]
     training = {"training": {name: _short(number) for name, number in run.training.items()}}

@@ -263,8 +263,9 @@ class Words:
     def way(self, name: str, mode: str = "stream") -> str:
         """Return a table of how each step of a chain of arms changes each metric, with its share of the way.
 
-        The chain leads from arm to control, and ends at the table's control; without one the text is empty. A
-        share is shown where the interval of the whole way does not contain 0.
+        In a chain each arm is the control of the one before it, and the table's control is its end; without a
+        chain the text is empty. Shares are of the difference between its two ends, and shown where that one's
+        interval does not contain 0.
         """
         table = self._table(name)
         steps = _chain(table)

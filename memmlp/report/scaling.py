@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from memmlp.sweep.spec import COMPUTE
 from memmlp.tables.formats import escaped
-from memmlp.tables.scaling import MODE, Bounds, Change, Slope, Trend, Trends
+from memmlp.tables.scaling import MODE, Bounds, Slope, Trend, Trends, TrendVerdict
 from memmlp.tables.table_text import places, signed, with_unit
 
 SIGNS = {1: "higher", -1: "lower", 0: "open", None: "no verdict"}
@@ -194,7 +194,7 @@ def _changes(own: Sequence[Trend], name: str) -> str:
     """Group an effect's metrics by the verdict on their slopes."""
     verdicts = [(trend.slopes[name].verdict, trend.metric) for trend in own if name in trend.slopes]
     parts = []
-    for verdict in (*Change, None):
+    for verdict in (*TrendVerdict, None):
         metrics = [metric for one, metric in verdicts if one == verdict]
         parts += [f"{verdict or 'no verdict'} in {_listed(metrics)}"] if metrics else []
     return f"against {escaped(name)} {', '.join(parts)}"

@@ -29,7 +29,7 @@ NOT_NUMBERS = (
     "tables",
     "tracking",
 )
-"""Folders of the package whose code no result of a run comes from."""
+"""Folders of the package whose code no result comes from, but for the times of whole poses (`live`)."""
 WIRING = ("config/build.py", "config/instantiate.py")  # they decide what reaches the constructors
 PATCH = 1_000_000  # at most so many characters of changes are kept with a run
 

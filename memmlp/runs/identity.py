@@ -98,7 +98,7 @@ class Identity:
 
     @property
     def what(self) -> str:
-        """Everything that `id` is a digest of but the recipe numbers.
+        """A digest of all that `id` is one of but the recipe numbers.
 
         It is equal in runs that differ by the age of their code alone.
         """
@@ -120,9 +120,9 @@ def run_id(kind: str, config: Mapping[str, Any], *, data: str, upstream: str | N
     return _digest(what | {"recipes": recipes(list(trained_components(kind, config)))})
 
 
-def evaluation_id(config: Mapping[str, Any], mode: str, grouped: str | None = None) -> str:
+def evaluation_id(config: Mapping[str, Any], mode: str, groups_digest: str | None = None) -> str:
     """Return the identity of a run's evaluation in a mode: a word and 16 hex digits."""
-    return evaluation_name(evaluation_settings(config, mode, grouped))
+    return evaluation_name(evaluation_settings(config, mode, groups_digest))
 
 
 def evaluation_name(settings: Mapping[str, Any]) -> str:
@@ -139,15 +139,17 @@ def evaluation_recipes(settings: Mapping[str, Any]) -> dict[str, int]:
     return recipes(["metrics", f"mode.{settings['mode']}", *solver, *own])
 
 
-def evaluation_settings(config: Mapping[str, Any], mode: str, grouped: str | None = None) -> dict[str, Any]:
+def evaluation_settings(
+    config: Mapping[str, Any], mode: str, groups_digest: str | None = None
+) -> dict[str, Any]:
     """Return the settings that an evaluation's result follows from, beside the run and its data.
 
-    `grouped` is a digest of the column file that says which clips belong together; None without one.
+    `groups_digest` is a digest of the column file that says which clips belong together; None without one.
     """
     group = config.get("evaluation", {})
     ik = group.get("ik", "off")
     solver = {"ik": ik} | ({"ik_iterations": group.get("ik_iterations")} if ik == "lbfgs" else {})
-    groups = _groups(config.get("data") or {}) | ({"groups_file": grouped} if grouped else {})
+    groups = _groups(config.get("data") or {}) | ({"groups_file": groups_digest} if groups_digest else {})
     drawn = {"batch": group.get("batch")} if inference(config).get("memory.blend") == "sampled" else {}
     measured = {"metrics": own} if (own := _own_metrics(group.get("metrics") or ())) else {}
     return {"mode": mode, **solver, **inference(config), **groups, **drawn, **measured}

@@ -48,7 +48,7 @@ def is_trained(run: Run) -> bool:
 def check_trained(run: Run) -> None:
     """Raise InputError where it is no finished run of a motion network."""
     if not is_trained(run):
-        raise InputError(f"run {run.id}: not a finished Mem-MLP run")
+        raise InputError(f"run {run.id}: not a finished run of a motion network")
 
 
 def _enumerate(names: Iterable[str], most: int = 8) -> str:

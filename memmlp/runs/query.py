@@ -33,9 +33,9 @@ DEEPEST = 50  # parentheses and "not"s in one another
 def record(run: Run) -> dict[str, Any]:
     """Return the values that conditions can use for a run, by key.
 
-    These are its id, kind, status, name, started, tag, note and step; its data by name (`data`) and by digest
-    (`data_digest`); the keys of its config, slots also by their name alone (`memory` for `memory.name`); and
-    its results, those of the rotation branch also without the branch (`stream.MPJPE` for
+    These are its id, kind, status, name, started, upstream, user, tag and note; its data by name (`data`) and
+    by digest (`data_digest`); the keys of its config, slots also by their name alone (`memory` for
+    `memory.name`); and its results, those of the rotation branch also without the branch (`stream.MPJPE` for
     `stream.rotation.MPJPE`).
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)

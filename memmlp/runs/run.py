@@ -210,7 +210,7 @@ class Run:
         If the code was changed since its commit, the patch is written beside them.
 
         Args:
-            kind: "vqvae" or "memmlp" (see `Identity`).
+            kind: what is trained (see `Identity`).
             config: the resolved config.
             data: digest of the prepared data.
             upstream: id of the run whose artifact this one uses.

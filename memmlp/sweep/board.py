@@ -109,7 +109,9 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
     for seed in seeds:
         table.add_column(f"seed {seed}", no_wrap=True)
     for label in dict.fromkeys(entry.label for entry in plan.entries):
-        cells = {e.seed: cell(plan, tasks[e.key], states[e.key]) for e in plan.entries if e.label == label}
+        cells = {
+            e.seed: state_text(plan, tasks[e.key], states[e.key]) for e in plan.entries if e.label == label
+        }
         table.add_row(Text(label), *(cells.get(seed, Text("-")) for seed in seeds))
     below = [_upstream(plan, task, states[task.key]) for task in plan.tasks if task.kind != NETWORK]
     running = [plan.run_of(task) for task in plan.tasks if states[task.key] == "running"]
@@ -124,7 +126,7 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
     return Group(table, *below)
 
 
-def cell(plan: Plan, task: RunTask, state: str) -> Text:
+def state_text(plan: Plan, task: RunTask, state: str) -> Text:
     """Describe a run in a few characters."""
     run = plan.run_of(task)
     if state == "running":
@@ -135,7 +137,7 @@ def cell(plan: Plan, task: RunTask, state: str) -> Text:
 
 
 def _upstream(plan: Plan, task: RunTask, state: str) -> Text:
-    return Text(f"{name(plan, task)}: ") + cell(plan, task, state)
+    return Text(f"{name(plan, task)}: ") + state_text(plan, task, state)
 
 
 def result(run: Run) -> str:

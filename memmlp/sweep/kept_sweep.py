@@ -29,12 +29,14 @@ def kept(folder: Path) -> Sweep | None:
         return None
     try:
         content = json.loads(path.read_bytes())
+        if "extra" in content:  # what earlier versions called it
+            content["command_line"] = content.pop("extra")
         content["arms"] = tuple(
             Arm(**_with_tuples(arm, ("overrides", "seeds", "cell"))) for arm in content["arms"]
         )
         scale = content.get("scale")
         content["scale"] = Scale(**_with_tuples(scale, ("against", "predict"))) if scale else None
-        return Sweep(**_with_tuples(content, ("notes", "base", "seeds", "arms", "metrics", "extra")))
+        return Sweep(**_with_tuples(content, ("notes", "base", "seeds", "arms", "metrics", "command_line")))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: not a sweep ({error}); start the sweep again") from None
 

@@ -83,11 +83,11 @@ class Plan:
 
     def run(self, label: str, seed: int) -> Run | None:
         """Return the run of an arm with a seed, finished or not; None where its identity is not known."""
-        found = self._by_cell.get((label, seed))
+        found = self._by_entry.get((label, seed))
         return Run.of(self.outputs, found) if found else None
 
     @cached_property
-    def _by_cell(self) -> dict[tuple[str, int], str]:
+    def _by_entry(self) -> dict[tuple[str, int], str]:
         return {(entry.label, entry.seed): entry.id for entry in self.entries}
 
     def run_of(self, task: RunTask | Entry) -> Run:

@@ -97,7 +97,7 @@ class Sweep:
         arms: the rows in order.
         control: the label of the arm that the others are compared with.
         metrics: the columns.
-        extra: overrides of the command line.
+        command_line: overrides of the command line.
         branch_source: how we know which branch the paper's values belong to; None where the file does not
             say.
         smallest: the smallest effect of interest by metric, in its unit; every metric but costs has one.
@@ -114,7 +114,7 @@ class Sweep:
     arms: tuple[Arm, ...]
     control: str
     metrics: tuple[str, ...]
-    extra: tuple[str, ...] = ()
+    command_line: tuple[str, ...] = ()
     branch_source: str | None = None
     smallest: Mapping[str, float] = field(default_factory=lambda: SMALLEST)
     scale: Scale | None = None
@@ -161,7 +161,7 @@ class Sweep:
         others = tuple(word for word in overrides if not word.startswith("seed="))
         self._check_keys_of_arms(others)
         chosen = parse_seeds(seeds[-1].split(","), "seed") if seeds else self.seeds
-        return replace(self, extra=(*self.extra, *others), seeds=chosen)
+        return replace(self, command_line=(*self.command_line, *others), seeds=chosen)
 
     def _check_keys_of_arms(self, overrides: Iterable[str]) -> None:
         """Raise InputError for an override of a key that an arm sets itself."""
@@ -175,7 +175,7 @@ class Sweep:
 
     def overrides(self, arm: Arm) -> tuple[str, ...]:
         """Return an arm's overrides: the base's, the command line's, its own; the last one for a key wins."""
-        words = (*self.base, *self.extra, *(arm.overrides or ()))
+        words = (*self.base, *self.command_line, *(arm.overrides or ()))
         return tuple({_key(word): word for word in words}.values())
 
     def runnable(self) -> tuple[Arm, ...]:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from memmlp.evaluation.units import HIGHER
 from memmlp.sweep.spec import COSTS, Arm, Sweep
 from memmlp.tables.effects import RunsBySeed, control_arm, with_existing_branches
 from memmlp.tables.statistics import interquartile_mean, probability_of_improvement
@@ -19,8 +20,9 @@ class Distribution(NamedTuple):
         label: the arm's label.
         errors: the errors (S, C) by seed and clip; empty where there are none.
         middle: their interquartile mean; None where there are none.
-        improvement: the probability that a run of the arm has a smaller error than one of its control on the
-            same clip; None without a control or a shared clip.
+        improvement: the probability that a run of the arm has a better value than one of its control on the
+            same clip: a smaller error, or a larger value of a metric of which more is better; None without a
+            control or a shared clip.
     """
 
     label: str
@@ -47,7 +49,8 @@ def _of_metric(
 ) -> list[Distribution]:
     arms = [arm for arm in sweep.runnable() if runs[arm.label]]
     errors = {arm.label: _errors(runs[arm.label], clips, mode, arm, metric) for arm in arms}
-    return [_distribution(arm.label, errors, control_arm(sweep, arm)) for arm in arms]
+    sign = -1 if metric in HIGHER else 1
+    return [_distribution(arm.label, errors, control_arm(sweep, arm), sign) for arm in arms]
 
 
 def _errors(runs: RunsBySeed, clips: list[str], mode: str, arm: Arm, metric: str) -> np.ndarray:
@@ -55,10 +58,11 @@ def _errors(runs: RunsBySeed, clips: list[str], mode: str, arm: Arm, metric: str
     return np.array([run.by_clip(clips, mode, arm.branch, metric) for run in runs.values()])
 
 
-def _distribution(label: str, errors: Mapping[str, np.ndarray], other: Arm | None) -> Distribution:
+def _distribution(label: str, errors: Mapping[str, np.ndarray], other: Arm | None, sign: int) -> Distribution:
     """Return an arm's distribution, over the clips for which all its runs have a number.
 
-    The comparison with the control is over the clips for which the control's runs have one, too.
+    The comparison with the control is over the clips for which the control's runs have one, too. `sign` is -1
+    where larger values are better.
     """
     every, theirs = errors[label], errors.get(other.label) if other else None
     known = np.isfinite(every).all(0)
@@ -67,4 +71,5 @@ def _distribution(label: str, errors: Mapping[str, np.ndarray], other: Arm | Non
     both = known & np.isfinite(theirs).all(0) if theirs is not None else known
     if theirs is None or not both.any():
         return Distribution(label, ours, middle, None)
-    return Distribution(label, ours, middle, probability_of_improvement(every[:, both], theirs[:, both]))
+    improvement = probability_of_improvement(sign * every[:, both], sign * theirs[:, both])
+    return Distribution(label, ours, middle, improvement)

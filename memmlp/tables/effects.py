@@ -20,7 +20,7 @@ from memmlp.tables.table import Effect, Key
 RunsBySeed = Mapping[int, Measured]  # an arm's finished runs by seed
 
 
-class Shared(NamedTuple):
+class SharedClips(NamedTuple):
     """What an arm's runs share with those of its control.
 
     Attributes:
@@ -123,7 +123,7 @@ def _compared(sweep: Sweep) -> Iterator[tuple[Arm, Arm]]:
 def _paired(
     ours: RunsBySeed,
     theirs: RunsBySeed,
-    shared: Shared,
+    shared: SharedClips,
     branches: tuple[str, str],
     mode: str,
     metric: str,
@@ -140,13 +140,13 @@ def _paired(
     return Paired(matrix[:, known], groups[known], *map(tuple, zip(*left, strict=True)))
 
 
-def _shared(ours: RunsBySeed, theirs: RunsBySeed) -> Shared:
+def _shared(ours: RunsBySeed, theirs: RunsBySeed) -> SharedClips:
     """Return what an arm and its control share."""
     seeds = [seed for seed in ours if seed in theirs]
     known = [runs[seed].clips for runs in (ours, theirs) for seed in seeds]
     clips = [name for name in known[0] if all(name in other for other in known)] if known else []
     names = [ours[seeds[0]].group(clip) for clip in clips]
-    return Shared(seeds, clips, names, np.unique(np.array(names, dtype=str), return_inverse=True)[1])
+    return SharedClips(seeds, clips, names, np.unique(np.array(names, dtype=str), return_inverse=True)[1])
 
 
 def alike(pairs: Mapping[Key, Paired]) -> Iterator[tuple[list[Key], np.ndarray, np.ndarray]]:

@@ -69,13 +69,21 @@ def flags(
     if set(sweep.metrics) - set(COSTS):
         yield from _replicates(sweep, runs)
         yield from _body(sweep, every)
+        yield from _less_precise(every)
+
+
+def _less_precise(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
+    """Flag arms whose size and times are those of another file than the network that errors are of."""
+    found = [label for label, run in every if run.origin.deployed != "fp32"]
+    if found:
+        yield f"size and times are of a file of less precision, errors of float32: {_quoted(found)}"
 
 
 def _other_data(sweep: Sweep) -> Iterable[str]:
     """Flag a table of the paper that names its data (a protocol on AMASS) and is shown for other data."""
     own, chosen = (
         next((word for word in reversed(words) if word.startswith("data=")), None)
-        for words in (sweep.base, sweep.extra)
+        for words in (sweep.base, sweep.command_line)
     )
     if sweep.table and own and chosen and own != chosen:
         yield f"a table of {own}, shown with {chosen}: its errors do not compare with the paper's"
@@ -294,7 +302,15 @@ def _same(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     for arm in sweep.runnable():
         other = control_arm(sweep, arm)
         if other and one_and_the_same(arm, other, runs[arm.label], runs[other.label]):
-            yield f"'{arm.label}' and '{other.label}' are one run: what tells them apart has no effect here"
+            said = _apart(runs[arm.label], runs[other.label])
+            yield f"'{arm.label}' and '{other.label}' are one run: {said}"
+
+
+def _apart(ours: RunsBySeed, theirs: RunsBySeed) -> str:
+    """Say what the difference between two arms of the same runs and errors has an effect on."""
+    if any(ours[seed].costs != theirs[seed].costs for seed in ours.keys() & theirs.keys()):
+        return "they differ in how it is deployed, and in nothing but costs"
+    return "what tells them apart has no effect here"
 
 
 def _single(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:

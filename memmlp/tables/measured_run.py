@@ -44,6 +44,7 @@ class Origin:
         partial: which part of its protocol's list the data is, in words; None where it is all of it.
         plugins: version and digest of the code of each package of one's own that it uses.
         offline: whether its frames are made with later ones, so that it is no stream.
+        deployed: the precision of the exported file that its size and times are of.
     """
 
     code: str
@@ -62,6 +63,7 @@ class Origin:
     partial: str | None = None
     plugins: Mapping[str, str] = field(default_factory=dict)
     offline: bool = False
+    deployed: str = "fp32"
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,8 @@ class Measured:
         means: the metrics' means over the test clips.
         clips: the metrics of each clip, by its name.
         groups: the group (take, subject) of each clip; a clip that is not named is a group of its own.
-        costs: GFLOP, GMAC and ms of a streaming step, its time over the yardstick's in the same minute,
+        costs: GFLOP and GMAC of the network as it was trained, for one frame; ms of a step of the exported
+            graph, its time over the yardstick's in the same minute,
             millions of parameters, MB of the ONNX file, frames a second, and how much of the time that was
             measured the thread had a core.
         origin: what the run was made from.
@@ -182,7 +185,7 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
             sources |= {clip["name"]: clip["source"]} if clip.get("source") else {}
     deployments = [run.deployment(name) for name in stages or () if run.deployment(name).done]
     latency = (deployments or [run.preferred_deployment])[-1].record
-    origin = _evaluated(_origin(manifest), reports)
+    origin = replace(_evaluated(_origin(manifest), reports), deployed=_deployed(latency))
     training = _training(run, manifest)
     return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run, sources, training)
 
@@ -246,11 +249,22 @@ def _read(path: Path) -> dict[str, Any]:
     return content
 
 
-def _costs(latency: Mapping[str, float]) -> dict[str, float]:
-    """Return the costs that were measured, in the units of the tables."""
+def _deployed(latency: Mapping[str, Any]) -> str:
+    """Return the precision of the file that a deployment was asked for, where it has it; else fp32."""
+    precision = str((latency.get("settings") or {}).get("precision", "fp32"))
+    return precision if precision in latency else "fp32"
+
+
+def _costs(latency: Mapping[str, Any]) -> dict[str, float]:
+    """Return the costs that were measured, in the units of the tables.
+
+    Size and times are those of the file in the precision that was asked for; the network alone has no other
+    than that in float32, whose time it is.
+    """
+    less_precise = latency.get(_deployed(latency), {})
 
     def of(name: str) -> float:
-        return float(latency.get(name, np.nan))
+        return float(less_precise.get(name, latency.get(name, np.nan)))
 
     costs = {
         "FLOPs": of("flops") / 1e9,

@@ -126,7 +126,8 @@ class Rounds:
     def counts(self, sweep: Sweep) -> dict[str, int]:
         """Return how many seeds each arm is to be trained with.
 
-        They are the most that a look asks for, taken or next: its own, or that of an arm compared with it.
+        They are those of its latest or next look, or of such a look of an arm that is compared with it,
+        whichever are more.
         """
         ahead = self.next_looks(sweep)
         found = {arm.label: self.looks[0] for arm in sweep.runnable()}

@@ -20,7 +20,7 @@ from memmlp.tables.table import Key
 MODE = "stream"
 
 
-class Change(StrEnum):
+class TrendVerdict(StrEnum):
     """What may be claimed of how an effect changes along the axes.
 
     RISES and FALLS are changes whose size is known, but not that of the effect at either end.
@@ -77,11 +77,11 @@ class Slope:
 
     change: Bounds
     p: float | None
-    verdict: Change | None
+    verdict: TrendVerdict | None
 
 
 @dataclass(frozen=True)
-class Prediction:
+class EffectPrediction:
     """The effect that one more cell would show elsewhere, if the line goes on straight.
 
     Attributes:
@@ -103,7 +103,8 @@ class Trend:
         control: its control's.
         metric: the metric.
         points: the measured cells.
-        clips: how many test clips all of its cells share; `lost`, how many more single ones have.
+        clips: how many test clips all of its cells share.
+        lost: how many more clips only some of its cells have.
         varied: what differs between the cells, the names of the line's slopes.
         line: the line; None where `reason` says why there is none.
         slopes: its slopes by name.
@@ -122,7 +123,7 @@ class Trend:
     line: Line | None
     slopes: Mapping[str, Slope]
     reason: str = ""
-    predicted: Prediction | None = None
+    predicted: EffectPrediction | None = None
 
     @property
     def most(self) -> dict[str, float]:
@@ -154,8 +155,8 @@ class Trends:
         name, title: the sweep's.
         against: what they are shown against; the first is a figure's axis.
         trends: the effects, series by series, each metric.
-        cells: how many cells were measured, of how many that the sweep has, each an arm's.
-        wanted: the latter number.
+        cells: how many cells were measured, each an arm's.
+        wanted: how many the sweep has.
         predict: the overrides whose compute the effects are predicted for; None for none.
         compute: that compute, FLOPs; None where it is not known.
         seconds: how long the trainings took together.
@@ -202,7 +203,7 @@ def trends(
     assert sweep.scale is not None
     pairs = paired(sweep, runs, (MODE,))
     metrics = [metric for metric in sweep.metrics if metric not in COSTS]
-    series = list(dict.fromkeys(arm.series for arm, _ in _in_cells(sweep)))
+    series = list(dict.fromkeys(arm.series for arm, _ in in_cells(sweep)))
     found = [_trend(sweep, runs, pairs, name, metric) for name in series for metric in metrics]
     words = " ".join(sweep.scale.predict) or None
     compute = (predicted or {}).get(words or "")
@@ -220,7 +221,7 @@ def trends(
     )
 
 
-def _in_cells(sweep: Sweep) -> list[tuple[Arm, Arm]]:
+def in_cells(sweep: Sweep) -> list[tuple[Arm, Arm]]:
     """Return the arms that are compared within their cell, each with its control."""
     found = [(arm, control_arm(sweep, arm)) for arm in sweep.runnable() if arm.cell]
     return [(arm, other) for arm, other in found if other is not None and other.cell == arm.cell]
@@ -231,7 +232,7 @@ def _trend(
 ) -> Trend:
     """Return an effect in a metric, whose slopes have no verdicts yet."""
     assert sweep.scale is not None
-    own = [(arm, other) for arm, other in _in_cells(sweep) if arm.series == series]
+    own = [(arm, other) for arm, other in in_cells(sweep) if arm.series == series]
     cells = _cells(sweep, runs, {arm.label: pairs.get(Key(arm.label, MODE, metric)) for arm, _ in own}, own)
     differences, groups, lost = _shared([cell.pair for cell in cells])
     values = [cell.values for cell in cells]
@@ -361,7 +362,7 @@ def _predicted(found: Sequence[Trend], compute: float | None) -> list[Trend]:
     return [
         trend
         if one is None
-        else replace(trend, predicted=Prediction(_bounds(one)[0], _signed(sign, float(one.mean[0]))))
+        else replace(trend, predicted=EffectPrediction(_bounds(one)[0], _signed(sign, float(one.mean[0]))))
         for trend, one, sign in zip(found, estimates, signs, strict=True)
     ]
 
@@ -370,17 +371,17 @@ def _signed(sure: int | None, mean: float) -> int | None:
     return None if sure is None else sure * (1 if mean > 0 else -1)
 
 
-def _verdict(trend: Trend, name: str, p: float) -> Change:
+def _verdict(trend: Trend, name: str, p: float) -> TrendVerdict:
     """Return what may be claimed of a slope, from the signs that the line has at both ends for certain."""
     if p > LEVEL:
-        return Change.NONE
+        return TrendVerdict.NONE
     every = [point.values[name] for point in trend.points]
     first, last = (trend.at({name: value}) for value in (min(every), max(every)))
     if not first.sign and not last.sign:
-        return Change.RISES if last.mean > first.mean else Change.FALLS
+        return TrendVerdict.RISES if last.mean > first.mean else TrendVerdict.FALLS
     if first.sign * last.sign < 0:
-        return Change.TURNS
-    return Change.GROWS if abs(last.mean) > abs(first.mean) else Change.FADES
+        return TrendVerdict.TURNS
+    return TrendVerdict.GROWS if abs(last.mean) > abs(first.mean) else TrendVerdict.FADES
 
 
 def _bounds(estimate: Estimate) -> list[Bounds]:

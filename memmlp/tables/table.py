@@ -178,10 +178,21 @@ class Table:
         return Counter(verdict for verdict in found if verdict is not None)
 
     def detectable(self, mode: str, metric: str) -> float | None:
-        """Return the smallest difference that every arm's comparison would have found with 80 % power."""
+        """Return the smallest difference that every comparison would have found with 80 % power.
+
+        Those in which nothing would have been found, as of one seed, are passed over (`blind`).
+        """
         known = [
             effect.detectable
             for _, name, _, effect in self.effects(mode)
             if name == metric and effect.detectable is not None
         ]
         return max(known, default=None)
+
+    def blind(self, mode: str, metric: str) -> list[str]:
+        """Return the labels of the arms in whose comparison no difference at all would have been found."""
+        return [
+            row.label
+            for row in self.rows
+            if (effect := row.cells[mode][metric].effect) is not None and effect.detectable is None
+        ]

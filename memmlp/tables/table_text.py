@@ -183,7 +183,9 @@ def _power(table: Table) -> list[str]:
         ]
         if words:
             what = f"{' or '.join(words)} {unit(metric)}"
-            lines.append(f"{metric}: in every arm {what} would have been found, with 80 % power")
+            blind = dict.fromkeys(label for mode in seen for label in table.blind(mode, metric))
+            but = f" but {', '.join(repr(label) for label in blind)}" if blind else ""
+            lines.append(f"{metric}: in every arm{but} {what} would have been found, with 80 % power")
         elif seen:
             lines.append(f"{metric}: too few seeds to have found even a difference as large as the values")
     return lines

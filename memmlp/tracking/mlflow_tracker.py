@@ -89,7 +89,7 @@ class MLflow:
         with self._client() as client:
             experiment = experiment_id(client, self)
             parent = _sweep_run(client, experiment, facts)
-            for run_id, label in facts.labels.items():
+            for run_id, label in facts.arms.items():
                 for child in found(client, experiment, run_id):
                     client.set_tag(child.info.run_id, f"memmlp.arm.{facts.name}", label)
                     if "mlflow.parentRunId" not in child.data.tags:
@@ -174,7 +174,7 @@ def contradicts(client: MlflowClient, old: MlflowRun, facts: Facts, points: Sequ
     MLflow can't take back values and parameters, so that such a run has to be made anew. It is one of an
     earlier start, or of steps that were repeated with other values.
     """
-    if old.data.tags.get("memmlp.started") not in (None, facts.tags.get("started")):
+    if old.data.tags.get("memmlp.started") not in (None, facts.origin.get("started")):
         return True
     params = _params(facts)
     if any(params.get(key) != value for key, value in old.data.params.items()):
@@ -236,13 +236,13 @@ def _params(facts: Facts) -> dict[str, str]:
 
 
 def _run_tags(facts: Facts) -> dict[str, str]:
-    tags = {f"memmlp.{key.replace(' ', '_')}": value for key, value in facts.tags.items()}
-    tags |= {f"memmlp.label.{label}": "yes" for label in facts.labels}
+    tags = {f"memmlp.{key.replace(' ', '_')}": value for key, value in facts.origin.items()}
+    tags |= {f"memmlp.label.{label}": "yes" for label in facts.tags}
     tags |= {"memmlp.run_id": facts.id, "memmlp.folder": str(facts.folder), "mlflow.runName": facts.name}
     tags |= {"mlflow.source.name": "memmlp", "mlflow.source.type": "LOCAL"}
     given = {
-        "mlflow.source.git.commit": facts.tags.get("commit"),
-        "mlflow.user": facts.tags.get("user"),
+        "mlflow.source.git.commit": facts.origin.get("commit"),
+        "mlflow.user": facts.origin.get("user"),
         "mlflow.note.content": facts.note or None,
         "memmlp.failure": facts.reason,
     }

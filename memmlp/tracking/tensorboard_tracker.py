@@ -76,7 +76,7 @@ class ShownInTensorBoard:
         self.log(results)
         config = "\n".join(f"| {key} | {value} |" for key, value in facts.config.items())
         texts = {"status": facts.status, "reason": facts.reason, "note": facts.note}
-        texts |= {"tags": ", ".join(facts.labels), "config": f"| key | value |\n|---|---|\n{config}"}
+        texts |= {"tags": ", ".join(facts.tags), "config": f"| key | value |\n|---|---|\n{config}"}
         for key, text in texts.items():
             if text:
                 self.writer.text(key, text)

@@ -51,8 +51,8 @@ class Facts:
         reason: why it failed; None if it did not.
         started, ended: seconds since 1970; `ended` is None while it runs.
         config: its config by dotted key, as text.
-        tags: facts of its origin by name; people's own tags are `labels`.
-        labels: the tags that people gave it.
+        origin: facts of its origin by name.
+        tags: the tags that people gave it.
         note: their note; empty for none.
         data: name and digest of its data.
         results: its results by name, as curves of one point.
@@ -67,8 +67,8 @@ class Facts:
     started: float
     ended: float | None
     config: Mapping[str, str]
-    tags: Mapping[str, str]
-    labels: tuple[str, ...]
+    origin: Mapping[str, str]
+    tags: tuple[str, ...]
     note: str
     data: tuple[str, str]
     results: Mapping[str, float]
@@ -103,8 +103,8 @@ def facts_of(run: Run, running: bool = False) -> Facts:
         started=started,
         ended=None if status == "running" else _ended(run, started),
         config={key: str(value) for key, value in flatten(config).items()},
-        tags=_tags(manifest),
-        labels=notes.tags,
+        origin=_origin(manifest),
+        tags=notes.tags,
         note=notes.note,
         data=(str((config.get("data") or {}).get("name") or "data"), str(manifest.get("data"))),
         results={k.replace(".", "/"): float(v) for k, v in flatten(run.results).items() if _number(v)},
@@ -123,7 +123,7 @@ def _ended(run: Run, started: float) -> float:
     return _seconds(when) if when else max((entry.time for entry in run.metrics()), default=started)
 
 
-def _tags(manifest: Mapping[str, Any]) -> dict[str, str]:
+def _origin(manifest: Mapping[str, Any]) -> dict[str, str]:
     """Return what the manifest says of the run's origin, as far as it is known."""
     git = manifest.get("git") or {}
     names = ("kind", "data", "upstream", "started", "version", "user", "host", "device", "gpu", "threads")
@@ -188,7 +188,7 @@ class SweepFacts:
         name: the sweep's name.
         folder: its folder.
         status: "running", "done" or "failed".
-        labels: run id -> the arm's label.
+        arms: run id -> the label of its arm.
         aggregates: means over seeds, by LABEL/MODE/METRIC.
         verdicts: verdicts on differences from the controls, by LABEL/MODE/METRIC.
         files: its table as Markdown and HTML.
@@ -197,7 +197,7 @@ class SweepFacts:
     name: str
     folder: Path
     status: str
-    labels: Mapping[str, str]
+    arms: Mapping[str, str]
     aggregates: Mapping[str, float]
     verdicts: Mapping[str, str]
     files: tuple[Path, ...]
@@ -211,8 +211,8 @@ class SweepFacts:
         if not {"name", "status", "labels", "aggregates", "verdicts"} <= found.keys():
             return None
         files = tuple(path for path in (folder / "table.md", folder / "table.html") if path.is_file())
-        own = {name: found[name] for name in ("name", "status", "labels", "aggregates", "verdicts")}
-        return cls(folder=folder.absolute(), files=files, **own)
+        own = {name: found[name] for name in ("name", "status", "aggregates", "verdicts")}
+        return cls(folder=folder.absolute(), arms=found["labels"], files=files, **own)
 
 
 def _number(value: Any) -> bool:

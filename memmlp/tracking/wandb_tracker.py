@@ -44,16 +44,16 @@ class WandB:
         """Write a run from its beginning; an earlier offline run of it is removed."""
         notes, config = (
             facts.note or None,
-            {**facts.config, "run": {**facts.tags, "folder": str(facts.folder)}},
+            {**facts.config, "run": {**facts.origin, "folder": str(facts.folder)}},
         )
-        shown = ShownInWandB(self._begun(facts.id, facts.name, facts.labels, notes, config))
+        shown = ShownInWandB(self._begun(facts.id, facts.name, facts.tags, notes, config))
         shown.log(points)
         return shown
 
     def sweep(self, facts: SweepFacts) -> None:
         """Write a sweep as a run of its own, with aggregates, verdicts and table."""
         own = hashlib.sha256(facts.name.encode()).hexdigest()[:16]
-        run = self._begun(own, f"sweep {facts.name}", ("sweep",), None, {"arms": dict(facts.labels)})
+        run = self._begun(own, f"sweep {facts.name}", ("sweep",), None, {"arms": dict(facts.arms)})
         run.summary.update({**facts.aggregates, **{f"verdict/{k}": v for k, v in facts.verdicts.items()}})
         for path in facts.files:
             run.save(str(path), base_path=str(facts.folder), policy="now")

@@ -51,7 +51,7 @@ class TrainingTask(Protocol):
 
     @property
     def dataset(self) -> MotionDataset:
-        """The training split."""
+        """The training part."""
 
     def parameter_groups(self) -> list[dict]:
         """Return the optimiser's parameter groups."""
@@ -63,7 +63,7 @@ class TrainingTask(Protocol):
         """Return values to log beside the loss terms."""
 
     def validate(self) -> dict[str, float]:
-        """Compute the metrics on the validation split."""
+        """Compute the metrics on the validation part."""
 
 
 def seed_step(seed: int, step: int) -> None:
@@ -226,7 +226,8 @@ def save(
 ) -> None:
     """Write a checkpoint with all that a later process needs to go on after `step` steps.
 
-    These took the seconds. Of several processes the first one writes, and the others go on with its weights.
+    Of several processes the first one writes, and the others go on with its weights. `seconds` is how long
+    the steps took.
     """
     distributed.align(task.module)
     if not distributed.first():

@@ -147,5 +147,5 @@ class MotionTask:
         return {f"weight_{name}": value for name, value in self.loss.weighting.weights().items()}
 
     def validate(self) -> dict[str, float]:
-        """Compute the stream-mode metrics on the validation split."""
+        """Compute the stream-mode metrics on the validation part."""
         return self._validate(self.model)

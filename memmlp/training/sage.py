@@ -54,7 +54,7 @@ class DroppingOptim(Optim):
 
     Attributes:
         drops: fractions of the steps at which it falls.
-        drop: to which part of itself.
+        drop: by which it is multiplied there.
     """
 
     drops: Sequence[float] = ()
@@ -142,7 +142,7 @@ class PartTraining:
             device: the device to train on.
 
         Returns:
-            Its errors on windows of the validation split.
+            Its errors on windows of the validation part.
         """
         before, dataset = checkpoint.read(upstream)[0] if upstream else {}, data.open("train").to(device)
         torch.manual_seed(self.network.seed)

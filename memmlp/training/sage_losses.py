@@ -43,7 +43,8 @@ def objective(kind: str, halves: nn.ModuleDict) -> Objective:
 def code_losses(net: SAGENet, codes: HalfVQVAE, frames: Tensor, training: bool) -> dict[str, Tensor]:
     """Return the losses of a VQ-VAE: of its last frame's rotations and joints, and of its codebooks.
 
-    In training it has to guess joints of its half other than the first. Hands count where they are of it.
+    In training it has to guess joints of its half other than the first. The half with the hands has a loss of
+    theirs, too.
 
     Args:
         net: the network, whose space the VQ-VAE works in.

@@ -120,6 +120,15 @@ def test_prose_with_a_claim_is_refused(memmlp: Memmlp, planned: None):
     assert one_line(memmlp("results", "docs"), "README.md, line 3", "'lowers' beside 'Jitter'")
 
 
+def test_a_page_says_that_a_protocol_is_shown_on_other_data(memmlp: Memmlp, planned: None):
+    memmlp("results", "save", "2", "data=mocap", "seed=0")
+    memmlp("results", "docs")
+    page = Path("docs/results/table02.md").read_text().replace("\\", "")
+    assert (
+        "a table of data=amass_s2, shown with data=mocap: its errors do not compare with the paper's" in page
+    )
+
+
 def test_results_of_a_file_elsewhere_keep_its_path(memmlp: Memmlp, planned: None):
     Path("mine.yaml").write_text("arms: {a: [b=1], c: [b=2]}\nseeds: [0, 1]\n")
     memmlp("results", "save", "./mine.yaml", "x=/data/here")

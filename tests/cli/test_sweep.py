@@ -21,11 +21,12 @@ from processes import PATIENCE, ignoring_interrupts, started, until
 from memmlp.cli.workers import split_executor
 from memmlp.common.errors import InputError
 from memmlp.config.perform_task import perform
-from memmlp.config.plan_sweep import find_sweep, make_plan, orphans
+from memmlp.config.plan_sweep import find_sweep, make_plan, orphans, plan_anew
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.recipe_numbers import RECIPES
 from memmlp.runs.run import Run
 from memmlp.sweep.board import name
+from memmlp.sweep.plan import Plan
 
 TINY = [*SMALLEST, "export.graph=off"]
 ARMS = {"full": [], "none": ["memory=none"], "wild": ["optim.lr=1e30"]}
@@ -184,6 +185,24 @@ def test_a_plan_is_kept_until_the_data_changes(home: Path, monkeypatch: pytest.M
     assert make_plan(chosen, outputs).entries == ()
     assert [task.id for task in make_plan(chosen, outputs, prepare=True).tasks] == [t.id for t in first.tasks]
     assert orphans(chosen, make_plan(chosen, outputs)) == []
+
+
+def test_a_plan_is_kept_until_the_groups_of_clips_change(home: Path, monkeypatch: pytest.MonkeyPatch):
+    """Which clips belong together is no part of the data, but evaluations have their identity from it."""
+    monkeypatch.chdir(home)
+    chosen = find_sweep("trial.yaml").with_overrides([*TINY, "data.split.groups_file=groups.csv"])
+    outputs = (home / "outputs").absolute()
+    clips = [f"{path.parent.name}/{path.stem}" for path in (outputs / "data").rglob("*.npz")]
+
+    def planned(word: str) -> Plan:
+        rows = [f"{clip},{word} {clip}\n" for clip in clips]
+        (home / "groups.csv").write_text("clip,group\n" + "".join(rows))
+        return make_plan(chosen, outputs, prepare=True)
+
+    before, after = planned("take"), planned("person")
+    assert [entry.id for entry in after.entries] == [entry.id for entry in before.entries]
+    assert [entry.stages for entry in after.entries] != [entry.stages for entry in before.entries]
+    assert after == plan_anew(chosen, outputs)
 
 
 def test_a_look_at_a_sweep_that_was_never_started_leaves_nothing(home: Path):

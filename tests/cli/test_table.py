@@ -20,7 +20,7 @@ def planned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     """Replace planning: every sweep's runs are there, except those of Table 1, which can't be planned."""
 
     def plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
-        if sweep.table == 1 or "bad=1" in sweep.extra:
+        if sweep.table == 1 or "bad=1" in sweep.command_line:
             raise InputError("data.root: has no value")
         find = fake_sweep(tmp_path / sweep.name, sweep)
         entries = [(arm, seed) for arm in sweep.runnable() for seed in sweep.seeds]

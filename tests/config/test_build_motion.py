@@ -78,7 +78,7 @@ def test_named_sources_have_groups_of_their_own():
     Path("groups.csv").write_text("clip,group\nsalsa/01,ann\n")
     own = build_motion(mix(with_source(groups_file="groups.csv")))
     assert own.source.split.splits["cmu"].grouping.rows == {"salsa/01": "ann"}
-    assert own.grouped != build_motion(mix()).grouped
+    assert own.groups_digest != build_motion(mix()).groups_digest
 
 
 @pytest.mark.parametrize(

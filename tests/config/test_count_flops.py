@@ -53,3 +53,11 @@ def test_a_prediction_is_of_the_control_without_its_cell():
     expected = float(flops_of(composed([*TINY, "optim.batch=4", "optim.steps=40"])))
     assert predicted_flops(parse_sweep("s", content)) == {"optim.steps=40": expected}
     assert predicted_flops(parse_sweep("s", content | {"scale": {}})) == {}
+    turned = {
+        "arms": dict(reversed(content["arms"].items()))
+    }  # the first arm's is what others are compared with
+    with pytest.raises(InputError, match=r"scale\.predict: allowed is one control, not 'full.* 'manual"):
+        predicted_flops(parse_sweep("s", content | turned))
+    third = {"third": {"overrides": ["loss=manual", "optim.batch=6"], "against": "manual"}}
+    with pytest.raises(InputError, match=r"scale\.predict: allowed is one control, not 'full.* 'manual"):
+        predicted_flops(parse_sweep("s", content | {"arms": content["arms"] | third}))

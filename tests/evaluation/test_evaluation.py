@@ -1,5 +1,6 @@
 """The stage that evaluates, and the broken network that it refuses."""
 
+import math
 from functools import partial
 
 import pytest
@@ -10,6 +11,7 @@ from torch import nn
 from memmlp.common.errors import InputError
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
+from memmlp.evaluation.modes import quick_stream
 from memmlp.motion.coordinates import Heading
 from memmlp.networks.recurrent_poser import OUTPUTS
 
@@ -46,3 +48,14 @@ def test_positions_that_are_not_those_of_the_rotations_are_refused():
     model.output = Displaced(model.output)
     with pytest.raises(InputError, match=r"RecurrentPoser: its positions have an MPJPE of .* clip clip0"):
         STREAM.report(model, TEST, "stream")
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_a_clip_without_numbers_is_no_clip_less(broken: bool):
+    """One that is too short for a metric is; but a network that diverges on a clip has no mean."""
+    network, clips = tiny.model(), [tiny.clip(40, seed=1), tiny.clip(2, seed=2)]
+    if broken:
+        clips[0][20] = math.nan
+    found = quick_stream(network, clips)
+    assert math.isnan(found["rotation MPJPE"]) == broken
+    assert math.isnan(found["rotation Jitter"]) == broken

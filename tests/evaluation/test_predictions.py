@@ -15,7 +15,7 @@ from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import LBFGS, NoIK
 from memmlp.evaluation.modes import stream
 from memmlp.evaluation.predictions import (
-    Predictor,
+    ClipPredictor,
     motion_clip,
     predict_clip,
     prediction_arrays,
@@ -32,9 +32,9 @@ NETWORK = model()
 BODY = REST.numpy()
 
 
-def predictor(mode: str = "stream", branch: str = "rotation", **changes) -> Predictor:
+def predictor(mode: str = "stream", branch: str = "rotation", **changes) -> ClipPredictor:
     settings = {"modes": ["stream"], "batch": 2, "ik": NoIK(), "seed": 0}
-    return Predictor(NETWORK, mode, branch, Evaluation(**settings | changes))
+    return ClipPredictor(NETWORK, mode, branch, Evaluation(**settings | changes))
 
 
 def source(length: int, seed: int = 0, fps: float = 60.0) -> Clip:

@@ -67,7 +67,7 @@ def test_a_sweep_trains_what_is_upstream_first():
     assert [task.config["refiner"] is None for task in tasks] == [True, True, False]
 
     class Data:
-        grouped = None
+        groups_digest = None
 
         def prepare(self):
             return type("Prepared", (), {"digest": "d"})

@@ -114,7 +114,7 @@ def test_a_refiner_stands_behind_it_and_a_sweep_trains_all_in_order():
     assert [task.id for task in tasks[:-1]] == chain_of(composed(SHORT))
 
     class Data:
-        grouped = None
+        groups_digest = None
 
         def prepare(self):
             return type("Prepared", (), {"digest": "d"})

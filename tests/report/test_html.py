@@ -6,6 +6,7 @@ import html
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from memmlp.report.html import Chapter, page, published
 from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.spec import Sweep
-from memmlp.tables.build_table import without_runs
+from memmlp.tables.build_table import make_table, without_runs
 from memmlp.tables.distributions import distributions
 from memmlp.tables.table_text import caption
 
@@ -188,6 +189,35 @@ def browser(tmp_path: Path, *arguments: str) -> subprocess.CompletedProcess[str]
 def console(ran: subprocess.CompletedProcess[str]) -> list[str]:
     """Return what the page wrote to the browser's console."""
     return [line for line in ran.stderr.splitlines() if "CONSOLE" in line]
+
+
+def test_deployments_of_one_run_have_a_row_each(tmp_path: Path):
+    sweep = replace(load_sweep(SHIPPED / "table14.yaml"), seeds=(0,))
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
+    one, two = list(runs)[:2]
+    slower = {**runs[one][0].latency, "median_ms": 5.0}
+    runs[two] = {0: replace(runs[one][0], latency=slower, costs={"ms": 5.0})}
+    found = page([Chapter(sweep, make_table(sweep, runs), runs)], [], "now", "0")
+    rows = re.findall(rf"<tr><th[^>]*><code>{runs[one][0].id}</code></th>(.*?)</tr>", found)
+    assert {"<td>5.00</td>" in row for row in rows if "<td>1.10</td>" in row} == {True, False}
+    assert f"{len(runs) - 1} finished runs stand" in found
+
+
+def test_more_may_be_better(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Of a metric of one's own that counts what is right."""
+    monkeypatch.setattr("memmlp.tables.table_text.HIGHER", {"MPJPE"})
+    monkeypatch.setattr("memmlp.tables.distributions.HIGHER", {"MPJPE"})
+    sweep = load_sweep(SHIPPED / "table14.yaml")
+    find = fake_sweep(tmp_path, sweep, {"2": 2.0})
+    runs = runs_of(sweep, find)
+    found = distributions(sweep, runs, "stream")
+    better = {
+        metric: next(one.improvement for one in arms if one.label == "2") for metric, arms in found.items()
+    }
+    assert (better["MPJPE"], better["Jitter"]) == (1.0, 0.0)
+    text = page([Chapter(sweep, table_of(sweep, find), runs)], [], "now", "0")
+    assert "Left is better, of MPJPE right." in text
+    assert "Further up and left is better, of MPJPE further down and right." in text
 
 
 @pytest.mark.slow

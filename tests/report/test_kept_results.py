@@ -131,6 +131,30 @@ def test_two_evaluations_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp
     assert not any("are one run" in flag and two in flag for flag in table.flags)
 
 
+def test_two_deployments_of_one_run_are_kept_apart(sweep: Sweep, kept: Kept, tmp_path: Path):
+    """Arms may show what two graphs of one training cost, and one of them two evaluations, too."""
+    one, two, three = list(kept.runs)[:3]
+    slower = {
+        seed: replace(run, costs={**run.costs, "ms": 5.0}, sources={}) for seed, run in kept.runs[one].items()
+    }
+    solved = {
+        seed: replace(run, id=kept.runs[one][seed].id, sources={}) for seed, run in kept.runs[three].items()
+    }
+    save(tmp_path / "kept.json", replace(kept, runs=kept.runs | {two: slower, three: solved}))
+    read = load_kept(tmp_path / "kept.json")
+    for seed, run in read.runs[one].items():
+        assert run.costs["ms"] == pytest.approx(kept.runs[one][seed].costs["ms"])
+        assert (run.id, read.runs[two][seed].costs["ms"]) == (read.runs[two][seed].id, 5.0)
+        assert read.runs[three][seed].means != run.means
+    assert dumps(read) == (tmp_path / "kept.json").read_text()
+    flags = make_table(replace(sweep, control=one), read.of(sweep)).flags
+    (said,) = (flag for flag in flags if "are one run" in flag)
+    assert (
+        said
+        == f"'{two}' and '{one}' are one run: they differ in how it is deployed, and in nothing but costs"
+    )
+
+
 def test_results_of_several_machines_add_up(sweep: Sweep, kept: Kept, tmp_path: Path):
     """Arms and seeds of both are there. A cell that both have is the newer one's; the other run is gone."""
     one = {label: {0: runs[0]} for label, runs in kept.runs.items()}

@@ -35,13 +35,13 @@ def test_a_key_that_an_arm_sets_is_refused_on_the_command_line(word: str):
     with pytest.raises(InputError, match=r"arm '(two|no hand)' of sweep s sets .* itself; allowed are keys"):
         parse_sweep("s", content).with_overrides(["profile=tiny", word])
     content["arms"]["two"] = content["arms"]["no hand"] = {"overrides": None}  # rows of the paper alone
-    assert parse_sweep("s", content).with_overrides([word]).extra == (word,)
+    assert parse_sweep("s", content).with_overrides([word]).command_line == (word,)
 
 
 def test_seeds_of_the_command_line_replace_the_files():
     sweep = parse_sweep("s", {"seeds": [0, 1], "arms": ARMS}).with_overrides(["seed=5,6,7", "profile=tiny"])
     assert sweep.seeds == (5, 6, 7)
-    assert sweep.extra == ("profile=tiny",)
+    assert sweep.command_line == ("profile=tiny",)
 
 
 def test_the_outputs_folder_is_an_option_and_no_override():

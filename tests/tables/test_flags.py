@@ -24,10 +24,10 @@ from memmlp.tables.table import Table
 def test_a_protocol_on_amass_with_other_data_is_flagged(sweep: Sweep):
     runs = runs_of(sweep, nothing)
     protocol = replace(sweep, table=1, base=("data=amass_s1",))
-    other = replace(protocol, extra=("data=mocap", "data.root=mine"))
+    other = replace(protocol, command_line=("data=mocap", "data.root=mine"))
     flag = "a table of data=amass_s1, shown with data=mocap: its errors do not compare with the paper's"
     assert flag in make_table(other, runs).flags
-    alike = (protocol, replace(protocol, extra=("data=amass_s1",)), replace(other, base=()))
+    alike = (protocol, replace(protocol, command_line=("data=amass_s1",)), replace(other, base=()))
     assert not any("a table of" in word for one in alike for word in make_table(one, runs).flags)
 
 

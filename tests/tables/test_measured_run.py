@@ -25,6 +25,25 @@ def test_costs_have_the_tables_units(tmp_path: Path):
     assert costs == pytest.approx({**sizes, "ms": 0.8, "ratio": 0.6, "FPS": 1250})
 
 
+def test_size_and_times_are_of_the_precision_that_was_asked_for(sweep: Sweep, tmp_path: Path):
+    run = fake_run(tmp_path, "run")
+    path = run.deployment("fp32-0").latency
+    record = json.loads(path.read_text()) | {"pose_median_ms": 0.9, "alone_median_ms": 0.7}
+    int8 = {"onnx_bytes": 500_000, "median_ms": 0.4, "ratio_to_yardstick": 0.3, "pose_median_ms": 0.5}
+    path.write_text(json.dumps(record | {"int8": int8, "settings": {"precision": "int8"}}))
+    assert load(run.folder).costs == pytest.approx({
+        "FLOPs": 0.026, "MACs": 0.013, "parameters": 0.356798, "size": 0.5, "ms": 0.4, "network ms": 0.7,
+        "pose ms": 0.5, "ratio": 0.3, "FPS": 2500,
+    })  # fmt: skip
+    said = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: run).flags
+    assert any("of a file of less precision, errors of float32" in flag for flag in said)
+    path.write_text(json.dumps(record | {"int8": int8}))
+    assert load(run.folder).costs["size"] == 1.9
+    assert not any(
+        "less precision" in f for f in table_of(replace(sweep, seeds=(0,)), lambda arm, seed: run).flags
+    )
+
+
 def test_what_an_evaluation_ran_on_counts_too(sweep: Sweep, tmp_path: Path):
     """An evaluation's numbers depend on code and device as the weights do."""
     other = {"device": "cuda:0", "made_by": {**ORIGIN, "git": {"commit": "fedcba98", "dirty": True}}}

@@ -11,7 +11,7 @@ import pytest
 from fake_cells import STEP, STEPS, cells, steps_of
 
 from memmlp.tables.effects import paired
-from memmlp.tables.scaling import Change, Trend, trends
+from memmlp.tables.scaling import Trend, TrendVerdict, trends
 from memmlp.tables.statistics.scaling import fit
 from memmlp.tables.table import Key
 
@@ -35,17 +35,19 @@ def trend_of(folder: Path, first: float, last: float, **changes) -> Trend:
 @pytest.mark.parametrize(
     ("first", "last", "verdict"),
     [
-        (1.0, 1.4, Change.GROWS),
-        (0.9, 0.6, Change.GROWS),
-        (1.4, 1.0, Change.FADES),
-        (0.7, 1.4, Change.TURNS),
-        (1.2, 1.2, Change.NONE),
+        (1.0, 1.4, TrendVerdict.GROWS),
+        (0.9, 0.6, TrendVerdict.GROWS),
+        (1.4, 1.0, TrendVerdict.FADES),
+        (0.7, 1.4, TrendVerdict.TURNS),
+        (1.2, 1.2, TrendVerdict.NONE),
     ],
 )
-def test_a_verdict_tells_where_the_effect_goes(tmp_path: Path, first: float, last: float, verdict: Change):
+def test_a_verdict_tells_where_the_effect_goes(
+    tmp_path: Path, first: float, last: float, verdict: TrendVerdict
+):
     trend = trend_of(tmp_path, first, last)
     assert trend.slopes["compute"].verdict == verdict
-    assert trend.slopes["data.split.train_fraction"].verdict == Change.NONE
+    assert trend.slopes["data.split.train_fraction"].verdict == TrendVerdict.NONE
     per_decade = (last - first) / math.log10(STEPS[-1] / STEPS[0])
     assert trend.slopes["compute"].change.mean == pytest.approx(6.5 * per_decade, abs=1.0)
     assert trend.at().mean == pytest.approx(6.5 * (last - 1), abs=0.7)

@@ -35,7 +35,7 @@ def test_table_means_verdicts_labels_and_status(tmp_path: Path):
     facts = SweepFacts.read(folder)
     assert facts is not None
     assert (facts.name, facts.status) == ("mine", "done")
-    assert facts.labels == {entry.id: entry.label for entry in entries}
+    assert facts.arms == {entry.id: entry.label for entry in entries}
     cell = next(row for row in table.rows if row.label == "none").cells["stream"]["MPJPE"]
     assert cell.effect is not None
     assert facts.aggregates["none/stream/MPJPE"] == cell.mean

@@ -9,6 +9,7 @@ from fake_runs import fake_sweep, table_of
 from fake_table import SHIPPED, printed
 
 from memmlp.sweep.parsing import load_sweep
+from memmlp.sweep.spec import Sweep
 from memmlp.tables.table import Table
 from memmlp.tables.table_text import heading
 
@@ -25,6 +26,15 @@ def test_costs_show_how_many_times_the_controls_they_are(tmp_path: Path):
 
 def test_heads_tell_unit_and_direction():
     assert [heading(name) for name in ("Jitter", "ms", "FPS")] == ["Jitter [10² m/s³] ↓", "ms ↓", "FPS ↑"]
+
+
+def test_an_arm_in_which_nothing_would_have_been_found_is_named(sweep: Sweep, tmp_path: Path):
+    find = fake_sweep(tmp_path, sweep)
+    one_seed = sweep.arms[1].label
+    table = table_of(sweep, lambda arm, seed: find(arm, seed) if arm.label != one_seed or seed == 0 else None)
+    said = " ".join(printed(table, 100).split())
+    assert f"in every arm but '{one_seed}'" in said
+    assert "in every arm but" not in " ".join(printed(table_of(sweep, find), 100).split())
 
 
 def test_a_power_beyond_the_values_themselves_is_no_number(table: Table, monkeypatch: pytest.MonkeyPatch):

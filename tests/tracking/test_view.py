@@ -39,8 +39,8 @@ def test_name_origin_data_labels_and_note(tmp_path: Path):
     facts = facts_of(run)
     assert (facts.name, facts.title) == ("memory=gru · seed 1", "memory=gru · seed 1 · 00000000")
     assert facts.data == ("mocap", "d" * 64)
-    assert (facts.labels, facts.note) == (("good",), "a note")
-    assert (facts.tags["user"], facts.tags["commit"]) == ("somebody", "abc")
+    assert (facts.tags, facts.note) == (("good",), "a note")
+    assert (facts.origin["user"], facts.origin["commit"]) == ("somebody", "abc")
     assert facts.config["memory.layers"] == "[2]"
 
 

@@ -44,7 +44,8 @@ def prepare(
 ) -> None:
     """Write the cache of a folder of AMASS npz.
 
-    The cache is memory-mappable, and has a manifest of what became of each file.
+    The cache is memory-mappable, and has a manifest of what became of each file. It is for code of your own:
+    memmlp train makes itself one of data.root.
     """
     from memmlp.motion.preparing.cache import ClipFolder
     from memmlp.motion.preparing.cache import prepare as run

@@ -68,13 +68,24 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 def least_rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the smallest rotations (..., 3, 3) that turn directions (..., 3) onto others.
 
-    Where a direction has no length there is nothing to turn, and the identity is returned.
+    Where a direction has no length there is nothing to turn, and the identity is returned. Opposite
+    directions are carried onto each other by a half turn about one of the axes across them.
     """
-    axis = np.cross(source, target)
+    axis, along = np.cross(source, target), (source * target).sum(-1, keepdims=True)
     norm = np.linalg.norm(axis, axis=-1, keepdims=True)
-    angle = np.arctan2(norm, (source * target).sum(-1, keepdims=True))
+    opposite = (norm == 0) & (along < 0)
+    axis, norm = np.where(opposite, _across(source), axis), np.where(opposite, 1.0, norm)
+    angle = np.where(opposite, np.pi, np.arctan2(norm, along))
     turn = axis * np.divide(angle, norm, out=np.zeros_like(norm), where=norm > 0)
     return Rotation.from_rotvec(turn.reshape(-1, 3)).as_matrix().reshape(*turn.shape, 3)
+
+
+def _across(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors of length 1 that are perpendicular to vectors (..., 3) with a length."""
+    axes = np.eye(3)[np.abs(vectors).argmin(-1)]
+    across = np.cross(vectors, axes)
+    length = np.linalg.norm(across, axis=-1, keepdims=True)
+    return np.divide(across, length, out=np.zeros_like(across), where=length > 0)
 
 
 def aligned(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]) -> np.ndarray:

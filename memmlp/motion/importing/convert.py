@@ -24,7 +24,7 @@ class Converted:
 
     Attributes:
         clip: the motion, world (Z up), its floor at 0 where one is known.
-        performance: what it was made from.
+        mapped_motion: what it was made from.
         fidelity: how far it is from that, and what is wrong with it.
         floor: height of the floor in the recording, metres on the body's scale, which was taken off; None
             where it is unknown or was not asked for.
@@ -34,7 +34,7 @@ class Converted:
     """
 
     clip: Clip
-    performance: MappedMotion
+    mapped_motion: MappedMotion
     fidelity: Fidelity
     floor: float | None
     rest_pose: str
@@ -65,9 +65,9 @@ def convert(
         InputError: as `mapped_motion.pick_joints` and `retarget.fit` do.
     """
     settled = settle(recording, skeleton)
-    performance = pick_joints(recording, settled)
-    fitted = fit(recording, settled, performance, rest)
-    clip = to_body(performance, fitted, rest, name, fps or recording.fps)
+    mapped_motion = pick_joints(recording, settled)
+    fitted = fit(recording, settled, mapped_motion, rest)
+    clip = to_body(mapped_motion, fitted, rest, name, fps or recording.fps)
     if floor == AUTO:
         height = find_floor(pose(clip, rest)[1], clip.fps)
     else:
@@ -75,8 +75,8 @@ def convert(
     clip = lowered(clip, height or 0.0)
     return Converted(
         clip=clip,
-        performance=performance,
-        fidelity=compare(clip, performance, rest, skeleton.name),
+        mapped_motion=mapped_motion,
+        fidelity=compare(clip, mapped_motion, rest, skeleton.name),
         floor=height,
         rest_pose=fitted.rest_pose,
         unit=float(settled.unit or 1.0),

@@ -86,16 +86,16 @@ class Fidelity:
     faults: tuple[str, ...]
 
 
-def compare(clip: Clip, performance: MappedMotion, rest: np.ndarray, skeleton: str) -> Fidelity:
-    """Compare a clip on a body, rest joints (22, 3) in metres, with the performance that it came from."""
+def compare(clip: Clip, mapped_motion: MappedMotion, rest: np.ndarray, skeleton: str) -> Fidelity:
+    """Compare a clip on a body, rest joints (22, 3) in metres, with the mapped motion that it came from."""
     rotations, positions = pose(clip, rest)
-    expected = performance.positions @ Z_UP.T
-    mm = _on_own_bones(rotations, expected, performance.mapped)
-    degrees = _segments(positions, expected, performance.mapped)
+    expected = mapped_motion.positions @ Z_UP.T
+    mm = _on_own_bones(rotations, expected, mapped_motion.mapped)
+    degrees = _segments(positions, expected, mapped_motion.mapped)
     found = Fidelity(clip.name, skeleton, len(clip), mm, degrees, ())
     faults = (
-        *_unlike_the_file(found, positions, expected, performance.mapped),
-        *_unlike_people(rotations, positions, performance.mapped),
+        *_unlike_the_file(found, positions, expected, mapped_motion.mapped),
+        *_unlike_people(rotations, positions, mapped_motion.mapped),
         *_odd_turns(rotations),
         *_twisted_limbs(rotations, positions),
         *_odd_lengths(expected, rest),

@@ -48,18 +48,18 @@ def find_stance(recording: Recording, skeleton: SkeletonMap, rest: np.ndarray) -
         InputError: as importing does: where no person stands in the file, or the map does not fit it.
     """
     settled = settle(recording, skeleton)
-    performance = pick_joints(recording, settled)
-    pose = find_rest_pose(recording, settled, performance)
-    turned = pose.rotations @ fit(recording, settled, performance, rest).corrections
-    mapped = {joint: int(performance.nodes[JOINTS.index(joint)]) for joint in skeleton.joints}
-    positions = _all_nodes(recording, settled, performance, pose)
+    mapped_motion = pick_joints(recording, settled)
+    pose = find_rest_pose(recording, settled, mapped_motion)
+    turned = pose.rotations @ fit(recording, settled, mapped_motion, rest).corrections
+    mapped = {joint: int(mapped_motion.nodes[JOINTS.index(joint)]) for joint in skeleton.joints}
+    positions = _all_nodes(recording, settled, mapped_motion, pose)
     return FileStance(
         recording.nodes, recording.node_parents, positions, mapped, _posed(turned, rest), pose.source
     )
 
 
 def _all_nodes(
-    recording: Recording, skeleton: SkeletonMap, performance: MappedMotion, pose: RestPose
+    recording: Recording, skeleton: SkeletonMap, mapped_motion: MappedMotion, pose: RestPose
 ) -> np.ndarray:
     """Return the positions (nodes, 3) of all nodes in the pose of which the mapped ones are known.
 
@@ -70,9 +70,9 @@ def _all_nodes(
     assert skeleton.unit is not None
     poses = np.concatenate([recording.zero_pose()[None], recording.posed(given)[1][None], frames])
     poses = skeleton.unit * poses @ skeleton.upright.T
-    off = np.abs(poses[:, performance.nodes, 1] - pose.positions[:, 1]).max(1)
+    off = np.abs(poses[:, mapped_motion.nodes, 1] - pose.positions[:, 1]).max(1)
     best = poses[off.argmin()]
-    return best @ anatomy.facing(best[performance.nodes]).T
+    return best @ anatomy.facing(best[mapped_motion.nodes]).T
 
 
 def _posed(rotations: np.ndarray, rest: np.ndarray) -> np.ndarray:

@@ -13,7 +13,9 @@ LOWEST = 0.05  # share of the standing toes that may be lower: noise, and feet t
 
 
 def find_floor(positions: np.ndarray, fps: float) -> float | None:
-    """Return the height of the floor, metres: below the lowest toes that stand still, and below all else.
+    """Return the height of the floor, metres.
+
+    It is below nearly all toes that stand still, and not above the lowest joint in nearly all frames.
 
     Args:
         positions: global joint positions (N, 22, 3), world (Z up).

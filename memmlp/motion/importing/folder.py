@@ -47,7 +47,8 @@ class Imported:
         header_fps: frame rate that the file's header tells, Hz.
         fps: frame rate of the clip, Hz.
         fps_reason: where that rate is from.
-        floor: height of the floor that was taken off, metres; None where none was found or asked for.
+        floor: height of the floor that was taken off, metres at the body's size; None where none was found or
+            asked for.
         faults: what is wrong with the clip, a sentence each (`fidelity.compare`).
     """
 

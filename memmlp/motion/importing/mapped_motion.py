@@ -45,12 +45,12 @@ def pick_joints(recording: Recording, skeleton: SkeletonMap) -> MappedMotion:
             frame is left.
     """
     nodes = _nodes(recording, skeleton)
-    upright, unit = skeleton.upright, skeleton.unit
     rotations, positions = (
         array[int(skeleton.calibration_frame) :, nodes] for array in recording.kinematics()
     )
     if len(rotations) == 0:
         raise InputError(f"{recording.path}: only the calibration frame; allowed: two frames or more")
+    upright, unit = skeleton.upright, skeleton.unit
     return MappedMotion(
         path=recording.path,
         mapped=np.array([joint in skeleton.joints for joint in JOINTS]),

@@ -37,31 +37,31 @@ class RestPose:
     straight: bool
 
 
-def find_rest_pose(recording: Recording, skeleton: SkeletonMap, performance: MappedMotion) -> RestPose:
+def find_rest_pose(recording: Recording, skeleton: SkeletonMap, mapped_motion: MappedMotion) -> RestPose:
     """Find the pose in which the person stands: the map's, else the zero pose, else the straightest frame.
 
     Raises:
         InputError: if there is none, or left and right contradict each other in it.
     """
     if isinstance(skeleton.rest, dict):
-        return _given(recording, skeleton, performance)
+        return _given(recording, skeleton, mapped_motion)
     if skeleton.rest != "auto":
-        return _frame(performance, _checked_frame(performance, int(skeleton.rest)), "given")
-    why = anatomy.why_no_stance(performance.zero)
+        return _frame(mapped_motion, _checked_frame(mapped_motion, int(skeleton.rest)), "given")
+    why = anatomy.why_no_stance(mapped_motion.zero)
     if why is None:
-        eyes = np.tile(np.eye(3), (len(performance.zero), 1, 1))
-        rest = _turned(eyes, performance.zero, "the zero pose", straight=True)
-        _check_sides(performance, rest)
+        eyes = np.tile(np.eye(3), (len(mapped_motion.zero), 1, 1))
+        rest = _turned(eyes, mapped_motion.zero, "the zero pose", straight=True)
+        _check_sides(mapped_motion, rest)
         if not anatomy.arms_lifted(rest.positions):
             return rest
         why = "an arm is more than 100 degrees from a T-pose's"
-    return _straightest(performance, why)
+    return _straightest(mapped_motion, why)
 
 
-def _given(recording: Recording, skeleton: SkeletonMap, performance: MappedMotion) -> RestPose:
+def _given(recording: Recording, skeleton: SkeletonMap, mapped_motion: MappedMotion) -> RestPose:
     """Return the pose whose joints have the map's rotations."""
     assert isinstance(skeleton.rest, dict)
-    rotations, positions = (array[performance.nodes] for array in recording.posed(skeleton.rest))
+    rotations, positions = (array[mapped_motion.nodes] for array in recording.posed(skeleton.rest))
     upright = skeleton.upright
     pose = skeleton.unit * positions @ upright.T
     rest = _turned(upright @ rotations @ upright.T, pose, "the map's rest pose", straight=False)
@@ -69,44 +69,44 @@ def _given(recording: Recording, skeleton: SkeletonMap, performance: MappedMotio
     if why is not None:
         wrong = f"rest of skeleton {skeleton.name} is no person who stands: {why}"
         raise InputError(f"{recording.path}: {wrong}; allowed: rotations of a stance")
-    _check_sides(performance, rest)
+    _check_sides(mapped_motion, rest)
     return rest
 
 
-def _straightest(performance: MappedMotion, why: str) -> RestPose:
+def _straightest(mapped_motion: MappedMotion, why: str) -> RestPose:
     """Return the frame in which the person stands straightest; `why` is what is wrong with the zero pose."""
-    frames = np.unique(np.linspace(0, len(performance) - 1, TRIED).astype(int))
-    order = frames[np.argsort(anatomy.unevenness(performance.positions[frames]), kind="stable")]
-    stances = [int(frame) for frame in order if anatomy.why_no_stance(performance.positions[frame]) is None]
+    frames = np.unique(np.linspace(0, len(mapped_motion) - 1, TRIED).astype(int))
+    order = frames[np.argsort(anatomy.unevenness(mapped_motion.positions[frames]), kind="stable")]
+    stances = [int(frame) for frame in order if anatomy.why_no_stance(mapped_motion.positions[frame]) is None]
     for frame in stances:
-        if anatomy.wrong_sides(performance.positions[frame], performance.mapped) is None:
-            return _frame(performance, frame, STRAIGHTEST)
+        if anatomy.wrong_sides(mapped_motion.positions[frame], mapped_motion.mapped) is None:
+            return _frame(mapped_motion, frame, STRAIGHTEST)
     if stances:
-        return _frame(performance, stances[0], STRAIGHTEST)  # which says what is wrong
-    best = anatomy.why_no_stance(performance.positions[order[0]])
+        return _frame(mapped_motion, stances[0], STRAIGHTEST)  # which says what is wrong
+    best = anatomy.why_no_stance(mapped_motion.positions[order[0]])
     wrong = f"the person stands neither in the zero pose ({why}) nor in any frame (at best, {best})"
     raise InputError(
-        f"{performance.path}: {wrong}; allowed: another up or joints, or rest, in the skeleton's map"
+        f"{mapped_motion.path}: {wrong}; allowed: another up or joints, or rest, in the skeleton's map"
     )
 
 
-def _frame(performance: MappedMotion, frame: int, how: str) -> RestPose:
-    pose, rotations = performance.positions[frame], performance.rotations[frame]
+def _frame(mapped_motion: MappedMotion, frame: int, how: str) -> RestPose:
+    pose, rotations = mapped_motion.positions[frame], mapped_motion.rotations[frame]
     rest = _turned(rotations, pose, f"frame {frame}, {how}", straight=False)
-    _check_sides(performance, rest)
+    _check_sides(mapped_motion, rest)
     return rest
 
 
-def _checked_frame(performance: MappedMotion, frame: int) -> int:
+def _checked_frame(mapped_motion: MappedMotion, frame: int) -> int:
     """Return the frame's number if the person stands in it; raise InputError otherwise."""
-    if not 0 <= frame < len(performance):
+    if not 0 <= frame < len(mapped_motion):
         raise InputError(
-            f"{performance.path}: no frame {frame} for rest; allowed: 0 to {len(performance) - 1}"
+            f"{mapped_motion.path}: no frame {frame} for rest; allowed: 0 to {len(mapped_motion) - 1}"
         )
-    why = anatomy.why_no_stance(performance.positions[frame])
+    why = anatomy.why_no_stance(mapped_motion.positions[frame])
     if why is not None:
         raise InputError(
-            f"{performance.path}: rest: frame {frame}: {why}; allowed: a frame of a person who stands"
+            f"{mapped_motion.path}: rest: frame {frame}: {why}; allowed: a frame of a person who stands"
         )
     return frame
 
@@ -117,8 +117,8 @@ def _turned(rotations: np.ndarray, positions: np.ndarray, source: str, straight:
     return RestPose(turn @ rotations, positions @ turn.T, source, straight)
 
 
-def _check_sides(performance: MappedMotion, rest: RestPose) -> None:
-    why = anatomy.wrong_sides(rest.positions, performance.mapped)
+def _check_sides(mapped_motion: MappedMotion, rest: RestPose) -> None:
+    why = anatomy.wrong_sides(rest.positions, mapped_motion.mapped)
     if why is not None:
         allowed = "a map with left on the left, and the file's true up axis"
-        raise InputError(f"{performance.path}: in {rest.source}, {why}; allowed: {allowed}")
+        raise InputError(f"{mapped_motion.path}: in {rest.source}, {why}; allowed: {allowed}")

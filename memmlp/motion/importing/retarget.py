@@ -44,29 +44,31 @@ class Retargeting:
 
 
 def fit(
-    recording: Recording, skeleton: SkeletonMap, performance: MappedMotion, rest: np.ndarray
+    recording: Recording, skeleton: SkeletonMap, mapped_motion: MappedMotion, rest: np.ndarray
 ) -> Retargeting:
     """Fit a recording's skeleton to a body's rest joints (22, 3), metres.
 
     Raises:
         InputError: if no pose is found in which the person stands, or left and right contradict each other.
     """
-    stance = find_rest_pose(recording, skeleton, performance)
-    turned = anatomy.orientations(stance.positions, performance.mapped, rest)
+    stance = find_rest_pose(recording, skeleton, mapped_motion)
+    turned = anatomy.orientations(stance.positions, mapped_motion.mapped, rest)
     if not stance.straight:
-        turned = _turned_to_hinges(turned, stance, performance, rest)
+        turned = _turned_to_hinges(turned, stance, mapped_motion, rest)
     corrections = stance.rotations.swapaxes(-1, -2) @ turned
-    scale = float(_leg_length(rest) / np.median(_leg_length(performance.positions)))
+    scale = float(_leg_length(rest) / np.median(_leg_length(mapped_motion.positions)))
     return Retargeting(corrections, scale, stance.source)
 
 
-def to_body(performance: MappedMotion, fitted: Retargeting, rest: np.ndarray, name: str, fps: float) -> Clip:
-    """Return a performance as a clip on the body that it was fitted to, in the world (Z up).
+def to_body(
+    mapped_motion: MappedMotion, fitted: Retargeting, rest: np.ndarray, name: str, fps: float
+) -> Clip:
+    """Return mapped motion as a clip on the body that it was fitted to, in the world (Z up).
 
     The middle of the hips goes where the recording has it, scaled by the length of the legs.
 
     Args:
-        performance: the recording's mapped joints.
+        mapped_motion: the recording's mapped joints.
         fitted: what `fit` found.
         rest: the body's rest joints (22, 3), metres.
         name: the clip's name.
@@ -75,34 +77,34 @@ def to_body(performance: MappedMotion, fitted: Retargeting, rest: np.ndarray, na
     Raises:
         InputError: if the person is more than 10 km from the origin.
     """
-    turned = Z_UP @ _aimed(performance, performance.rotations @ fitted.corrections, rest)
-    hips = fitted.scale * performance.positions[:, list(HIPS)].mean(1) @ Z_UP.T
+    turned = Z_UP @ _aimed(mapped_motion, mapped_motion.rotations @ fitted.corrections, rest)
+    hips = fitted.scale * mapped_motion.positions[:, list(HIPS)].mean(1) @ Z_UP.T
     trans = hips - turned[:, 0] @ (rest[list(HIPS)].mean(0) - rest[0]) - rest[0]
     if np.abs(trans).max() > POSITION_LIMIT:
         far = f"{np.abs(trans).max():.3g} m from the origin"
-        raise InputError(f"{performance.path}: {far}; allowed: {POSITION_LIMIT:g} m")
+        raise InputError(f"{mapped_motion.path}: {far}; allowed: {POSITION_LIMIT:g} m")
     local = turned.copy()
     local[:, 1:] = turned[:, list(PARENTS[1:])].swapaxes(-1, -2) @ turned[:, 1:]
     poses = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(len(local), len(JOINTS), 3)
     return Clip(name, poses, trans, fps)
 
 
-def _aimed(performance: MappedMotion, turned: np.ndarray, rest: np.ndarray) -> np.ndarray:
+def _aimed(mapped_motion: MappedMotion, turned: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """Return rotations (N, 22, 3, 3) whose segments point as in the recording; unmapped joints don't turn."""
-    for start, end in (HIP_LINE, *segments(performance.mapped)):
+    for start, end in (HIP_LINE, *segments(mapped_motion.mapped)):
         joint = 0 if (start, end) == HIP_LINE else start
         if joint > 0 or (start, end) == HIP_LINE:
-            there = performance.positions[:, end] - performance.positions[:, start]
+            there = mapped_motion.positions[:, end] - mapped_motion.positions[:, start]
             turned[:, joint] = (
                 least_rotation(turned[:, joint] @ (rest[end] - rest[start]), there) @ turned[:, joint]
             )
-    for joint in map(int, np.flatnonzero(~performance.mapped)):
+    for joint in map(int, np.flatnonzero(~mapped_motion.mapped)):
         turned[:, joint] = turned[:, PARENTS[joint]]
     return turned
 
 
 def _turned_to_hinges(
-    turned: np.ndarray, stance: RestPose, performance: MappedMotion, rest: np.ndarray
+    turned: np.ndarray, stance: RestPose, mapped_motion: MappedMotion, rest: np.ndarray
 ) -> np.ndarray:
     """Turn thighs and upper arms about themselves, so that knees and elbows bend about their axes.
 
@@ -111,7 +113,7 @@ def _turned_to_hinges(
     for joint in HINGES:
         axis = anatomy.bend(stance.positions, joint)
         if axis is None:
-            own = anatomy.hinge(performance.rotations[:, joint], performance.positions, joint)
+            own = anatomy.hinge(mapped_motion.rotations[:, joint], mapped_motion.positions, joint)
             axis = None if own is None else stance.rotations[joint] @ own
         if axis is None:
             continue

@@ -58,7 +58,7 @@ def verify(
     with tempfile.TemporaryDirectory() as folder:
         write_clip(Path(folder) / "clip.npz", converted.clip)
         clip = read_clip(Path(folder) / "clip.npz", converted.clip.name)
-    return compare(clip, converted.performance, rest, chosen.name)
+    return compare(clip, converted.mapped_motion, rest, chosen.name)
 
 
 def verify_folder(

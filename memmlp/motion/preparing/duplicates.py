@@ -33,7 +33,7 @@ def assign(
     for name in sorted(groups):
         firsts.setdefault(groups[name], name)
     drawn = split.assign(sorted(firsts.values())).parts
-    return {name: drawn[firsts[groups[name]]] for name in groups}, groups, {}
+    return split.limited({name: drawn[firsts[groups[name]]] for name in groups}, groups), groups, {}
 
 
 def one_part_each(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -55,6 +55,10 @@ class Split(Protocol):
         """Return the part and the group of every name; raises InputError if the split is impossible."""
         ...
 
+    def limited(self, parts: Mapping[str, str | None], groups: Mapping[str, str]) -> dict[str, str | None]:
+        """Return the parts of clips in groups, without clips that the split leaves out of large groups."""
+        ...
+
     def missing(self, names: Collection[str]) -> tuple[str, ...]:
         """Return the entries of the split (list entries, subsets) that none of the names fits."""
         ...
@@ -69,7 +73,7 @@ class Split(Protocol):
         ...
 
     @property
-    def grouped(self) -> str | None:
+    def groups_digest(self) -> str | None:
         """A digest of the column files that say which clips belong together; None without one."""
         ...
 
@@ -91,8 +95,11 @@ class _Grouped:
         return Grouping.of(self.groups, self.groups_file)
 
     @property
-    def grouped(self) -> str | None:
+    def groups_digest(self) -> str | None:
         return self.grouping.digest
+
+    def limited(self, parts: Mapping[str, str | None], groups: Mapping[str, str]) -> dict[str, str | None]:
+        return dict(parts)
 
     def check_groups(self, names: Collection[str], files: Collection[str]) -> None:
         self.grouping.check(names, files)
@@ -126,13 +133,18 @@ class SeededSplit(_Grouped):
 
     def assign(self, names: Sequence[str]) -> Assignment:
         seen = {name: name for name in names}
-        parts = _divide(seen, {"test": self.test, "val": self.val}, self)
-        if self.per_group:
-            for group in self.grouping.tied(seen):
-                held_out = [name for name in group if parts[name] in ("test", "val")]
-                held_out.sort(key=lambda name: _rank(name, self.seed))
-                parts.update(dict.fromkeys(held_out[self.per_group :], None))
-        return Assignment(parts, self.grouping.names(seen))
+        parts, groups = _divide(seen, {"test": self.test, "val": self.val}, self), self.grouping.names(seen)
+        return Assignment(self.limited(parts, groups), groups)
+
+    def limited(self, parts: Mapping[str, str | None], groups: Mapping[str, str]) -> dict[str, str | None]:
+        if self.per_group is None:
+            return dict(parts)
+        held_out: dict[str, list[str]] = defaultdict(list)
+        for name in sorted(parts, key=lambda name: _rank(name, self.seed)):
+            if parts[name] in ("test", "val"):
+                held_out[groups[name]].append(name)
+        left_out = (name for names in held_out.values() for name in names[self.per_group :])
+        return {**parts, **dict.fromkeys(left_out)}
 
     def missing(self, names: Collection[str]) -> tuple[str, ...]:
         return ()
@@ -170,6 +182,16 @@ class MixedSplit:
             groups |= {f"{source}/{name}": f"{source}/{group}" for name, group in found.groups.items()}
         return Assignment(parts, groups)
 
+    def limited(self, parts: Mapping[str, str | None], groups: Mapping[str, str]) -> dict[str, str | None]:
+        found: dict[str, str | None] = {}
+        for source, own in self._own(parts):
+            whole = {name: f"{source}/{name}" for name in own}
+            limited = self.splits[source].limited(
+                {name: parts[whole[name]] for name in own}, {name: groups[whole[name]] for name in own}
+            )
+            found |= {whole[name]: part for name, part in limited.items()}
+        return found
+
     def missing(self, names: Collection[str]) -> tuple[str, ...]:
         return ()
 
@@ -184,8 +206,10 @@ class MixedSplit:
         }
 
     @property
-    def grouped(self) -> str | None:
-        digests = {source: split.grouped for source, split in self.splits.items() if split.grouped}
+    def groups_digest(self) -> str | None:
+        digests = {
+            source: split.groups_digest for source, split in self.splits.items() if split.groups_digest
+        }
         return hashlib.sha256(json.dumps(digests, sort_keys=True).encode()).hexdigest() if digests else None
 
     def check_groups(self, names: Collection[str], files: Collection[str]) -> None:

@@ -33,8 +33,9 @@ class EgoPoser(AvatarPoser):
     """AvatarPoser's encoder over the sum of two views: the window's newer half, and its every second frame.
 
     It has 4,126,340 parameters at the paper's sizes (T = 80, otherwise AvatarPoser's); the released code has
-    a further layer of 7,808 that nothing uses. Positions are relative to the head on the floor of the same
-    frame, and how far they moved since the window's first frame is appended to each frame's inputs.
+    a further layer of 7,808 that nothing uses. Positions are relative to the point of the floor below the
+    head in the same frame, and how far they moved since the window's first frame is appended to each frame's
+    inputs.
     """
 
     inputs: ClassVar[int] = SPARSE_DIM + PLACES

@@ -93,13 +93,20 @@ def swivels(base: Tensor, middle: Tensor, end: Tensor, up: Tensor) -> Tensor:
 
 
 def bend_direction(axis: Tensor, up: Tensor, swivel: Tensor) -> Tensor:
-    """Return the unit vectors (..., 3) from the axis to the middle, at swivels (..., 2)."""
+    """Return the unit vectors (..., 3) from the axis to the middle, at swivels (..., 2), cosine and sine."""
     start, quarter = circle(axis, up)
     return swivel[..., :1] * start + swivel[..., 1:] * quarter
 
 
 def middle_at(base: Tensor, end: Tensor, up: Tensor, swivel: Tensor, upper: Tensor, lower: Tensor) -> Tensor:
-    """Return the middles (..., 3) of limbs at swivels (..., 2); lengths of bones are (..., 1), metres."""
+    """Return the middle joints (..., 3) of limbs, metres.
+
+    Args:
+        base, end: the limbs' other joints (..., 3), metres.
+        up: the bases' Y axes (..., 3).
+        swivel: cosines and sines (..., 2) of the swivels.
+        upper, lower: lengths of the bones (..., 1), metres.
+    """
     away = end - base
     reach = away.norm(dim=-1, keepdim=True).clamp_min(1e-4)
     axis = away / reach

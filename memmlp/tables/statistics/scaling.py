@@ -86,8 +86,8 @@ class Line:
         Args:
             x: the covariates; a unit vector asks for its coefficient.
             level: the probability.
-            another: whether the intervals are for the effect that one more cell would show there, measured as
-                these are and no nearer to the line than they are; otherwise they are for the line.
+            another: whether the intervals are for the effect that one more cell would show there, which is
+                as far from the line, and as noisy, as these are; otherwise they are for the line.
         """
         factors = self._factors(np.atleast_2d(x))
         mean, known = factors @ self.effects, self._error(factors, another)

@@ -42,6 +42,14 @@ def test_least_rotation_turns_one_direction_onto_another() -> None:
     np.testing.assert_array_equal(anatomy.least_rotation(a[:1] * 0, b[:1]), np.eye(3)[None])
 
 
+def test_least_rotation_turns_a_direction_onto_its_opposite() -> None:
+    """As a bone lies that a file's zero pose has pointing down, and the body pointing up."""
+    ways = np.concatenate([np.eye(3), -np.eye(3), [[1, 1, 1], [0.5, -2, 0]]])
+    turn = anatomy.least_rotation(ways, -3 * ways)
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", turn, ways), -ways, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(turn), 1, atol=1e-12)
+
+
 # Stances
 
 

@@ -17,21 +17,21 @@ from memmlp.motion.importing.skeleton import load_skeleton
 @pytest.mark.parametrize("skeleton", TREES)
 def test_joints_are_those_of_the_map(tmp_path: Path, skeleton: str) -> None:
     bvh, chosen = read(tmp_path, skeleton), load_skeleton(skeleton)
-    performance = pick_joints(bvh, chosen)
+    mapped_motion = pick_joints(bvh, chosen)
     positions = bvh.kinematics()[1][1:] * chosen.unit
-    assert len(performance) == len(bvh) - 1
+    assert len(mapped_motion) == len(bvh) - 1
     for joint, name in enumerate(JOINTS):
-        assert performance.mapped[joint] == (name in chosen.joints)
+        assert mapped_motion.mapped[joint] == (name in chosen.joints)
         if name in chosen.joints:
             node = bvh.nodes.index(chosen.joints[name])
-            np.testing.assert_array_equal(performance.positions[:, joint], positions[:, node])
+            np.testing.assert_array_equal(mapped_motion.positions[:, joint], positions[:, node])
 
 
 def test_a_joint_without_counterpart_is_its_parent(tmp_path: Path) -> None:
-    performance = pick_joints(read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz"))
+    mapped_motion = pick_joints(read(tmp_path, "cmu_daz"), load_skeleton("cmu_daz"))
     spine2, spine3 = JOINTS.index("spine2"), JOINTS.index("spine3")
-    assert performance.nodes[spine3] == performance.nodes[spine2]
-    np.testing.assert_array_equal(performance.positions[:, spine3], performance.positions[:, spine2])
+    assert mapped_motion.nodes[spine3] == mapped_motion.nodes[spine2]
+    np.testing.assert_array_equal(mapped_motion.positions[:, spine3], mapped_motion.positions[:, spine2])
 
 
 def test_a_map_of_other_joints_is_refused(tmp_path: Path) -> None:

@@ -64,12 +64,12 @@ def test_a_runner_whose_feet_point_back_is_no_stance(tmp_path: Path, walk: Clip)
     turns = random_turns(own_tree(DAZ), 1)
     first = found(tmp_path, walk, DAZ, turns=turns)
     bvh = read_bvh(tmp_path / "clip.bvh")
-    performance = pick_joints(bvh, DAZ)
+    mapped_motion = pick_joints(bvh, DAZ)
     frame = int(first.source.split()[1].rstrip(","))
     for ankle, toes in ((7, 10), (8, 11)):
-        foot = performance.positions[frame, toes] - performance.positions[frame, ankle]
-        performance.positions[frame, toes] -= 2 * foot * [1, 0, 1]
-    other = find_rest_pose(bvh, DAZ, performance)
+        foot = mapped_motion.positions[frame, toes] - mapped_motion.positions[frame, ankle]
+        mapped_motion.positions[frame, toes] -= 2 * foot * [1, 0, 1]
+    other = find_rest_pose(bvh, DAZ, mapped_motion)
     assert other.source.endswith("the straightest")
     assert other.source != first.source
 

@@ -217,6 +217,8 @@ def test_calibration_frame_is_dropped(tmp_path: Path) -> None:
     np.testing.assert_array_equal(dropped.trans, kept.trans[1:])
     with refuse(tmp_path / "clip.bvh", "only the calibration frame"):
         imported(read(tmp_path, "cmu_daz", frames=1), chosen)
+    with refuse(tmp_path / "clip.bvh", "only the calibration frame"):  # from which no up axis is found either
+        imported(read(tmp_path, "cmu_daz", frames=1), replace(chosen, up=None))
 
 
 # Motion of people

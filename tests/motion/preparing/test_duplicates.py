@@ -1,7 +1,12 @@
 """Clips of the same frames: in one part, and one group."""
 
-from memmlp.motion.preparing.duplicates import one_part_each, tied
+from collections import Counter
+
+import pytest
+
+from memmlp.motion.preparing.duplicates import assign, one_part_each, tied
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
+from memmlp.motion.preparing.splits import MixedSplit, SeededSplit
 
 CONTENTS = {"a": "x", "b": "y", "c": "x", "d": "x", "e": "y", "f": "z", "g": STILL, "h": STILL}
 
@@ -27,3 +32,21 @@ def test_groups_with_copies_are_one():
     assert tied(clips(), groups) == {
         "a": "a", "b": "a", "c": "a", "d": "a", "e": "a", "f": "f", "g": "a", "h": "h",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("source", ["", "cmu/"])
+@pytest.mark.parametrize("copy", [False, True])
+def test_a_copy_leaves_the_limit_of_clips_of_a_group(source: str, copy: bool):
+    """Twelve takes of ten clips each; one clip of the first take is there again in the second."""
+    names = [f"{source}take{take:02}/{clip}" for take in range(12) for clip in range(10)]
+    contents = {name: name for name in names}
+    if copy:
+        contents[names[10]] = names[0]
+    records = [ClipRecord(name, "", "", "", 0, 9, "", of, 60.0, "kept") for name, of in contents.items()]
+    own = SeededSplit(0.2, 0.2, 0, ["(take..)/"], per_group=2)
+    parts, groups, gave_way = assign(MixedSplit({"cmu": own}) if source else own, records)
+    held_out = Counter((groups[name], part) for name, part in parts.items() if part in ("val", "test"))
+    assert {part for _, part in held_out} == {"val", "test"}
+    assert set(held_out.values()) == {2}
+    assert groups[names[10]] == (groups[names[0]] if copy else names[10])
+    assert gave_way == {}
