@@ -9,7 +9,7 @@ from typing import Any
 
 from memmlp.common.files import file_digest, now, read_json, write_json
 from memmlp.runs.environment import environment
-from memmlp.runs.identity import belongs, deployment_name
+from memmlp.runs.identity import belongs, deployment_name, deployment_recipes
 
 ONNX_FILES = {
     "fp32": "step.onnx",
@@ -57,6 +57,11 @@ class DeploymentFolder:
     def current(self) -> bool:
         """Whether the deployment was made by the present recipes."""
         return self.folder.name == deployment_name(self.settings)
+
+    @property
+    def recipes(self) -> dict[str, int]:
+        """The recipe numbers that it was made by; empty where these are not the present ones."""
+        return deployment_recipes(self.settings) if self.current else {}
 
     def finish(self, record: Mapping[str, Any]) -> None:
         """Write what was measured, with the files' digests; this marks the deployment as complete."""

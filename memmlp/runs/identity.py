@@ -175,15 +175,15 @@ def deployment_id(config: Mapping[str, Any]) -> str:
 
 def deployment_name(settings: Mapping[str, Any]) -> str:
     """Return the identity that a deployment with these settings has by the present recipes."""
-    graph = settings.get("graph", "auto")
-    used = [
-        "export",
-        "latency",
-        *(f"graph.{name}" for name in ("streaming", "naive") if graph in (name, "auto")),
-    ]
     name = settings.get("precision", "fp32")
-    used += [name] if name != "fp32" else []
-    return f"{name}-{_digest({'settings': settings, 'recipes': recipes(used)})}"
+    return f"{name}-{_digest({'settings': settings, 'recipes': deployment_recipes(settings)})}"
+
+
+def deployment_recipes(settings: Mapping[str, Any]) -> dict[str, int]:
+    """Return the recipe numbers of the components that a deployment with these settings uses."""
+    graph, name = settings.get("graph", "auto"), settings.get("precision", "fp32")
+    graphs = [f"graph.{one}" for one in ("streaming", "naive") if graph in (one, "auto")]
+    return recipes(["export", "latency", *graphs, *([name] if name != "fp32" else [])])
 
 
 def deployment_settings(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -184,8 +184,10 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
             groups |= {clip["name"]: clip["group"]} if clip.get("group") else {}
             sources |= {clip["name"]: clip["source"]} if clip.get("source") else {}
     deployments = [run.deployment(name) for name in stages or () if run.deployment(name).done]
-    latency = (deployments or [run.preferred_deployment])[-1].record
+    deployed = (deployments or [run.preferred_deployment])[-1]
+    latency = deployed.record
     origin = replace(_evaluated(_origin(manifest), reports), deployed=_deployed(latency))
+    origin = replace(origin, recipes={**origin.recipes, **deployed.recipes})
     training = _training(run, manifest)
     return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run, sources, training)
 

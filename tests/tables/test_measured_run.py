@@ -15,6 +15,8 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.report.kept_results import Kept, dumps, load_kept
 from memmlp.runs.evaluation_file import write_report
+from memmlp.runs.identity import deployment_name
+from memmlp.runs.recipe_numbers import RECIPES, outdated
 from memmlp.sweep.spec import Sweep
 from memmlp.tables.measured_run import Measured, load
 
@@ -42,6 +44,21 @@ def test_size_and_times_are_of_the_precision_that_was_asked_for(sweep: Sweep, tm
     assert not any(
         "less precision" in f for f in table_of(replace(sweep, seeds=(0,)), lambda arm, seed: run).flags
     )
+
+
+def test_costs_of_an_earlier_recipe_are_known_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    run, settings = fake_run(tmp_path, "run"), {"graph": "naive", "precision": "int8"}
+    before = load(run.folder).origin.recipes
+    path = run.deployment("fp32-0").latency
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"settings": settings}))
+    path.parent.rename(path.parent.with_name(deployment_name(settings)))
+    after = load(run.folder).origin.recipes
+    made_by = {name: number for name, number in after.items() if name not in before}
+    assert made_by.keys() == {"export", "latency", "graph.naive", "int8"}
+    number = made_by["latency"]
+    monkeypatch.setitem(RECIPES, "latency", number + 1)
+    assert outdated(made_by) == [f"latency {number} -> {number + 1}"]
+    assert load(run.folder).origin.recipes == before  # by which numbers it was made, is not known
 
 
 def test_what_an_evaluation_ran_on_counts_too(sweep: Sweep, tmp_path: Path):
