@@ -107,7 +107,7 @@ class PathsConfig:
 
 @dataclass
 class ProfileConfig:
-    """The sizes that fit a scale of work (tests, a CPU, a GPU).
+    """The sizes that fit a scale of work (tests, a CPU, a GPU), and readings of the paper that go with them.
 
     The other groups read their defaults from here; any of them can be overridden in its own group.
     """
