@@ -9,7 +9,7 @@ import contextlib
 import getpass
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,7 @@ from memmlp.evaluation.predictions import save_predictions
 from memmlp.live.latency import measure_pose
 from memmlp.motion.motion_source import Prepared
 from memmlp.motion.preparing.manifest import ClipRecord
+from memmlp.motion.preparing.splits import divided_subjects
 from memmlp.pipeline.devices import described
 from memmlp.pipeline.experiment import Experiment, UpstreamTraining
 from memmlp.runs.environment import packages_of_ones_own
@@ -66,6 +67,18 @@ def of_tests(clips: Sequence[ClipRecord]) -> str:
     return f"{counts}, too few to tell networks apart; more motion or a larger data.split.test tests on more"
 
 
+def of_subjects(config: Mapping[str, Any], clips: Sequence[ClipRecord]) -> str:
+    """Say that a seeded split of AMASS tests on people whom it trains on; empty where it doesn't.
+
+    Published lists do so, as they were published, and a mix names its sources before its clips.
+    """
+    divided = divided_subjects((clip.name, clip.split) for clip in clips)
+    if not divided or config.get("sources") or "folder" in config["split"]:
+        return ""
+    more = f" and {len(divided) - 1} more" if len(divided) > 1 else ""
+    return f"clips of {divided[0]}{more} are in training and in test; data=amass_s3 keeps subjects apart"
+
+
 def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     """Bring the experiment's run to its end, doing only what is missing.
 
@@ -76,6 +89,8 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     data = experiment.data.prepare()
     clips = data.manifest.clips
     tell(f"data: {len(clips)} clips ({of_tests(clips)}), prepared in {data.cache}")
+    if said := of_subjects(experiment.config["data"], clips):
+        tell(f"data: {said}")
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     if not run.done:
         experiment.training.optim.check_installed()

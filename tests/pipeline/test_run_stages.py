@@ -1,5 +1,6 @@
 """The whole way at profile=tiny, by the commands a person would type."""
 
+import itertools
 import json
 import re
 import shutil
@@ -264,6 +265,24 @@ def test_a_single_group_of_test_clips_is_told_to_decide_nothing():
         "in groups: 1, too few to tell networks apart; more motion or a larger data.split.test"
         in run_stages.of_tests([*train, *clips("a", "a")])
     )
+
+
+@pytest.mark.parametrize(
+    ("names", "config", "said"),
+    [
+        (("CMU/01/a", "CMU/01/b", "KIT/3/a", "KIT/3/b"), {}, "clips of CMU/01 and 1 more are in"),
+        (("BMLrub/BioMotionLab_NTroje/7/a", "BMLrub/BioMotionLab_NTroje/7/b"), {}, "clips of BioMotion"),
+        (("CMU/01/a", "CMU/02/b"), {}, None),
+        (("CMU/a", "CMU/b", "mine/01/a", "mine/01/b"), {}, None),
+        (("CMU/01/a", "CMU/01/b"), {"split": {"folder": "LISTS"}}, None),
+        (("cmu/salsa/01", "cmu/salsa/02"), {"sources": {"cmu": {}}}, None),
+    ],
+)
+def test_a_split_that_tests_on_the_people_that_it_trains_on_says_so(names, config, said):
+    parts = zip(names, itertools.cycle(["train", "test"]))
+    clips = [SimpleNamespace(name=name, split=part) for name, part in parts]
+    found = run_stages.of_subjects({"split": {}, **config}, clips)
+    assert found.startswith(said) if said else found == ""
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,23 @@ S2_TRAIN = (
 S2_TEST = ("HumanEva", "Transitions_mocap")
 
 
+AMASS = frozenset(map(subset, (*S2_TRAIN, *S2_TEST)))
+
+
+def divided_subjects(parts: Iterable[tuple[str, str]]) -> list[str]:
+    """Return AMASS' subjects, SUBSET/SUBJECT, of whom clips are both in training and in test.
+
+    Args:
+        parts: clips' names and parts.
+    """
+    found: dict[str, set[str]] = defaultdict(set)
+    for name, part in parts:
+        folders = unpacked(name).split("/")[:-1]
+        if len(folders) >= 2 and subset(name) in AMASS:
+            found["/".join(folders[:2])].add(part)
+    return sorted(subject for subject, of in found.items() if {"train", "test"} <= of)
+
+
 @dataclass(frozen=True)
 class Assignment:
     """What a split decided.
