@@ -128,11 +128,12 @@ def test_it_works_outside_the_checkout(bin_folder: Path, tmp_path: Path):
     (tmp_path / "mine.yaml").write_text("arms: {without: [memory=none]}")
     said = run(command, "sweep", "mine.yaml", *TINY, "export.graph=off", folder=tmp_path)
     assert "1 of 1 runs done" in said
-    (made,) = (tmp_path / "outputs/runs").glob("*/deployments/*/step.onnx")
-    said = run(
-        python, "-c", f"import memmlp; print(memmlp.Stream({str(made)!r}).network.fps)", folder=tmp_path
-    )
-    assert float(said) == 60
+    made = sorted(map(str, (tmp_path / "outputs/runs").glob("*/deployments/*/step.onnx")))
+    assert len(made) == 2  # the demo's two networks
+    streams = f"import memmlp; print({{memmlp.Stream(path).network.fps for path in {made}}})"
+    assert run(python, "-c", streams, folder=tmp_path) == "{60}\n"
+    shown = run(python, "-c", "import memmlp; print(*dir(memmlp))", folder=tmp_path).split()
+    assert set(memmlp.__all__) <= set(shown)
 
 
 @contextmanager
