@@ -131,7 +131,7 @@ def test_it_works_outside_the_checkout(bin_folder: Path, tmp_path: Path):
     made = sorted(map(str, (tmp_path / "outputs/runs").glob("*/deployments/*/step.onnx")))
     assert len(made) == 2  # the demo's two networks
     streams = f"import memmlp; print({{memmlp.Stream(path).network.fps for path in {made}}})"
-    assert run(python, "-c", streams, folder=tmp_path) == "{60}\n"
+    assert run(python, "-c", streams, folder=tmp_path) == "{60.0}\n"
     shown = run(python, "-c", "import memmlp; print(*dir(memmlp))", folder=tmp_path).split()
     assert set(memmlp.__all__) <= set(shown)
 
