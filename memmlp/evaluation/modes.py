@@ -148,7 +148,7 @@ def evaluate(
 
     Args:
         network: the network to evaluate.
-        dataset: the part.
+        dataset: the clips.
         modes: the evaluation modes.
         batch: how many clips are evaluated side by side, at most.
         ik: inverse kinematics, whose result is a further branch.

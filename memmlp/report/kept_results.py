@@ -26,6 +26,7 @@ from memmlp.tables.measured_run import Errors, Measured, Origin, known_mean
 
 DIGITS = 6
 FLAT_LIST = re.compile(r"\[\n([^\[\]{}]*?)\n *\]")  # of plain values; no string has a line's end in it
+LATER_FACTS = ("partial", "processes", "offline", "deployed")  # the origins of older files have none of these
 OLDER_NAMES = {"vqvae": "upstream"}  # what the origins of older files call otherwise
 
 
@@ -87,11 +88,11 @@ class Kept:
 
     def name(self, run: Measured) -> str:
         """Return a run's name in the file."""
+        if run.id in self.named:
+            return run.id
         run_id, errors, costs = _key(run)
         return next(
-            name
-            for name in (run_id, f"{run_id}/{errors}", f"{run_id}/{errors}-{costs}")
-            if name in self.named
+            name for name in (f"{run_id}/{errors}", f"{run_id}/{errors}-{costs}") if name in self.named
         )
 
     @staticmethod
@@ -282,12 +283,7 @@ def _record(run: Measured) -> dict[str, Any]:
     """Return what is kept of a run."""
     costs = _shortened_costs(run)
     origin = plain(asdict(run.origin))
-    for name in (
-        "partial",
-        "processes",
-        "offline",
-        "deployed",
-    ):  # files from before there were these have none
+    for name in LATER_FACTS:
         if origin[name] == getattr(Origin, name):
             del origin[name]
     training = {"training": {name: _short(number) for name, number in run.training.items()}}
