@@ -21,7 +21,7 @@ from hypothesis import HealthCheck, settings
 from own_package import on_path  # noqa: F401
 from remembered import keep_exports, remember
 
-from memmlp.common.garbage_collection import collect_seldom
+from memmlp.common.python_gc import collect_seldom
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -19,12 +19,12 @@ from memmlp.networks.refiner import SAGERefiner
 from memmlp.networks.vqvae import VQVAE
 from memmlp.training.loop import seed_step, train_step
 from memmlp.training.losses import Fixed, Loss, Terms
-from memmlp.training.network import MotionTask
 from memmlp.training.optim import Optim, vqvae_optim
-from memmlp.training.refiner import RefinerTask, RefinerTraining, sage_loss
 from memmlp.training.rollout import TeacherForcing
-from memmlp.training.sage import PARTS, DroppingOptim, PartTask
-from memmlp.training.vqvae import VQVAETask
+from memmlp.training.train_network import MotionTask
+from memmlp.training.train_refiner import RefinerTask, RefinerTraining, sage_loss
+from memmlp.training.train_sage import PARTS, DroppingOptim, PartTask
+from memmlp.training.train_vqvae import VQVAETask
 
 
 def frames() -> MotionDataset:

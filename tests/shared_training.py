@@ -16,7 +16,7 @@ from memmlp.common import distributed
 from memmlp.runs.run import Run
 from memmlp.training.loop import TrainingTask, train
 from memmlp.training.optim import Muon, Optim, ScheduleFree
-from memmlp.training.vqvae import VQVAETask
+from memmlp.training.train_vqvae import VQVAETask
 
 STEPS = replace(OPTIM, steps=50, checkpoint_every=20, validate_every=25)
 OPTIMS = {

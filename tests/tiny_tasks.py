@@ -14,12 +14,12 @@ from memmlp.networks.memory import JointCodeMemory
 from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.run import Run
 from memmlp.training.losses import HandPosition, MotionLoss, TermsLoss, Uncertainty
-from memmlp.training.network import MotionTask, NetworkTraining
 from memmlp.training.optim import Optim
 from memmlp.training.rollout import OwnPredictions, PersistentStreams, TeacherForcing
-from memmlp.training.sage import PARTS, PartTask, Windows
 from memmlp.training.sage_losses import objective
-from memmlp.training.vqvae import VQVAETask
+from memmlp.training.train_network import MotionTask, NetworkTraining
+from memmlp.training.train_sage import PARTS, PartTask, Windows
+from memmlp.training.train_vqvae import VQVAETask
 
 OPTIM = Optim(steps=12, batch=4, lr=1e-3, final_lr=1e-4, schedule="cosine", checkpoint_every=5, log_every=4)
 ROLLOUTS = {

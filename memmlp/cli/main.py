@@ -15,8 +15,8 @@ import click
 import memmlp
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
-from memmlp.common.garbage_collection import collect_seldom
 from memmlp.common.progress import telling
+from memmlp.common.python_gc import collect_seldom
 
 
 class Command(NamedTuple):

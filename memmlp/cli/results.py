@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from memmlp.report.markdown import KeptTable
     from memmlp.sweep.spec import Sweep
     from memmlp.tables.effects import RunsBySeed
-    from memmlp.tables.scaling import Trends
+    from memmlp.tables.effects_along_axes import Trends
     from memmlp.tables.table import Table
 
 FOLDER = Path("docs/results")
@@ -179,7 +179,7 @@ def _trends(kept: Kept, stem: str) -> Trends | None:
         stem: the name of their page.
     """
     from memmlp.config.plan_sweep import find_sweep
-    from memmlp.tables.scaling import trends
+    from memmlp.tables.effects_along_axes import trends
 
     sweep = find_sweep(kept.sweep)
     if sweep.scale is None:
@@ -263,7 +263,7 @@ def _stale(folder: Path, made: Mapping[str, str]) -> list[str]:
 
 def _pictures(folder: Path, found: Mapping[str, KeptTable]) -> dict[str, Trends]:
     """Return the figures whose files are not there or show other numbers, by the files' names."""
-    from memmlp.report.scaling import picture_name
+    from memmlp.report.scaling_section import picture_name
 
     wanted = {
         picture_name(one.trends): one.trends

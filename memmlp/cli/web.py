@@ -92,7 +92,7 @@ def network_of(opened: OpenedRun, clips: list[SiteClip]) -> SiteNetwork:
     """Return a run's network as a site has it."""
     from memmlp.live.web.networks import SiteNetwork
     from memmlp.runs.identity import flatten
-    from memmlp.runs.name import run_name
+    from memmlp.runs.shown_name import run_name
 
     run, config = opened.run, flatten(opened.run.config)
     name, model = run_name(run.manifest, config).removeprefix("default · "), config["model.name"]

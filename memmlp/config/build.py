@@ -21,7 +21,7 @@ from memmlp.config import plugins
 from memmlp.config.build_motion import build_motion, shares
 from memmlp.config.compose import composed
 from memmlp.config.instantiate import built, located
-from memmlp.config.readable_name import readable_name
+from memmlp.config.name_from_config import readable_name
 from memmlp.config.schema import check, restored
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
@@ -47,10 +47,10 @@ from memmlp.runs.lookup import check_trained
 from memmlp.runs.run import Run
 from memmlp.tracking.feed import Tracking
 from memmlp.training.losses import Loss, MotionLoss, Term
-from memmlp.training.network import NetworkTraining
 from memmlp.training.optim import Optim, vqvae_optim
-from memmlp.training.refiner import RefinerTraining
-from memmlp.training.vqvae import VQVAETraining
+from memmlp.training.train_network import NetworkTraining
+from memmlp.training.train_refiner import RefinerTraining
+from memmlp.training.train_vqvae import VQVAETraining
 
 COORDINATES: dict[str, type[Coordinates]] = {
     "head_relative": HeadRelative,

@@ -16,9 +16,9 @@ from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.normalizer import Normalizer
 from memmlp.sweep.spec import Sweep
 from memmlp.tables.effects import RunsBySeed
+from memmlp.tables.effects_along_axes import in_cells
 from memmlp.tables.measured_run import Measured
-from memmlp.tables.scaling import in_cells
-from memmlp.training.network import NetworkTraining
+from memmlp.training.train_network import NetworkTraining
 from memmlp.training.training_flops import training_flops
 
 ELSEWHERE = ("seed", "data", "paths", "profile", "tracking", "evaluation", "export", "device", "threads")

@@ -13,7 +13,7 @@ from torch import Tensor
 from memmlp.common.progress import tell
 from memmlp.deploy import latency
 from memmlp.deploy.block_quantization import quantise_blocks
-from memmlp.deploy.half import halve
+from memmlp.deploy.half_precision import halve
 from memmlp.deploy.network_alone import network_alone
 from memmlp.deploy.opsets import NATIVE
 from memmlp.deploy.parity import TOLERANCE, parity, tolerated

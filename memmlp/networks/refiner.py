@@ -1,7 +1,7 @@
 """The refiner slot: what corrects the stream of a network's poses, frame by frame.
 
 SAGE-Net's (Feng et al., CVPR 2024) is a recurrent network behind its decoder; here it may stand behind any
-network. It is trained on the poses that the finished network streams (memmlp.training.refiner).
+network. It is trained on the poses that the finished network streams (memmlp.training.train_refiner).
 """
 
 from __future__ import annotations

@@ -16,8 +16,8 @@ from memmlp.networks.architecture import VQVAE_SETTINGS, Architecture
 from memmlp.runs.identity import NETWORK, Identity, deployment_id, evaluation_id
 from memmlp.runs.run import Run
 from memmlp.tracking.feed import Tracking
-from memmlp.training.network import NetworkTraining
-from memmlp.training.refiner import RefinerTraining
+from memmlp.training.train_network import NetworkTraining
+from memmlp.training.train_refiner import RefinerTraining
 
 
 class UpstreamTraining(Protocol):

@@ -23,8 +23,8 @@ from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
 from memmlp.live.latency import measure_pose
 from memmlp.motion.motion_source import Prepared
+from memmlp.motion.preparing.amass import divided_subjects
 from memmlp.motion.preparing.manifest import ClipRecord
-from memmlp.motion.preparing.splits import divided_subjects
 from memmlp.pipeline.devices import described
 from memmlp.pipeline.experiment import Experiment, UpstreamTraining
 from memmlp.runs.environment import packages_of_ones_own

@@ -10,11 +10,11 @@ from jinja2 import Environment, StrictUndefined, TemplateError
 
 from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept
-from memmlp.report.scaling import scaling_section, scaling_summary
+from memmlp.report.scaling_section import scaling_section, scaling_summary
 from memmlp.report.unbacked_claims import claims
+from memmlp.tables.effects_along_axes import Trends
 from memmlp.tables.formats import escaped, markdown
 from memmlp.tables.measured_run import UNKNOWN, Measured
-from memmlp.tables.scaling import Trends
 from memmlp.tables.statistics import Verdict
 from memmlp.tables.table import Cell, Row, Table
 from memmlp.tables.table_text import (

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from memmlp.common.files import digest
 from memmlp.sweep.spec import COMPUTE
-from memmlp.tables.scaling import Point, Trend, Trends
+from memmlp.tables.effects_along_axes import Point, Trend, Trends
 from memmlp.tables.table_text import with_unit
 
 INK, LINE, FAINT, AHEAD = "#1f2328", "#0969da", "#d0d7de", "#bc4c00"

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
 from memmlp.runs.identity import SLOTS, chosen, flatten, trained_by
-from memmlp.runs.name import run_name
 from memmlp.runs.notes import read_notes
 from memmlp.runs.run import STATUSES, Run
+from memmlp.runs.shown_name import run_name
 
 Record = Mapping[str, Any]
 Condition = Callable[[Record], bool]

@@ -15,8 +15,8 @@ from rich.text import Text
 
 from memmlp.runs.identity import NETWORK, training_settings
 from memmlp.runs.metrics_log import Metrics
-from memmlp.runs.name import kind_words
 from memmlp.runs.run import Run
+from memmlp.runs.shown_name import kind_words
 from memmlp.sweep.plan import Plan, RunTask
 
 COLOURS = {

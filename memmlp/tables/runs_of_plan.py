@@ -12,7 +12,7 @@ from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan
 from memmlp.sweep.spec import Arm
 from memmlp.tables.build_table import Find
-from memmlp.tables.flags import Say
+from memmlp.tables.flags_of_runs import Say
 from memmlp.tables.measured_run import Measured
 
 Read = Callable[[Path, tuple[str, ...]], Measured]

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 from memmlp.common.files import file_digest, plain, read_json
 from memmlp.runs.identity import flatten
 from memmlp.runs.metrics_log import Metrics, parsed
-from memmlp.runs.name import run_name
 from memmlp.runs.notes import read_notes
 from memmlp.runs.run import Run
+from memmlp.runs.shown_name import run_name
 
 SYSTEM = "system.jsonl"
 """The log of what a run's machine did meanwhile, in its folder."""

@@ -8,7 +8,7 @@ from typing import Any
 from torch.profiler import ProfilerActivity, profile, record_function
 
 SAMPLING = "sampling"
-"""What the drawing of a batch is called in a profile (memmlp.training.network)."""
+"""What the drawing of a batch is called in a profile (memmlp.training.train_network)."""
 
 MATRIX_PRODUCTS = frozenset(
     f"aten::{name}"

@@ -19,9 +19,9 @@ from memmlp.motion.body import FRAME_DIM
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks.motion_model import MotionModel
 from memmlp.training.losses import Loss
-from memmlp.training.network import MotionTask
 from memmlp.training.optim import Optim
 from memmlp.training.rollout import TeacherForcing
+from memmlp.training.train_network import MotionTask
 
 COUNTED = (2, 3)
 """Two batches whose counts give that of any, for a step is linear in its windows.

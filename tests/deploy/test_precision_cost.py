@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import tiny
 
-from memmlp.deploy.half import halve
+from memmlp.deploy.half_precision import halve
 from memmlp.deploy.precision_cost import accuracy, compared
 from memmlp.evaluation import modes as evaluation
 from memmlp.networks.streaming import streaming

@@ -17,9 +17,9 @@ from memmlp.networks.vqvae import VQVAE
 from memmlp.runs.run import Run
 from memmlp.training.loop import train
 from memmlp.training.losses import HandPosition, MotionLoss, Uncertainty, l1
-from memmlp.training.network import MotionTask
 from memmlp.training.optim import Optim
 from memmlp.training.rollout import OwnPredictions, PersistentStreams, TeacherForcing
+from memmlp.training.train_network import MotionTask
 
 RECURRENT = [LSTMMemory, GRUMemory]
 SPARSE = tiny.clip(35)[None, :, :SPARSE_DIM]

@@ -17,7 +17,7 @@ from memmlp.networks import checkpoint
 from memmlp.networks.baselines.sage_net import SAGENet
 from memmlp.pipeline.run_stages import upstream_run
 from memmlp.runs.lookup import check_trained, list_runs
-from memmlp.training.sage import PARTS
+from memmlp.training.train_sage import PARTS
 
 SHORT = [
     "model=sage", "profile=tiny", "data.synth.minutes=0.05", "tracking=none", "threads=1", "export.graph=off",

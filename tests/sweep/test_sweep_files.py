@@ -24,7 +24,7 @@ from memmlp.runs.identity import flatten
 from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.spec import Arm, Sweep
 from memmlp.training.loop import train_step
-from memmlp.training.network import MotionTask
+from memmlp.training.train_network import MotionTask
 
 FOLDER = Path(__file__).parent.parent.parent / "sweeps"
 FILES = sorted(FOLDER.glob("*.yaml"))

@@ -18,10 +18,10 @@ from memmlp.networks import checkpoint
 from memmlp.runs.run import Run
 from memmlp.training import loop
 from memmlp.training.loop import train
-from memmlp.training.network import MotionTask
 from memmlp.training.optim import SCHEDULES
 from memmlp.training.rollout import TeacherForcing
-from memmlp.training.vqvae import perplexity
+from memmlp.training.train_network import MotionTask
+from memmlp.training.train_vqvae import perplexity
 
 
 def test_the_weighting_of_the_data_decides_which_clips_a_step_sees():

@@ -14,8 +14,8 @@ from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.runs.run import Run
 from memmlp.training.loop import Watch, train, unwatched
-from memmlp.training.network import MotionTask
 from memmlp.training.optim import Muon, Optim, ScheduleFree
+from memmlp.training.train_network import MotionTask
 
 COMMON = {"steps": 12, "batch": 4, "lr": 1e-2, "checkpoint_every": 5, "log_every": 4}
 OPTIMS: dict[str, Optim] = {

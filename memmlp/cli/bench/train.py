@@ -135,7 +135,7 @@ def compose_experiment(words: Sequence[str]) -> Experiment:
     from memmlp.common.errors import InputError
     from memmlp.config.build import build_experiment
     from memmlp.config.compose import composed
-    from memmlp.training.network import NetworkTraining
+    from memmlp.training.train_network import NetworkTraining
 
     experiment = build_experiment(composed(words))
     if experiment.device.type != "cpu":
@@ -186,8 +186,8 @@ def measure_seed(
 def learner(experiment: Experiment, data: Any, error: str = "MPJPE") -> Learner:
     """Return a training of an experiment that can go on piece by piece; its VQ-VAE is found or trained."""
     from memmlp.pipeline.run_stages import upstream_run
-    from memmlp.training.network import NetworkTraining
     from memmlp.training.time_to_error import Learner
+    from memmlp.training.train_network import NetworkTraining
 
     training = experiment.training
     assert isinstance(training, NetworkTraining)

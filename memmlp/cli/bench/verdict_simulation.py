@@ -11,7 +11,7 @@ import click
 import numpy as np
 
 from memmlp.tables.statistics.calibration import EFFECT, MARGIN, TABLE, broken, extreme, grid, simulate
-from memmlp.tables.statistics.effects import LEVEL
+from memmlp.tables.statistics.paired_differences import LEVEL
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -56,7 +56,8 @@ def prepare(
 
 def _split(name: str, val: float, test: float, seed: int, groups: tuple[str, ...]) -> Split:
     """Return the split that --split names. Raises InputError for an unknown name."""
-    from memmlp.motion.preparing.splits import S2_TEST, S2_TRAIN, ListSplit, SeededSplit, SubsetSplit
+    from memmlp.motion.preparing.amass import S2_TEST, S2_TRAIN
+    from memmlp.motion.preparing.splits import ListSplit, SeededSplit, SubsetSplit
 
     if name == "seeded":
         return SeededSplit(test, val, seed, groups)

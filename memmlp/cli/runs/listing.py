@@ -16,7 +16,7 @@ from memmlp.cli.options import outputs_option
 from memmlp.cli.runs.texts import age, console, number_text, plain_table, recorded, value_text
 from memmlp.evaluation.units import UNITS
 from memmlp.runs.identity import NETWORK
-from memmlp.runs.name import kind_words
+from memmlp.runs.shown_name import kind_words
 
 if TYPE_CHECKING:
     from memmlp.runs.query import Record

@@ -317,7 +317,7 @@ class PartConfig:
 @dataclass
 class SAGEUpstreamConfig(UpstreamConfig):
     name: str = called("sage")
-    _target_: str = target("memmlp.training.sage.SAGEUpstream")
+    _target_: str = target("memmlp.training.train_sage.SAGEUpstream")
     upper_codes: PartConfig = field(default_factory=PartConfig)
     lower_codes: PartConfig = field(default_factory=PartConfig)
     upper_diffusion: PartConfig = field(default_factory=PartConfig)

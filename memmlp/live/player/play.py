@@ -17,7 +17,7 @@ from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES, Space
 from memmlp.live.stream import Pose, Stream
 from memmlp.motion.body import FPS, JOINTS, PARENTS
-from memmlp.motion.formats.humanoid import VRM
+from memmlp.motion.formats.humanoid_bones import VRM
 from memmlp.motion.limb_shapes import LIMBS
 from memmlp.render.error_colours import HEAT
 

@@ -11,7 +11,7 @@ import numpy as np
 from memmlp.common.errors import InputError
 from memmlp.motion.clip import Clip
 from memmlp.motion.formats.bvh_writer import write_bvh
-from memmlp.motion.formats.gltf import write_gltf
+from memmlp.motion.formats.gltf_writer import write_gltf
 from memmlp.motion.formats.npz import write_clip
 
 

@@ -1,4 +1,4 @@
-"""The names of AMASS' clips, which its releases write differently.
+"""AMASS: the names of its clips, which its releases write differently, and what its names tell.
 
 Three namings are known. The first SMPL+H release has folders like `BioMotionLab_NTroje` and `MPI_HDM05`, and
 files that end in `_poses`. Later downloads call the folders `BMLrub` and `HDM05`. The SMPL-X release has
@@ -10,6 +10,8 @@ that are unpacked each into a folder of its own, have the subset's folder twice,
 from __future__ import annotations
 
 import re
+from collections import defaultdict
+from collections.abc import Iterable
 
 RENAMED = {
     "bmlrub": "biomotionlabntroje",
@@ -42,3 +44,28 @@ def clip_key(name: str) -> str:
     """Return what is equal for all names of one clip, whichever release they are from, but for case."""
     _, _, rest = unpacked(name).partition("/")
     return f"{subset(unpacked(name))}/{SUFFIX.sub('', rest.replace(' ', '_'))}"
+
+
+S2_TRAIN = (
+    "CMU", "MPI_Limits", "TotalCapture", "Eyes_Japan_Dataset", "KIT", "BioMotionLab_NTroje", "BMLmovi",
+    "EKUT", "ACCAD", "MPI_mosh", "SFU", "MPI_HDM05",
+)  # fmt: skip
+S2_TEST = ("HumanEva", "Transitions_mocap")
+"""Protocol S2: the subsets to train on, and to test on."""
+
+AMASS = frozenset(map(subset, (*S2_TRAIN, *S2_TEST)))
+"""The subsets of protocol S2 as `subset` names them."""
+
+
+def divided_subjects(parts: Iterable[tuple[str, str]]) -> list[str]:
+    """Return AMASS' subjects, SUBSET/SUBJECT, of whom clips are both in training and in test.
+
+    Args:
+        parts: clips' names and parts.
+    """
+    found: dict[str, set[str]] = defaultdict(set)
+    for name, part in parts:
+        folders = unpacked(name).split("/")[:-1]
+        if len(folders) >= 2 and subset(name) in AMASS:
+            found["/".join(folders[:2])].add(part)
+    return sorted(subject for subject, of in found.items() if {"train", "test"} <= of)

@@ -1,11 +1,8 @@
 """Splits, which assign clip names to train, val, test or nothing.
 
 A clip's name is its path below the data root without suffix, `/`-separated. Clips that belong together
-(`Grouping`) are never divided. Fractions count groups, and a clip that nothing ties to another is a group of
-its own. Nothing depends on the order of the names: groups are ranked by a hash of seed and name, so a clip
-that is added later moves few others, and a smaller `train_fraction` takes some of the clips of a larger one.
-Entries of lists and names of subsets fit AMASS' clips whatever release these are from
-(`memmlp.motion.preparing.amass`).
+(`Grouping`) are never divided (`memmlp.motion.preparing.dividing`). Entries of lists and names of subsets fit
+AMASS' clips whatever release these are from (`memmlp.motion.preparing.amass`).
 """
 
 from __future__ import annotations
@@ -15,39 +12,15 @@ import json
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
 from memmlp.common.errors import InputError
 from memmlp.motion.preparing.amass import subset, unpacked
-from memmlp.motion.preparing.groups import Grouping
+from memmlp.motion.preparing.dividing import Grouped, check_fractions, rank
 from memmlp.motion.preparing.published_lists import PHASES, check_once, entries_of_clips, read_lists
 
 PARTS = ("train", "val", "test")
-
-S2_TRAIN = (
-    "CMU", "MPI_Limits", "TotalCapture", "Eyes_Japan_Dataset", "KIT", "BioMotionLab_NTroje", "BMLmovi",
-    "EKUT", "ACCAD", "MPI_mosh", "SFU", "MPI_HDM05",
-)  # fmt: skip
-S2_TEST = ("HumanEva", "Transitions_mocap")
-
-
-AMASS = frozenset(map(subset, (*S2_TRAIN, *S2_TEST)))
-
-
-def divided_subjects(parts: Iterable[tuple[str, str]]) -> list[str]:
-    """Return AMASS' subjects, SUBSET/SUBJECT, of whom clips are both in training and in test.
-
-    Args:
-        parts: clips' names and parts.
-    """
-    found: dict[str, set[str]] = defaultdict(set)
-    for name, part in parts:
-        folders = unpacked(name).split("/")[:-1]
-        if len(folders) >= 2 and subset(name) in AMASS:
-            found["/".join(folders[:2])].add(part)
-    return sorted(subject for subject, of in found.items() if {"train", "test"} <= of)
 
 
 @dataclass(frozen=True)
@@ -99,31 +72,8 @@ class Split(Protocol):
         ...
 
 
-class _Grouped:
-    """What all splits do alike with their keys `groups` and `groups_file`."""
-
-    groups: Sequence[str]
-    groups_file: Path | str | None
-    train_fraction: float
-
-    @cached_property
-    def grouping(self) -> Grouping:
-        """What ties clips together."""
-        return Grouping.of(self.groups, self.groups_file)
-
-    @property
-    def groups_digest(self) -> str | None:
-        return self.grouping.digest
-
-    def limited(self, parts: Mapping[str, str | None], groups: Mapping[str, str]) -> dict[str, str | None]:
-        return dict(parts)
-
-    def check_groups(self, names: Collection[str], files: Collection[str]) -> None:
-        self.grouping.check(names, files)
-
-
 @dataclass(frozen=True)
-class SeededSplit(_Grouped):
+class SeededSplit(Grouped):
     """A random split with a seed.
 
     Args:
@@ -146,18 +96,18 @@ class SeededSplit(_Grouped):
     per_group: int | None = None
 
     def __post_init__(self) -> None:
-        _check_fractions(self.train_fraction, test=self.test, val=self.val)
+        check_fractions(self.train_fraction, test=self.test, val=self.val)
 
     def assign(self, names: Sequence[str]) -> Assignment:
         seen = {name: name for name in names}
-        parts, groups = _divide(seen, {"test": self.test, "val": self.val}, self), self.grouping.names(seen)
+        parts, groups = self.divided(seen, {"test": self.test, "val": self.val}), self.grouping.names(seen)
         return Assignment(self.limited(parts, groups), groups)
 
     def limited(self, parts: Mapping[str, str | None], groups: Mapping[str, str]) -> dict[str, str | None]:
         if self.per_group is None:
             return dict(parts)
         held_out: dict[str, list[str]] = defaultdict(list)
-        for name in sorted(parts, key=lambda name: _rank(name, self.seed)):
+        for name in sorted(parts, key=lambda name: rank(name, self.seed)):
             if parts[name] in ("test", "val"):
                 held_out[groups[name]].append(name)
         left_out = (name for names in held_out.values() for name in names[self.per_group :])
@@ -172,7 +122,7 @@ class SeededSplit(_Grouped):
 
     def describe(self) -> dict[str, Any]:
         most = {"per_group": self.per_group} if self.per_group else {}
-        return {"kind": "seeded", "test": self.test, **_carving(self), **most}
+        return {"kind": "seeded", "test": self.test, **self.described(), **most}
 
 
 @dataclass(frozen=True)
@@ -241,7 +191,7 @@ class MixedSplit:
 
 
 @dataclass(frozen=True)
-class ListSplit(_Grouped):
+class ListSplit(Grouped):
     """Published lists (AvatarPoser, AGRoL): FOLDER/SUBSET/train_split.txt and test_split.txt.
 
     A line is the relative path of an npz; blank lines, CRLF, a leading `./` and whatever stands before the
@@ -267,7 +217,7 @@ class ListSplit(_Grouped):
     entries: Mapping[str, str] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        _check_fractions(self.train_fraction, val=self.val)
+        check_fractions(self.train_fraction, val=self.val)
         object.__setattr__(self, "entries", read_lists(Path(self.folder)))
 
     def assign(self, names: Sequence[str]) -> Assignment:
@@ -286,11 +236,11 @@ class ListSplit(_Grouped):
 
     def describe(self) -> dict[str, Any]:
         lists = hashlib.sha256(json.dumps(sorted(self.entries.items())).encode()).hexdigest()
-        return {"kind": "lists", "lists_sha256": lists, **_carving(self)}
+        return {"kind": "lists", "lists_sha256": lists, **self.described()}
 
 
 @dataclass(frozen=True)
-class SubsetSplit(_Grouped):
+class SubsetSplit(Grouped):
     """A split by top-level folder, in any letter case and under any name that AMASS gave the subset.
 
     Clips in other folders are left out.
@@ -314,7 +264,7 @@ class SubsetSplit(_Grouped):
     train_fraction: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_fractions(self.train_fraction, val=self.val)
+        check_fractions(self.train_fraction, val=self.val)
         both = set(map(subset, self.train)) & set(map(subset, self.test))
         if both:
             raise InputError(f"data.split: subsets {', '.join(sorted(both))} are both in train and in test")
@@ -334,27 +284,7 @@ class SubsetSplit(_Grouped):
         return dict.fromkeys((*self.train, *self.test), 1)
 
     def describe(self) -> dict[str, Any]:
-        return {"kind": "subsets", "train": list(self.train), "test": list(self.test), **_carving(self)}
-
-
-def _carving(split: SeededSplit | ListSplit | SubsetSplit) -> dict[str, Any]:
-    """Return the settings that every split has."""
-    digest = split.grouping.digest
-    file = {"groups_file_sha256": digest} if digest else {}
-    fewer = {"train_fraction": split.train_fraction} if split.train_fraction < 1 else {}
-    return {"val": split.val, "seed": split.seed, "groups": list(split.groups), **file, **fewer}
-
-
-def _check_fractions(train_fraction: float, **fractions: float) -> None:
-    if not 0 < train_fraction <= 1:
-        raise InputError(
-            f"data.split.train_fraction: {train_fraction} is none; allowed is above 0 and at most 1"
-        )
-    for key, value in fractions.items():
-        if not 0 <= value < 1:
-            raise InputError(f"data.{key}: {value} is no fraction; allowed: 0 <= {key} < 1")
-    if sum(fractions.values()) >= 1:
-        raise InputError(f"data.{', data.'.join(fractions)}: they add up to 1 or more; leave some to train")
+        return {"kind": "subsets", "train": list(self.train), "test": list(self.test), **self.described()}
 
 
 def _carved(
@@ -367,45 +297,5 @@ def _carved(
     train = {name: seen[name] for name, part in parts.items() if part == "train"}
     if not train:
         raise InputError("data.split: no clip of its train part is below data.root; is it the right root?")
-    carved = {**parts, **_divide(train, {"val": split.val}, split)}
+    carved = {**parts, **split.divided(train, {"val": split.val})}
     return Assignment(carved, split.grouping.names(seen), missing)
-
-
-def _divide(
-    seen: Mapping[str, str], fractions: Mapping[str, float], split: SeededSplit | ListSplit | SubsetSplit
-) -> dict[str, str | None]:
-    """Map clips to parts: the first groups in a seeded order fill those of `fractions`, the rest train.
-
-    `seen` maps each clip to the name by which patterns and the seed know it. Of the rest the last groups are
-    left out, as the split's `train_fraction` says.
-    """
-    ranked = sorted(split.grouping.tied(seen), key=lambda group: _rank(seen[group[0]], split.seed))
-    parts: dict[str, str | None] = dict.fromkeys(seen, "train")
-    start = 0
-    for part, count in _counts(len(ranked), fractions).items():
-        for group in ranked[start : start + count]:
-            parts.update(dict.fromkeys(group, part))
-        start += count
-    used = max(1, round(split.train_fraction * (len(ranked) - start)))
-    for group in ranked[start + used :]:
-        parts.update(dict.fromkeys(group, None))
-    return parts
-
-
-def _counts(total: int, fractions: Mapping[str, float]) -> dict[str, int]:
-    """Return how many groups each part gets: its rounded share, at least one, leaving one for train."""
-    counts = {part: max(1, round(share * total)) if share > 0 else 0 for part, share in fractions.items()}
-    needed = 1 + sum(count > 0 for count in counts.values())
-    if total < needed:
-        wanted = ", ".join(["train", *(part for part, count in counts.items() if count)])
-        raise InputError(
-            f"data.split: {wanted} need at least {needed} clips or groups, and there are {total}; "
-            "add clips, loosen data.groups or set a fraction to 0"
-        )
-    while sum(counts.values()) >= total:
-        counts[max(counts, key=lambda part: counts[part])] -= 1
-    return counts
-
-
-def _rank(name: str, seed: int) -> str:
-    return hashlib.sha256(json.dumps([seed, name]).encode()).hexdigest()

@@ -1,6 +1,6 @@
 """SAGE-Net (Feng et al., CVPR 2024): diffusion makes latents of the body's halves, a decoder the pose.
 
-Its parts are trained one after the other (memmlp.training.sage) before they are as a whole.
+Its parts are trained one after the other (memmlp.training.train_sage) before they are as a whole.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ A memory makes the backbone's blocks (`block`), turns the buffers of past frames
 (`recall`), and updates its buffers with the network's output (`remember`). All of it is in network space.
 """
 
-from memmlp.networks.memory.features import (
+from memmlp.networks.memory.memory_block import (
     Blend,
     MemoryBlock,
     Past,

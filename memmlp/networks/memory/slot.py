@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from memmlp.common.errors import InputError
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.layers import MLPBlock, PlainFusion, ResidualFusion
-from memmlp.networks.memory.features import MemoryBlock, Past, Recurred, State
+from memmlp.networks.memory.memory_block import MemoryBlock, Past, Recurred, State
 from memmlp.networks.vqvae import VQVAE
 
 FUSIONS: dict[str, type[ResidualFusion | PlainFusion]] = {"residual": ResidualFusion, "plain": PlainFusion}

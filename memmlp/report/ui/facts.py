@@ -15,8 +15,8 @@ import yaml
 from memmlp.common.files import plain, read_json
 from memmlp.runs.evaluation_file import current
 from memmlp.runs.identity import INFERENCE, flatten, training_settings, used_as_configured
-from memmlp.runs.name import run_name
 from memmlp.runs.run import Run
+from memmlp.runs.shown_name import run_name
 
 HIDDEN = ("paths", "tracking", "tracker", "force", "hydra", "save_predictions")
 """Groups of the config that say nothing about a run."""

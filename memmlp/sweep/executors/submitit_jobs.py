@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from memmlp.common.errors import InputError
-from memmlp.common.garbage_collection import collect_seldom
+from memmlp.common.python_gc import collect_seldom
 from memmlp.sweep.executors.executor import Work
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ docs/statistics.md explains the method and how well it keeps its promises.
 
 from __future__ import annotations
 
-from memmlp.tables.statistics.effects import Effects, equivalence_p, paired_effects, seed_effects
+from memmlp.tables.statistics.paired_differences import Effects, equivalence_p, paired_effects, seed_effects
 from memmlp.tables.statistics.power import detectable, seeds_needed
 from memmlp.tables.statistics.robust import (
     interquartile_mean,

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from memmlp.tables.statistics.effects import LEVEL
+from memmlp.tables.statistics.paired_differences import LEVEL
 from memmlp.tables.statistics.simulation import SHARES, GridRow, Shares, Simulated, choices
 from memmlp.tables.statistics.verdicts import holm, sequential, spending
 

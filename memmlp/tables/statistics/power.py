@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import chdtri, ndtri
 
 from memmlp.tables.statistics.crossed import Error, Groups, error
-from memmlp.tables.statistics.effects import LEVEL
+from memmlp.tables.statistics.paired_differences import LEVEL
 
 DRAWS = 4096  # simulated tables; a power of two, as Sobol's sequence wants
 

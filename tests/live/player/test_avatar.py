@@ -21,7 +21,7 @@ from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Pose
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
-from memmlp.motion.formats.humanoid import VRM
+from memmlp.motion.formats.humanoid_bones import VRM
 
 REST = builtin_rest_joints()
 RANDOM = np.random.default_rng(2)

@@ -5,7 +5,8 @@ from collections import Counter
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.splits import S2_TEST, S2_TRAIN, ListSplit, SeededSplit, SubsetSplit
+from memmlp.motion.preparing.amass import S2_TEST, S2_TRAIN
+from memmlp.motion.preparing.splits import ListSplit, SeededSplit, SubsetSplit
 
 NAMES = [f"salsa/{n:02}" for n in range(1, 31)] + [f"martial/{n:02}" for n in range(1, 11)]
 TWINS = [rf"salsa/(?:{n:02}|{n + 15:02})$" for n in range(1, 16)]

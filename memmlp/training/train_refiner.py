@@ -21,8 +21,8 @@ from memmlp.networks.refiner import HIDDEN, Refined, SAGERefiner
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, Watch, train, unwatched
 from memmlp.training.losses import Loss, TermsLoss
-from memmlp.training.network import VALIDATION_PIECE
 from memmlp.training.optim import Optim
+from memmlp.training.train_network import VALIDATION_PIECE
 
 TOGETHER = 64  # pieces that the network streams through side by side
 

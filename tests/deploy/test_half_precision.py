@@ -13,7 +13,7 @@ from onnx import TensorProto, numpy_helper
 
 from memmlp.common.errors import InputError
 from memmlp.deploy.export import export
-from memmlp.deploy.half import halve, halved
+from memmlp.deploy.half_precision import halve, halved
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.deploy.parity import streamed
 from memmlp.deploy.quantization import inner_layers

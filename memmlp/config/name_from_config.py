@@ -19,7 +19,7 @@ from memmlp.config.compose import VERSION_BASE
 from memmlp.config.packaged import packaged
 from memmlp.config.schema import register
 from memmlp.runs.identity import NETWORK, SLOTS, chosen, flatten, trained_by
-from memmlp.runs.name import kind_words
+from memmlp.runs.shown_name import kind_words
 
 MOST = 6  # words
 BETWEEN = " · "

@@ -19,7 +19,7 @@ from memmlp.networks.architecture import PartedArchitecture
 from memmlp.networks.baselines.sage import LOWER, UPPER
 from memmlp.training import sage_losses
 from memmlp.training.loop import train_step
-from memmlp.training.sage import PARTS, DroppingOptim
+from memmlp.training.train_sage import PARTS, DroppingOptim
 
 OPTIM = DroppingOptim(steps=4, batch=4, lr=1e-2, drops=(0.5, 0.75), drop=0.2)
 FRAMES = torch.stack([tiny.clip(8, seed) for seed in (1, 2)])

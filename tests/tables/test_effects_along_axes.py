@@ -11,8 +11,8 @@ import pytest
 from fake_cells import STEP, STEPS, cells, steps_of
 
 from memmlp.tables.effects import paired
-from memmlp.tables.scaling import Trend, TrendVerdict, trends
-from memmlp.tables.statistics.scaling import fit
+from memmlp.tables.effects_along_axes import Trend, TrendVerdict, trends
+from memmlp.tables.statistics.effect_regression import fit
 from memmlp.tables.table import Key
 
 PAPER = {"profile=paper": STEP * 1e6}

@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 
 from memmlp.sweep.spec import COMPUTE
+from memmlp.tables.effects_along_axes import MODE, Bounds, Slope, Trend, Trends, TrendVerdict
 from memmlp.tables.formats import escaped
-from memmlp.tables.scaling import MODE, Bounds, Slope, Trend, Trends, TrendVerdict
 from memmlp.tables.table_text import places, signed, with_unit
 
 SIGNS = {1: "higher", -1: "lower", 0: "open", None: "no verdict"}

@@ -10,10 +10,10 @@ from typing import NamedTuple
 from memmlp.common.files import read_json
 from memmlp.runs.identity import NETWORK
 from memmlp.runs.lookup import list_runs
-from memmlp.runs.name import kind_words
 from memmlp.runs.notes import read_notes
 from memmlp.runs.recipe_numbers import outdated
 from memmlp.runs.run import Run
+from memmlp.runs.shown_name import kind_words
 
 REASONS = ("failed", "old", "orphaned")
 

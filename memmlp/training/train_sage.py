@@ -26,9 +26,9 @@ from memmlp.networks.baselines.sage import LOWER, UPPER
 from memmlp.networks.baselines.sage_net import SAGENet
 from memmlp.runs.run import Run
 from memmlp.training.loop import StepResult, train
-from memmlp.training.network import NetworkTraining
 from memmlp.training.optim import Optim
 from memmlp.training.sage_losses import Objective, objective
+from memmlp.training.train_network import NetworkTraining
 
 PARTS = ("upper_codes", "lower_codes", "upper_diffusion", "lower_diffusion", "decoder")
 """In the order of their training; each builds upon the one before."""

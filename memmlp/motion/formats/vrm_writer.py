@@ -13,7 +13,7 @@ import numpy as np
 
 import memmlp
 from memmlp.motion.body import HEAD, N_JOINTS
-from memmlp.motion.formats.gltf import (
+from memmlp.motion.formats.gltf_writer import (
     Buffer,
     Mesh,
     capsule,
@@ -24,7 +24,7 @@ from memmlp.motion.formats.gltf import (
     skin,
     write_glb,
 )
-from memmlp.motion.formats.humanoid import VRM
+from memmlp.motion.formats.humanoid_bones import VRM
 
 COLOURS = ((0.30, 0.42, 0.56, 1.0), (0.012, 0.016, 0.022, 1.0))  # of body and eyes, linear RGB and opacity
 EYES = (0.016, 0.036, 0.055, 0.100)  # metres: radius; to either side, above and before the head's joint

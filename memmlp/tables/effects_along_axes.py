@@ -13,8 +13,8 @@ import numpy as np
 from memmlp.sweep.spec import COMPUTE, COSTS, Arm, Sweep
 from memmlp.tables.effects import Paired, RunsBySeed, control_arm, paired
 from memmlp.tables.statistics import holm, paired_effects
-from memmlp.tables.statistics.effects import LEVEL
-from memmlp.tables.statistics.scaling import Estimate, Line, fit
+from memmlp.tables.statistics.effect_regression import Estimate, Line, fit
+from memmlp.tables.statistics.paired_differences import LEVEL
 from memmlp.tables.table import Key
 
 MODE = "stream"

@@ -9,8 +9,8 @@ import pytest
 from glb import Glb
 
 from memmlp.motion.body import JOINTS, builtin_rest_joints
-from memmlp.motion.formats.humanoid import UNITY, VRM
-from memmlp.motion.formats.vrm import write_vrm
+from memmlp.motion.formats.humanoid_bones import UNITY, VRM
+from memmlp.motion.formats.vrm_writer import write_vrm
 
 REST = builtin_rest_joints()
 REQUIRED = {

@@ -6,7 +6,7 @@ import sys
 from processes import finished
 
 from memmlp.cli.main import main
-from memmlp.common.garbage_collection import THRESHOLDS
+from memmlp.common.python_gc import THRESHOLDS
 from memmlp.sweep.executors.submitit_jobs import Requeued
 
 COMMAND = """

@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 from memmlp.tables.statistics.crossed import error
-from memmlp.tables.statistics.effects import paired_effects
-from memmlp.tables.statistics.scaling import Line, fit
+from memmlp.tables.statistics.effect_regression import Line, fit
+from memmlp.tables.statistics.paired_differences import paired_effects
 
 STEPS = np.array([500, 1000, 2000, 2000, 2000, 2000, 4000, 8000, 2000, 2000, 2000])
 WIDTH = np.array([128, 128, 128, 64, 256, 512, 128, 128, 128, 128, 128])

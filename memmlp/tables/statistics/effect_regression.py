@@ -33,7 +33,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from memmlp.tables.statistics.crossed import Error, Groups, by_group
-from memmlp.tables.statistics.effects import LEVEL
+from memmlp.tables.statistics.paired_differences import LEVEL
 
 LEAST = 2
 """The least degrees of freedom of a fit: cells beyond as many as it has coefficients."""

@@ -15,7 +15,7 @@ from memmlp.networks.refiner import SAGERefiner
 from memmlp.runs.run import Run
 from memmlp.training.loop import train
 from memmlp.training.optim import Optim
-from memmlp.training.refiner import RefinerTask, RefinerTraining, sage_loss, streamed
+from memmlp.training.train_refiner import RefinerTask, RefinerTraining, sage_loss, streamed
 
 OPTIM = Optim(steps=12, batch=4, lr=1e-2, final_lr=1e-3, schedule="cosine", checkpoint_every=5, log_every=4)
 REFINER = SAGERefiner(width=6, depth=2, frames=20, pieces=6)

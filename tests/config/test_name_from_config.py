@@ -9,7 +9,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from memmlp.config.compose import composed
-from memmlp.config.readable_name import readable_name
+from memmlp.config.name_from_config import readable_name
 
 pytestmark = pytest.mark.slow
 

@@ -13,10 +13,10 @@ from PIL import Image
 
 from memmlp.report.kept_results import Kept, dumps, load_kept, overrides_of, save
 from memmlp.report.markdown import KeptTable, Words, pages
-from memmlp.report.scaling import bounds_words, power, scaling_section
 from memmlp.report.scaling_figure import figure_is_of, scaling_figure
+from memmlp.report.scaling_section import bounds_words, power, scaling_section
 from memmlp.tables.build_table import make_table
-from memmlp.tables.scaling import Bounds, Trends, trends
+from memmlp.tables.effects_along_axes import Bounds, Trends, trends
 from memmlp.tables.table_text import MINUS
 
 PAPER = {"profile=paper": STEP * 8000 * 30}
