@@ -20,6 +20,7 @@ from memmlp.cli.main import COMMANDS
 from memmlp.config.build import build_loss
 from memmlp.config.compose import composed
 from memmlp.config.plugins import activate
+from memmlp.evaluation.units import SMALLEST, UNITS
 from memmlp.motion.importing.skeleton import SkeletonMap
 from memmlp.runs.identity import flatten
 from memmlp.sweep.parsing import load_sweep
@@ -233,3 +234,9 @@ def test_the_skeleton_of_the_guide_has_the_keys_of_one():
 def test_python_of_pages_is_python(page: Path):
     for number, block in blocks(page.read_text(encoding="utf-8"), "python"):
         compile(block, f"{page}:{number}", "exec")
+
+
+def test_the_metrics_of_the_guide_are_the_field_s():
+    rows = re.findall(r"^\| `(.+?)` \| (.+?) \| (.+?) \|", (DOCS / "guides/runs.md").read_text(), re.MULTILINE)
+    listed = {name: (unit, float(smallest)) for name, unit, smallest in rows if name in UNITS}
+    assert listed == {name: (UNITS[name], SMALLEST[name]) for name in UNITS if name != "GT Jitter"}
