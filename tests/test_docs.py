@@ -237,6 +237,8 @@ def test_python_of_pages_is_python(page: Path):
 
 
 def test_the_metrics_of_the_guide_are_the_field_s():
-    rows = re.findall(r"^\| `(.+?)` \| (.+?) \| (.+?) \|", (DOCS / "guides/runs.md").read_text(), re.MULTILINE)
+    rows = re.findall(
+        r"^\| `(.+?)` \| (.+?) \| (.+?) \|", (DOCS / "guides/runs.md").read_text(), re.MULTILINE
+    )
     listed = {name: (unit, float(smallest)) for name, unit, smallest in rows if name in UNITS}
     assert listed == {name: (UNITS[name], SMALLEST[name]) for name in UNITS if name != "GT Jitter"}

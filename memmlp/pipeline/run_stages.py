@@ -139,8 +139,8 @@ def make_missing_stages(experiment: Experiment, run: Run, data: Prepared) -> lis
         The names of the stages that were made.
     """
     made = []
-    if "partial" not in run.manifest:  # a run from before this was recorded
-        run.write_manifest({"partial": partial_words(experiment, data)})
+    if not {"partial", "divided"} <= run.manifest.keys():  # a run from before these were recorded
+        run.write_manifest(of_data(experiment, data))
     missing = [mode for mode, identity in experiment.evaluations.items() if not run.has(identity)]
     if missing:
         evaluate_run(experiment, run, data, missing)
@@ -259,7 +259,7 @@ def train_run(
     onward = ", on from its checkpoint" if run.checkpoint.exists() else ""
     tell(f"network: train it for {steps} steps{onward} (run {run.id})")
     begin(experiment, run, experiment.identity(data.digest), experiment.config)
-    run.write_manifest({"body": data.manifest.body, "partial": partial_words(experiment, data)})
+    run.write_manifest({"body": data.manifest.body, **of_data(experiment, data)})
     run.clear_stages()
     weights = upstream.weights() if upstream else None
     distributed.of_first(NETWORK)  # tells the others what is trained now
@@ -327,6 +327,12 @@ def own_code(experiment: Experiment) -> dict[str, Any]:
     """Return version and digest of the packages of one's own that the experiment uses; empty without any."""
     packages = experiment.config.get("plugins")
     return {"plugins": packages_of_ones_own(packages)} if packages else {}
+
+
+def of_data(experiment: Experiment, data: Prepared) -> dict[str, Any]:
+    """Return what tables have to flag of a run's data, each in words, None where there is nothing to say."""
+    divided = of_subjects(experiment.config["data"], data.manifest.clips) or None
+    return {"partial": partial_words(experiment, data), "divided": divided}
 
 
 def partial_words(experiment: Experiment, data: Prepared) -> str | None:

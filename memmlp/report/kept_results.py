@@ -26,7 +26,13 @@ from memmlp.tables.measured_run import Errors, Measured, Origin, known_mean
 
 DIGITS = 6
 FLAT_LIST = re.compile(r"\[\n([^\[\]{}]*?)\n *\]")  # of plain values; no string has a line's end in it
-LATER_FACTS = ("partial", "processes", "offline", "deployed")  # the origins of older files have none of these
+LATER_FACTS = (
+    "partial",
+    "processes",
+    "offline",
+    "deployed",
+    "divided",
+)  # the origins of older files have none of these
 OLDER_NAMES = {"vqvae": "upstream"}  # what the origins of older files call otherwise
 
 

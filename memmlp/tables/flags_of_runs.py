@@ -61,6 +61,7 @@ def flags(
         yield from _busy(sweep, runs)
     yield from _seen(sweep, runs)
     yield from _partial(every)
+    yield from _divided_subjects(every)
     yield from _recipes(every)
     yield from _own_code(every)
     changed = [label for label, run in every if run.origin.changed]
@@ -260,6 +261,12 @@ def _partial(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
     """Flag runs on a part of their protocol's list."""
     for part in _unique(run.origin.partial for _, run in every if run.origin.partial):
         yield f"{part}, and no more: {_quoted(label for label, run in every if run.origin.partial == part)}"
+
+
+def _divided_subjects(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
+    """Flag runs that were tested on people on whom they were trained."""
+    for said in _unique(run.origin.divided for _, run in every if run.origin.divided):
+        yield f"{said}: {_quoted(label for label, run in every if run.origin.divided == said)}"
 
 
 def _recipes(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:

@@ -45,6 +45,7 @@ class Origin:
         plugins: version and digest of the code of each package of one's own that it uses.
         offline: whether its frames are made with later ones, so that it is no stream.
         deployed: the precision of the exported file that its size and times are of.
+        divided: in words, that people of whom clips are in training are also in test; None where none are.
     """
 
     code: str
@@ -64,6 +65,7 @@ class Origin:
     plugins: Mapping[str, str] = field(default_factory=dict)
     offline: bool = False
     deployed: str = "fp32"
+    divided: str | None = None
 
 
 @dataclass(frozen=True)
@@ -307,6 +309,7 @@ def _origin(manifest: Mapping[str, Any]) -> Origin:
         recipes=manifest.get("recipes") or {},
         upstream=manifest.get("upstream"),
         partial=manifest.get("partial"),
+        divided=manifest.get("divided"),
         plugins={
             name: f"{one['version'] or 'no version'} ({one['digest']})"
             for name, one in (manifest.get("plugins") or {}).items()

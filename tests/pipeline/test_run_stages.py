@@ -48,6 +48,7 @@ def test_a_run_leaves_everything(home):
     assert run.preferred_deployment.done
     assert len(list(run.evaluations.iterdir())) == 2
     assert set(run.results) == {"window", "stream", "latency"}
+    assert {run.manifest[fact] for fact in ("partial", "divided")} == {None}
     assert run.results["stream"]["rotation"]["MPJPE"] > 0
     assert run.results["latency"]["steps"] >= 200
     assert run.results["latency"]["onnx_parity"] < 1e-4
@@ -283,6 +284,9 @@ def test_a_split_that_tests_on_the_people_that_it_trains_on_says_so(names, confi
     clips = [SimpleNamespace(name=name, split=part) for name, part in parts]
     found = run_stages.of_subjects({"split": {}, **config}, clips)
     assert found.startswith(said) if said else found == ""
+    data = SimpleNamespace(manifest=SimpleNamespace(coverage=SimpleNamespace(whole=True), clips=clips))
+    experiment = SimpleNamespace(config={"data": {"name": "mine", "split": {}, **config}})
+    assert run_stages.of_data(experiment, data) == {"partial": None, "divided": found or None}
 
 
 @pytest.mark.parametrize(

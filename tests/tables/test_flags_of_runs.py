@@ -296,3 +296,18 @@ def test_a_part_of_a_list_is_said_wherever_its_runs_are(sweep: Sweep, tmp_path: 
     kept = load_kept(path)
     assert {run.origin.partial for run in kept.every} == {part, None}
     assert part in origin_words(kept).replace("\\", "")  # escaped for Markdown
+
+
+def test_runs_that_were_tested_on_people_of_their_training_are_named(sweep: Sweep, tmp_path: Path):
+    said = "clips of CMU/01 and 2 more are in training and in test; data=amass_s3 keeps subjects apart"
+    arms = [arm.label for arm in sweep.runnable()]
+    runs = {
+        label: fake_run(tmp_path, label, origin={"divided": said} if label != arms[0] else None)
+        for label in arms
+    }
+    flagged = table_of(replace(sweep, seeds=(0,)), lambda arm, seed: runs[arm.label]).flags
+    assert f"{said}: {', '.join(map(repr, arms[1:]))}" in flagged
+    measured = {label: {0: load(runs[label].folder)} for label in arms}
+    path = tmp_path / "kept.json"
+    path.write_text(dumps(Kept("5", (), measured, {label: () for label in arms})))
+    assert {run.origin.divided for run in load_kept(path).every} == {said, None}
