@@ -70,7 +70,9 @@ SHOWN_MODES = {"stream": ("stream",), "window": ("window",), "both": ("stream", 
     help="Measure networks without a run untrained; for tables of costs alone (16, 17).",
 )
 @click.option(
-    "--plan", is_flag=True, help="Show how many seeds it would take to see the paper's effects on this data."
+    "--seeds-needed",
+    is_flag=True,
+    help="Show how many seeds it would take to see the paper's effects on this data.",
 )
 @config_dir_option
 @plugins_option
@@ -85,7 +87,7 @@ def table(
     source: str | None,
     add: tuple[Path, ...],
     untrained: bool,
-    plan: bool,
+    seeds_needed: bool,
     outputs: Path,
 ) -> None:
     """Show the table of a sweep: NAME is a file's path, a shipped sweep, a table's number, or `all`.
@@ -95,15 +97,15 @@ def table(
     from memmlp.tables import browser_rows
     from memmlp.tables.measured_run import load
 
-    if plan and (form or out or add):
-        raise InputError("--plan: goes to the screen alone, without --format, --out and --add")
+    if seeds_needed and (form or out or add):
+        raise InputError("--seeds-needed: goes to the screen alone, without --format, --out and --add")
     measured = [browser_rows.read(path) for path in add]
     with _uncollected():
         found = gathered(
             [name], overrides, outputs, SHOWN_MODES[mode], functools.cache(load), branch, source, untrained
         )
-    if plan:
-        plans_on_screen(found, SHOWN_MODES[mode])
+    if seeds_needed:
+        seeds_on_screen(found, SHOWN_MODES[mode])
         return
     tables = [functools.reduce(browser_rows.with_rows, measured, one.table) for one in found]
     if form is None and out is None:
@@ -244,7 +246,7 @@ def on_screen(tables: Sequence[Table]) -> None:
         show(one, console)
 
 
-def plans_on_screen(found: Sequence[SweepTable], modes: Sequence[str]) -> None:
+def seeds_on_screen(found: Sequence[SweepTable], modes: Sequence[str]) -> None:
     """Print, sweep by sweep, how many seeds the paper's effects would need."""
     from memmlp.tables.seeds_needed import needs
     from memmlp.tables.table_text import caption
