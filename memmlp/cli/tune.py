@@ -226,7 +226,7 @@ def summary(setup: Setup, study: Study) -> None:
 
     from memmlp.pipeline.run_stages import partial_words
     from memmlp.sweep.search.board import counts, figures, row, trials_table
-    from memmlp.sweep.search.results import importances
+    from memmlp.sweep.search.results import at_an_end, importances
 
     console = Console(highlight=False)
     best = study.best()
@@ -238,6 +238,8 @@ def summary(setup: Setup, study: Study) -> None:
         console.print(table)
     if found := importances(study):
         click.echo("importance: " + ", ".join(f"{key} {share:.2f}" for key, share in found))
+    for line in at_an_end(study.study):
+        click.echo(line)
     click.echo(counts(study))
     experiment = _experiments(setup, {})[0]
     if part := partial_words(experiment, experiment.data.prepare()):

@@ -104,7 +104,7 @@ def _study(folder: Path, url: str | None) -> optuna.Study:
 def _of_study(study: optuna.Study) -> dict[str, Any]:
     from optuna.trial import TrialState
 
-    from memmlp.sweep.search.results import study_importances
+    from memmlp.sweep.search.results import at_an_end, study_importances
 
     trials = [trial for trial in study.get_trials(deepcopy=False) if trial.state != TrialState.WAITING]
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
@@ -125,6 +125,7 @@ def _of_study(study: optuna.Study) -> dict[str, Any]:
         "front": front,
         "best": [_trial(trial) for trial in complete if trial.number in front][:1],
         "trials": [_trial(trial) for trial in trials],
+        "ends": at_an_end(study),
         "importance": [[key, round(share, 4)] for key, share in study_importances(study)],
     }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import warnings
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 import matplotlib
 import optuna
 import yaml
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.exceptions import ExperimentalWarning
 from optuna.trial import FrozenTrial, TrialState
 
@@ -148,6 +150,42 @@ def study_importances(study: optuna.Study) -> list[tuple[str, float]]:
 
 def _first(trial: FrozenTrial) -> float:
     return trial.values[0]
+
+
+def at_an_end(study: optuna.Study) -> list[str]:
+    """Say of each key whose best value lies at an end of what was tried that better ones may lie beyond it.
+
+    Of a range, that is within a fiftieth of its width (of that of its logarithm, where this is searched).
+    Empty for several objectives, whose front reaches to the ends. Zero is an end that nothing lies beyond.
+    """
+    complete = [t for t in study.get_trials(deepcopy=False) if t.state == TrialState.COMPLETE]
+    if len(complete) < 2 or len(study.directions) > 1:
+        return []
+    best = study.best_trial
+    ends = ((key, best.params[key], _end(best.params[key], one)) for key, one in best.distributions.items())
+    return [
+        f"{key}: the best value, {value:g}, is the {end} that was tried; better ones may lie beyond it"
+        for key, value, end in ends
+        if end
+    ]
+
+
+def _end(value: Any, tried: BaseDistribution) -> str | None:
+    """Return at which end of what was tried a number lies, "smallest" or "largest"; None for at neither."""
+    if isinstance(tried, CategoricalDistribution):
+        numbers = [one for one in tried.choices if isinstance(one, int | float) and not isinstance(one, bool)]
+        low, high, margin = min(numbers, default=0), max(numbers, default=0), 0.0
+        known = len(numbers) == len(tried.choices)
+    else:
+        assert isinstance(tried, FloatDistribution | IntDistribution)
+        low, high, margin, known = tried.low, tried.high, 0.02, True
+    if not known or low == high:
+        return None
+    scale = math.log if getattr(tried, "log", False) else float
+    share = (scale(value) - scale(low)) / (scale(high) - scale(low))
+    if share >= 1 - margin:
+        return "largest"
+    return "smallest" if share <= margin and value else None
 
 
 def plots(study: Study) -> dict[str, dict[str, Any]]:

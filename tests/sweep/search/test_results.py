@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+import optuna
 import pytest
 import yaml
 from fake_search import (
@@ -20,6 +21,8 @@ from fake_search import (
 )
 
 from memmlp.sweep.search import results
+from memmlp.sweep.search.spec import Range
+from memmlp.sweep.search.study import suggest
 
 
 def test_trials_of_several_seeds_as_csv(tmp_path: Path):
@@ -111,3 +114,40 @@ def test_a_best_trial_of_groups_lists_and_plain_keys_is_a_config(tmp_path: Path)
     assert content["defaults"][0]["override /hand"] in ("off", "fk")
     assert content["memory"]["layers"] in ([2], [2, 4])
     assert content["seed"] in range(3, 10)
+
+
+@pytest.mark.parametrize(
+    ("tried", "values", "said"),
+    [
+        ({"choices": [0.001, 0.002, 0.008]}, [0.001, 0.002, 0.008], "0.008, is the largest"),
+        ({"choices": [0.001, 0.002, 0.008, 0.016]}, [0.001, 0.002, 0.016, 0.008], None),
+        ({"choices": [0.008, 0.016, 0.004]}, [0.016, 0.008, 0.004], "0.004, is the smallest"),
+        ({"choices": [0.0, 0.1, 0.2]}, [0.2, 0.1, 0.0], None),  # nothing lies beyond zero
+        ({"choices": [False, True]}, [True, False], None),
+        ({"choices": ["a", "b", 3]}, ["a", "b", 3], None),
+        ({"low": 1e-4, "high": 1e-2, "log": True}, [1e-3, 9.5e-3], "0.0095, is the largest"),
+        ({"low": 1e-4, "high": 1e-2, "log": True}, [9.5e-3, 5e-3], None),
+        ({"low": 1e-4, "high": 1e-2}, [9.5e-3, 2.9e-4], "0.00029, is the smallest"),
+        ({"low": 2, "high": 6}, [4, 2, 6], "6, is the largest"),
+    ],
+)  # fmt: skip
+def test_a_best_value_at_an_end_of_what_was_tried_is_told(tried, values, said):
+    """The last value is the best: so is a network tuned that is not, and looks it."""
+    study = optuna.create_study()
+    for number, value in enumerate(values):
+        study.enqueue_trial({"optim.lr": value})
+        trial = study.ask()
+        suggest(trial, Range("optim.lr", **{k: tuple(v) if k == "choices" else v for k, v in tried.items()}))
+        study.tell(trial, -number)
+    found = results.at_an_end(study)
+    assert [line.startswith(f"optim.lr: the best value, {said}") for line in found] == [True] * bool(said)
+
+
+def test_a_front_reaches_to_the_ends():
+    study = optuna.create_study(directions=["minimize", "minimize"])
+    for value in (0.1, 0.2):
+        study.enqueue_trial({"lr": value})
+        trial = study.ask()
+        trial.suggest_float("lr", 0.1, 0.2)
+        study.tell(trial, [value, -value])
+    assert results.at_an_end(study) == []

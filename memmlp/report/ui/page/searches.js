@@ -51,7 +51,7 @@ function body(search) {
   const lines = listed.map(trial => ({ id: trial.number, value: trial.value, text: text(trial), cells: { ...trial.params, ...Object.fromEntries(trial.values.map((value, i) => [`objective ${i}`, value])) } }));
   const best = complete.filter(trial => front.has(trial.number));
   return [
-    h('div', { class: 'sum' }, summary, h('p', { class: 'best' }, best.length === 1 ? 'Best: ' : `On the Pareto front: `, best.slice(0, 8).map((trial, i) => [i ? ', ' : '', runLink(trial), ' ', h('b', { class: 'n' }, trial.values.map(value => number(value, 3)).join(' / '))]))),
+    h('div', { class: 'sum' }, summary, h('p', { class: 'best' }, best.length === 1 ? 'Best: ' : `On the Pareto front: `, best.slice(0, 8).map((trial, i) => [i ? ', ' : '', runLink(trial), ' ', h('b', { class: 'n' }, trial.values.map(value => number(value, 3)).join(' / '))])), search.ends.map(line => h('p', { class: 'faint' }, line))),
     search.objectives.length > 1 ? h('div', { class: 'tools' }, select('Objective', search.objectives.map(one => [one, one]), wanted, value => { remember({ objective: value }); dispatchEvent(new HashChangeEvent('hashchange')); })) : null,
     search.objectives.length === 2 ? section('Pareto front', scatter(complete.map(trial => ({ id: trial.number, x: trial.values[0], y: trial.values[1], text: text(trial) })), { x: search.objectives[0], y: search.objectives[1], front, title: 'text' })) : null,
     h('div', { class: 'pair' }, section('History', history(listed, { label: wanted, choose: open })), search.importance.length ? section('Importance', bars(search.importance.map(([key, value]) => ({ name: short.get(key), value })), { label: `share in the variation of ${search.objectives[0]}` })) : null),
