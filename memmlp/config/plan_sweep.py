@@ -71,7 +71,8 @@ def sweep_folder(sweep: Sweep, outputs: Path) -> Path:
 def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
     """Return the plan of a sweep, the kept one where it still holds.
 
-    A look at a sweep that was never started leaves nothing in the outputs.
+    A look at a sweep that was never started leaves nothing in the outputs, and one at fewer of its seeds, or
+    while its data is not there, leaves the kept plan as it is.
 
     Args:
         sweep: the sweep with the command line's overrides.
@@ -86,15 +87,24 @@ def make_plan(sweep: Sweep, outputs: Path, prepare: bool = False) -> Plan:
     if not prepare and not path.parent.is_dir():
         return plan_anew(sweep, outputs)
     stamp = _stamp(sweep, outputs)
-    keep(sweep, path.parent)
     kept = read_json(path)
     if kept.get("stamp") == stamp and all(_fresh(data, prepare) for data in kept["data"]):
+        keep(sweep, path.parent)
         return Plan.load(path.with_name("plan.json"))
     plan, data = _plan(sweep, outputs, prepare)
-    plan.save(path.with_name("plan.json"))
-    write_json(path, {"stamp": stamp if data is not None else None, "data": data or []})
-    _remember(sweep, plan, path.with_name("entries.json"))
+    if prepare or _has_all(sweep, plan, path.with_name("plan.json")):
+        keep(sweep, path.parent)
+        plan.save(path.with_name("plan.json"))
+        write_json(path, {"stamp": stamp if data is not None else None, "data": data or []})
+        _remember(sweep, plan, path.with_name("entries.json"))
     return plan
+
+
+def _has_all(sweep: Sweep, plan: Plan, path: Path) -> bool:
+    """Return whether a plan has all entries of the kept one, but for those of arms that are gone."""
+    labels = {arm.label for arm in sweep.arms}
+    cells = {(one.get("label"), one.get("seed")) for one in read_json(path).get("entries", ())}
+    return {cell for cell in cells if cell[0] in labels} <= {(one.label, one.seed) for one in plan.entries}
 
 
 def plan_anew(sweep: Sweep, outputs: Path) -> Plan:

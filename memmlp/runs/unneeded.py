@@ -5,9 +5,10 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from memmlp.common.files import read_json
+from memmlp.common.liveness import lives
 from memmlp.runs.identity import NETWORK
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.notes import read_notes
@@ -51,8 +52,9 @@ def garbage(outputs: Path, kinds: Iterable[str] = REASONS) -> list[Garbage]:
         kind, reason = _reason(run, orphans)
         if kind in wanted and not _marked(run) and run.state(False) != "running":
             found[run.id] = Garbage(run, kind, reason, _size(run.folder))
-    used = {run.manifest.get("upstream") for run in runs if run.id not in found}
-    return [one for run_id, one in found.items() if run_id not in used]
+    while found.keys() & (used := {run.manifest.get("upstream") for run in runs if run.id not in found}):
+        found = {run_id: one for run_id, one in found.items() if run_id not in used}
+    return list(found.values())
 
 
 def delete(one: Garbage) -> bool:
@@ -66,7 +68,7 @@ def delete(one: Garbage) -> bool:
 
 
 def _reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, str]:
-    if run.failure:
+    if run.failure and not run.done:  # a trained run may have failed in an export alone
         return "failed", run.failure
     if changed := outdated(run.manifest.get("recipes") or {}):
         return "old", f"older recipe: {', '.join(changed)}"
@@ -76,17 +78,15 @@ def _reason(run: Run, orphans: Mapping[str, str]) -> tuple[str, str]:
 def _orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
     """Return by id why a run is an orphan.
 
-    Orphans are runs of earlier versions of a sweep that no plan has now, VQ-VAEs and parts that no run uses,
-    and folders in which nothing began.
+    Orphans are runs of earlier versions of a sweep that no plan has now, VQ-VAEs and parts that no run uses
+    and no plan wants, and folders in which nothing began.
     """
-    planned: set[str] = set()
-    before: dict[str, str] = {}
-    for path in outputs.glob("sweeps/*/plan.json"):
-        planned |= {task["id"] for task in _listed(path, "tasks")}
-    for path in outputs.glob("sweeps/*/entries.json"):
-        before |= {
-            entry["id"]: f"no longer in sweep {path.parent.name}" for entry in _listed(path, "entries")
-        }
+    planned = {task["id"] for path in _plans(outputs) for task in _listed(path, "tasks")}
+    before = {
+        run_id: f"no longer in sweep {folder.name}"
+        for folder in outputs.glob("sweeps/*/")
+        for run_id in _left(folder)
+    }
     used = {run.manifest.get("upstream") for run in runs} | planned
     kinds = {run.id: str(run.manifest.get("kind") or NETWORK) for run in runs}
     alone = [run_id for run_id, kind in kinds.items() if kind != NETWORK and run_id not in used]
@@ -96,7 +96,29 @@ def _orphans(outputs: Path, runs: list[Run]) -> dict[str, str]:
     return found | {run.id: "nothing began in it" for run in empty}
 
 
-def _listed(path: Path, key: str) -> Iterator[Mapping[str, str]]:
+def _plans(outputs: Path) -> Iterator[Path]:
+    """Yield the files of sweeps' plans, and of those that a living process, such as a search, works on."""
+    yield from outputs.glob("sweeps/*/plan.json")
+    for path in outputs.glob("*/*/controllers/*.process"):
+        if (process := read_json(path)) and lives(process) is not False:
+            yield path.with_suffix(".json")
+
+
+def _left(folder: Path) -> Iterator[str]:
+    """Yield the ids of runs that a sweep had and has no more: their arm is gone, or has another run now.
+
+    A plan that lacks an entry says nothing of its run: it may be for fewer seeds, or its data not be there.
+    """
+    now = {(one.get("label"), one.get("seed")): one["id"] for one in _listed(folder / "plan.json", "entries")}
+    arms = read_json(folder / "sweep.json").get("arms")
+    labels = {arm.get("label") for arm in arms} if arms else None
+    for one in _listed(folder / "entries.json", "entries"):
+        gone = labels is not None and one.get("label") not in labels
+        if gone or now.get((one.get("label"), one.get("seed")), one["id"]) != one["id"]:
+            yield one["id"]
+
+
+def _listed(path: Path, key: str) -> Iterator[Mapping[str, Any]]:
     found = read_json(path).get(key)
     yield from (one for one in found or () if isinstance(one, dict) and "id" in one)
 

@@ -207,10 +207,27 @@ def test_a_plan_is_kept_until_the_groups_of_clips_change(home: Path, monkeypatch
 
 def test_a_look_at_a_sweep_that_was_never_started_leaves_nothing(home: Path):
     folders = sorted((home / "outputs" / "sweeps").iterdir())
-    assert "waiting" in command(home, "seed=7", "--status")
-    command(home, "seed=7", "--dry-run")
-    assert "0/1" in run(home, "table", "trial.yaml", *TINY, "seed=7")
+    assert "waiting" in command(home, "seed=7", "optim.weight_decay=0.1", "--status")
+    command(home, "seed=7", "optim.weight_decay=0.1", "--dry-run")
     assert sorted((home / "outputs" / "sweeps").iterdir()) == folders
+
+
+def test_a_look_at_other_seeds_or_without_the_data_leaves_a_sweep_as_it_was(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Its runs must not look orphaned, which `memmlp runs gc` deletes."""
+    copy = Path(shutil.copytree(home, tmp_path / "copy"))
+    monkeypatch.chdir(copy)
+    assert "1 waiting" not in command(copy, "executor=debug", code=1)
+    folder = next((copy / "outputs" / "sweeps").glob("trial-*"))
+    before = {path.name: path.read_bytes() for path in folder.glob("*.json")}
+    assert "waiting" in command(copy, "seed=7", "--status")
+    command(copy, "seed=7", "--dry-run")
+    assert "0/1" in run(copy, "table", "trial.yaml", *TINY, "seed=7")
+    shutil.move(copy / "outputs" / "data", copy / "elsewhere")
+    command(copy, "--status")
+    assert {path.name: path.read_bytes() for path in folder.glob("*.json")} == before
+    assert "orphaned" not in run(copy, "runs", "gc")
 
 
 @pytest.mark.slow

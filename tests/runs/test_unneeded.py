@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from memmlp.common.files import write_json
+from memmlp.common.liveness import myself
 from memmlp.runs.notes import add_tags
 from memmlp.runs.run import Run
 from memmlp.runs.unneeded import delete, garbage
@@ -25,7 +26,8 @@ def made(outputs: Path, name: str, kind: str = "memmlp", upstream: str | None = 
 @pytest.fixture
 def outputs(tmp_path: Path) -> Path:
     """One run of each sort."""
-    made(tmp_path, FAILED).fail("loss is nan")
+    Run.of(tmp_path, FAILED).begin("memmlp", {}, data="d", upstream=None)
+    Run.of(tmp_path, FAILED).fail("loss is nan")
     made(tmp_path, OLD, recipe=0)
     made(tmp_path, GONE)
     made(tmp_path, CODES, "vqvae")
@@ -34,8 +36,10 @@ def outputs(tmp_path: Path) -> Path:
     Run.of(tmp_path, EMPTY).folder.mkdir()
     sweep = tmp_path / "sweeps" / "mine"
     sweep.mkdir(parents=True)
-    write_json(sweep / "plan.json", {"tasks": [{"id": GOOD}]})
-    write_json(sweep / "entries.json", {"entries": [{"id": GONE}, {"id": GOOD}]})
+    now = {"label": "a", "seed": 0, "id": GOOD}
+    write_json(sweep / "sweep.json", {"arms": [{"label": "a"}]})
+    write_json(sweep / "plan.json", {"entries": [now], "tasks": [{"id": GOOD}]})
+    write_json(sweep / "entries.json", {"entries": [{**now, "id": GONE}, now]})
     return tmp_path
 
 
@@ -71,6 +75,45 @@ def test_a_run_that_was_marked_meanwhile_stays(outputs: Path):
     assert one.run.folder.exists()
 
 
-def test_a_damaged_plan_spares_nothing_and_stops_nothing(outputs: Path):
-    (outputs / "sweeps" / "mine" / "plan.json").write_text("{")
-    assert GOOD in found(outputs)
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [
+        ("plan.json", "{"),
+        ("plan.json", '{"entries": [], "tasks": []}'),  # its data is not there
+        ("plan.json", '{"entries": [{"label": "a", "seed": 1, "id": "0"}]}'),  # for another seed
+        ("entries.json", "{"),
+    ],
+)
+def test_a_plan_that_does_not_name_a_run_condemns_none(outputs: Path, file: str, content: str):
+    (outputs / "sweeps" / "mine" / file).write_text(content)
+    assert {GONE, GOOD} & set(found(outputs)) == set()
+
+
+def test_runs_of_an_arm_that_is_gone_may_go(outputs: Path):
+    write_json(outputs / "sweeps" / "mine" / "sweep.json", {"arms": [{"label": "b"}]})
+    write_json(outputs / "sweeps" / "mine" / "plan.json", {"entries": [], "tasks": []})
+    assert found(outputs)[GOOD] == "orphaned"
+
+
+def test_a_trained_run_whose_export_failed_stays(outputs: Path):
+    made(outputs, "7" * 16).fail("step.int8.onnx: ONNX Runtime differs")
+    assert "7" * 16 not in found(outputs)
+    Run.of(outputs, "8" * 16).begin("memmlp", {}, data="d", upstream=None)
+    Run.of(outputs, "8" * 16).fail("loss is nan")
+    assert found(outputs)["8" * 16] == "failed"
+
+
+def test_what_is_upstream_of_what_stays_stays_however_far_up(outputs: Path):
+    made(outputs, "7" * 16, "vqvae", recipe=0)
+    made(outputs, "8" * 16, upstream="7" * 16, recipe=0)
+    made(outputs, "9" * 16, upstream="8" * 16)
+    assert {"7" * 16, "8" * 16} & set(found(outputs)) == set()
+
+
+def test_a_finished_vqvae_of_a_search_under_way_stays(outputs: Path):
+    folder = outputs / "tune" / "mine" / "controllers"
+    folder.mkdir(parents=True)
+    write_json(folder / "one.json", {"entries": [], "tasks": [{"id": CODES}]})
+    assert CODES in found(outputs)
+    write_json(folder / "one.process", myself())
+    assert CODES not in found(outputs)
