@@ -16,13 +16,11 @@ from functools import cached_property
 from pathlib import Path, PurePath
 from typing import Any
 
-import numpy as np
-
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, plain
 from memmlp.sweep.spec import Sweep
 from memmlp.tables.effects import RunsBySeed
-from memmlp.tables.measured_run import Errors, Measured, Origin, known_mean
+from memmlp.tables.measured_run import Errors, Measured, Origin
 
 DIGITS = 6
 FLAT_LIST = re.compile(r"\[\n([^\[\]{}]*?)\n *\]")  # of plain values; no string has a line's end in it
@@ -313,9 +311,9 @@ def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str
     if any(len(values) != len(names) for values in _every(errors)):
         raise ValueError(f"run {name} has not as many errors as clips")
     origin = {OLDER_NAMES.get(key, key): value for key, value in record["origin"].items()}
-    return Measured(
+    measured = Measured(
         id=name.partition("/")[0],
-        means=_each(errors, _mean),
+        means=errors,
         clips={clip: _each(errors, lambda values, i=i: values[i]) for i, clip in enumerate(names)},
         groups={clip: group for clip, group, *_ in clips},
         sources={clip: source[0] for clip, _, *source in clips if source},
@@ -323,6 +321,7 @@ def _measured(name: str, record: Mapping[str, Any], clips: Sequence[Sequence[str
         origin=Origin(**origin),
         training=record.get("training", {}),
     )
+    return measured.over(names)
 
 
 def _each(errors: Mapping[str, Any], what: Any) -> Errors:
@@ -341,11 +340,6 @@ def _every(errors: Mapping[str, Any]) -> list[Sequence[Any]]:
     return [
         values for branches in errors.values() for metrics in branches.values() for values in metrics.values()
     ]
-
-
-def _mean(values: Sequence[float | str | None]) -> float:
-    """Return the mean over the clips that have a number, as the evaluation does; NaN where none has."""
-    return known_mean(np.array([math.nan if value is None else float(value) for value in values]))
 
 
 def _short(value: float) -> float | str | None:

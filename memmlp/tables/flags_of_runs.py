@@ -10,7 +10,7 @@ import numpy as np
 
 from memmlp.sweep.spec import COSTS, Arm, Sweep
 from memmlp.tables.effects import RunsBySeed, control_arm, one_and_the_same
-from memmlp.tables.measured_run import Measured
+from memmlp.tables.measured_run import SHARED, Measured
 
 Say = Callable[[Arm, int], str | None]
 BUILT_IN = "builtin"
@@ -169,7 +169,7 @@ def _unequal_groups(every: Sequence[tuple[str, Measured]]) -> Iterable[str]:
 def _no_numbers(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
     """Flag runs that have no number for clips for which others have one, because their network diverged.
 
-    A clip for which no run has a number is too short for the metric.
+    A clip for which no run has a number is too short for the metric, unless it has no position error either.
     """
     lost: dict[tuple[str, int], set[str]] = defaultdict(set)
     every = [(arm, seed, run) for arm in sweep.runnable() for seed, run in runs[arm.label].items()]
@@ -181,6 +181,12 @@ def _no_numbers(sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> Iterable[str]:
             if run.value(mode, arm.branch, metric) is not None
         }
         short = set.intersection(*lacking.values()) if lacking else set()
+        short -= {
+            clip
+            for arm, _, run in every
+            if run.value(mode, arm.branch, SHARED) is not None
+            for clip in _lacking(run, mode, arm.branch, SHARED)
+        }
         for cell, clips in lacking.items():
             lost[cell] |= clips - short
     found = [f"'{label}' seed {seed} ({len(clips)} clips)" for (label, seed), clips in lost.items() if clips]

@@ -117,14 +117,16 @@ class Measured:
 
     def by_source(self) -> dict[str, Measured]:
         """Return the results on each source's clips alone, by its name; empty where there is one source."""
-        names = sorted(set(self.sources.values()))
-        return {name: self._of([clip for clip in self.clips if self.sources[clip] == name]) for name in names}
+        own: dict[str, list[str]] = {name: [] for name in sorted(set(self.sources.values()))}
+        for clip in self.clips if own else ():
+            own[self.sources[clip]].append(clip)
+        return {name: self.over(clips) for name, clips in own.items()}
 
-    def _of(self, clips: Sequence[str]) -> Measured:
-        """Return the same of some of the clips alone."""
+    def over(self, clips: Sequence[str]) -> Measured:
+        """Return the same of some of the clips alone, with the means over these."""
         means = {
             mode: {
-                branch: {metric: known_mean(self.by_clip(clips, mode, branch, metric)) for metric in metrics}
+                branch: _means({metric: self.by_clip(clips, mode, branch, metric) for metric in metrics})
                 for branch, metrics in branches.items()
             }
             for mode, branches in self.means.items()
@@ -154,8 +156,18 @@ class Measured:
         return all(math.isclose(one, other, rel_tol=SAME) for one, other in known)
 
 
-def known_mean(values: np.ndarray) -> float:
-    """Return the mean over the clips that have a number, as the evaluation does; NaN where none has."""
+def _means(values: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Return the means over clips (C,) of a branch's metrics, as the evaluation does (`modes.evaluate`).
+
+    A clip too short for a metric does not count in it. One on which the network's numbers are none counts:
+    all means are NaN then. It is told by the metric that has a number on the shortest clip.
+    """
+    diverged = SHARED in values and bool(np.isnan(values[SHARED]).any())
+    return {metric: math.nan if diverged else _known_mean(each) for metric, each in values.items()}
+
+
+def _known_mean(values: np.ndarray) -> float:
+    """Return the mean over the clips that have a number; NaN where none has."""
     known = values[~np.isnan(values)]
     return float(known.mean()) if len(known) else math.nan
 

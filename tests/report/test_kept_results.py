@@ -37,6 +37,21 @@ def test_kept_results_make_the_runs_table(sweep: Sweep, kept: Kept, tmp_path: Pa
     assert [run.origin for run in read.every] == [run.origin for run in kept.every]
 
 
+def test_a_run_that_diverged_on_one_clip_has_no_means(sweep: Sweep, kept: Kept, tmp_path: Path):
+    """Not those over the other clips; a clip that is too short for a metric does not count in that one."""
+    run, other = kept.runs["2"][1], kept.runs["2"][0]
+    first = next(iter(run.clips))
+    errors = run.clips[first]["stream"]["combined"]
+    errors.update(dict.fromkeys(errors, np.nan))
+    other.clips[first]["stream"]["combined"]["Jitter"] = None
+    save(tmp_path / "kept.json", kept)
+    again = load_kept(tmp_path / "kept.json").runs["2"]
+    assert all(np.isnan(mean) for mean in again[1].means["stream"]["combined"].values())
+    assert np.isfinite(list(again[0].means["stream"]["combined"].values())).all()
+    assert np.isnan(run.over(list(run.clips)).means["stream"]["combined"]["MPJPE"])
+    assert np.isfinite(run.over(list(run.clips)[1:]).means["stream"]["combined"]["MPJPE"])
+
+
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_a_run_that_diverged_stays_one(sweep: Sweep, kept: Kept, tmp_path: Path, number: float):
     """It is no run less: its arm has no mean, and no other arm's looks better for it."""

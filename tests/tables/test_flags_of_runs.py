@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -102,6 +104,17 @@ def test_a_network_that_diverged_on_a_clip_is_said(sweep: Sweep, tmp_path: Path,
         "errors that are no numbers, of clips that are left out of differences: 'full_model' seed 1 (2 clips)"
     )
     assert [flag for flag in table.flags if "no numbers" in flag] == [line]
+
+
+def test_a_clip_on_which_every_run_diverged_is_flagged(sweep: Sweep, tmp_path: Path):
+    """It is not too short for a metric: the shortest clip has position errors."""
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
+    for run in (run for of_arm in runs.values() for run in of_arm.values()):
+        for mode, branch in itertools.product(run.means, ("rotation", "position")):
+            errors = next(iter(run.clips.values()))[mode][branch]
+            errors.update(dict.fromkeys(errors, math.nan))
+    (line,) = (flag for flag in make_table(sweep, runs).flags if "no numbers" in flag)
+    assert all(f"'{arm.label}' seed 0 (1 clips)" in line for arm in sweep.runnable())
 
 
 def test_motion_calmer_than_the_true_one_is_said(sweep: Sweep, tmp_path: Path):
