@@ -2,10 +2,11 @@
 
 `stream` is live use: one frame at a time, on the network's own history, the last frame of each window kept.
 `window` is AGRoL's: non-overlapping windows whose T frames all count; the tail window is shifted back and its
-overlap dropped. A network that recalls the window which ended one frame before is led through each window
-frame by frame, so that it recalls what it was trained on: in one call it would get the window of T frames
-ago. Its result for a window is the last call's output. A network without a window is a stream in both. One
-that makes the windows of a clip together (`MotionModel.joint`) gets the whole clip, and is no stream.
+overlap dropped, and what a network recalls of its past is shifted with it. A network that recalls the window
+which ended one frame before is led through each window frame by frame, so that it recalls what it was trained
+on: in one call it would get the window of T frames ago. Its result for a window is the last call's output. A
+network without a window is a stream in both. One that makes the windows of a clip together
+(`MotionModel.joint`) gets the whole clip, and is no stream.
 """
 
 from __future__ import annotations
@@ -57,6 +58,9 @@ class Evaluable(Protocol):
         The motion (B, newest, 198) is that of the newest frames; by default that of all frames that the
         network makes of its window.
         """
+
+    def rewound(self, state: State, frames: Tensor) -> State:
+        """Return the state as it was `frames` (B,) ago, for a window that takes in frames again."""
 
     def whole(self, sparse: Tensor) -> Tensor:
         """Map the inputs of a clip (N, 54), N >= T, to its motion (N, 198) in the world."""
@@ -114,6 +118,9 @@ def window_by_window(network: Evaluable, clips: Sequence[Tensor]) -> list[Tensor
         state = {name: tensor[: len(order)] for name, tensor in state.items()}
         begin = [min(start, len(padded[i]) - size) for i in order]
         inputs = torch.stack([padded[i][b : b + size] for i, b in zip(order, begin, strict=True)])
+        back = torch.tensor([start - b for b in begin], device=inputs.device)
+        if network.shift and back.any():  # a tail recalls what came before it, and not its own frames
+            state = network.rewound(state, back)
         output, state = network.advance(inputs, state)
         for i, b, result in zip(order, begin, output, strict=True):
             motion[i][start : b + size] = result[start - b :]  # the tail window begins at b < start

@@ -90,6 +90,10 @@ class MemMLP(MotionModel):
         kept |= self.memory.remember(motion, past, state, new)
         return self.normalizer.decode_motion(motion[:, -wanted:], origin[:, -wanted:]), kept
 
+    def rewound(self, state: State, frames: Tensor) -> State:
+        """Return the state with what the memory recalls as it was some frames ago; see MotionModel."""
+        return {**state, **self.memory.rewound(state, frames)}
+
     def learn(self, sparse: Tensor, state: State, truth: Tensor) -> Learned:
         """Make a training call. A memory whose VQ-VAE trains with the network brings losses of its own."""
         motion, kept = self.advance(sparse, state)

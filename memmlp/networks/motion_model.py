@@ -127,6 +127,18 @@ class MotionModel(nn.Module):
         """
         raise NotImplementedError
 
+    def rewound(self, state: State, frames: Tensor) -> State:
+        """Return the state as it was some frames ago, for a window that takes in frames again.
+
+        By default that is the state itself: T new frames are all that a network without a past sees.
+        Recurrent states can't be taken back, and stay.
+
+        Args:
+            state: what the last call returned.
+            frames: how many frames each of the batch goes back (B,), int64, fewer than T.
+        """
+        return state
+
     def whole(self, sparse: Tensor) -> Tensor:
         """Map the world inputs (N, 54) of a clip, N >= T, to its world motion (N, 198); see `joint`."""
         raise NotImplementedError

@@ -74,7 +74,7 @@ RECIPES: dict[str, int] = {
     # how they are evaluated (memmlp.evaluation)
     "metrics": 1,
     "mode.stream": 1,
-    "mode.window": 1,
+    "mode.window": 2,
     "ik.lbfgs": 1,
     "ik.arms": 1,
     # how they are deployed (memmlp.deploy, memmlp.networks.streaming)

@@ -153,6 +153,30 @@ def test_windows_do_not_overlap_and_the_tail_is_shifted_back():
     assert stream(Counter([clip]), [clip])[0][:, 0].tolist() == list(range(1, 18))
 
 
+@pytest.mark.parametrize("length", [15, 17, 20, 21])
+def test_the_tail_window_recalls_the_window_before_it(length, monkeypatch):
+    """A past that is a whole window ago is that of the tail's own frames, not of the call before."""
+    model = tiny.model(shift="window")
+    clips = [tiny.clip(length), tiny.clip(21)]
+    for clip in clips:
+        clip[:, 20] = torch.arange(1, len(clip) + 1)  # an angular velocity, which is that in all coordinates
+    recall, seen = model.memory.recall, []
+
+    def spied(sparse, state, new):
+        past = recall(sparse, state, new)
+        marks = [
+            x[:, :, 20] * model.normalizer.std[20] + model.normalizer.mean[20] for x in (sparse, past.sparse)
+        ]
+        seen.append([mark[-1].round().int().tolist() for mark in marks])
+        return past
+
+    monkeypatch.setattr(model.memory, "recall", spied)
+    window(model, clips)
+    inputs, recalled = seen[2]
+    assert inputs[-7:] == list(range(length - 6, length + 1))
+    assert recalled == list(range(length - 13, length - 6))
+
+
 def test_modes_differ_and_batches_do_not():
     split, model = tiny.frames((40, 33, 12)), tiny.model()
     one, many = (evaluate(model, split, list(MODE_FUNCTIONS), batch=batch) for batch in (1, 3))

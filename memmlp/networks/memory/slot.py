@@ -78,6 +78,10 @@ class Memory(nn.Module):
         """
         return {}
 
+    def rewound(self, state: State, frames: Tensor) -> State:
+        """Return what of the network's state is other where each of the batch goes `frames` (B,) back."""
+        return {}
+
     def auxiliary_losses(self, frames: Tensor, normalizer: Normalizer) -> dict[str, Tensor]:
         """Return the memory's own losses at true world frames (B, T, 252), added to the network's."""
         return {}
