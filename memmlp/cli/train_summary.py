@@ -12,7 +12,7 @@ from rich.table import Table
 from memmlp.evaluation.units import UNITS
 from memmlp.pipeline.run_stages import Outcome
 from memmlp.runs.run import Run
-from memmlp.tables.measured_run import Errors, load
+from memmlp.tables.measured_run import Errors, as_deployed, deployed_precision, load
 
 STAGES = ("training", "evaluation", "deployment")
 BRANCHES = ("rotation", "position", "combined")
@@ -60,10 +60,13 @@ def show_side_by_side(outcomes: Mapping[str, Outcome]) -> None:
     Console(highlight=False).print(table)
 
 
-def show_latency(console: Console, measured: Mapping[str, Any]) -> None:
-    """Print what a frame takes, and how large the network is."""
+def show_latency(console: Console, record: Mapping[str, Any]) -> None:
+    """Print what a frame takes in the exported file that was asked for, and how large that is."""
+    measured, precision = as_deployed(record), deployed_precision(record)
+    file = "" if precision == "fp32" else f" in {precision}"
     console.print(
-        f"a frame on one CPU core: {measured['median_ms']:.2f} ms median, {measured['p95_ms']:.2f} ms p95 "
+        f"a frame on one CPU core{file}: {measured['median_ms']:.2f} ms median, "
+        f"{measured['p95_ms']:.2f} ms p95 "
         f"({measured['ratio_to_yardstick']:.2f} x the yardstick)",
         soft_wrap=True,
     )

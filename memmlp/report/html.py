@@ -18,7 +18,7 @@ from memmlp.sweep.spec import COSTS, Sweep
 from memmlp.tables.distributions import Distribution, distributions
 from memmlp.tables.effects import RunsBySeed
 from memmlp.tables.formats import as_html
-from memmlp.tables.measured_run import Measured
+from memmlp.tables.measured_run import Measured, as_deployed
 from memmlp.tables.table import Table
 from memmlp.tables.table_text import better, caption
 
@@ -282,6 +282,7 @@ def _latency(entries: Sequence[ReportedRun]) -> str:
         return ""
     head = (
         "run",
+        "precision",
         "median ms",
         "p95 ms",
         "whole pose, ms",
@@ -294,7 +295,7 @@ def _latency(entries: Sequence[ReportedRun]) -> str:
     )
     rows = []
     for entry in entries:
-        values = entry.measured.latency
+        values = as_deployed(entry.measured.latency)
         numbers = [
             _number(values, key, scale, form)
             for key, scale, form in (
@@ -303,7 +304,8 @@ def _latency(entries: Sequence[ReportedRun]) -> str:
                 ("parameters", 1, ",.0f"), ("macs", 1e6, ".1f"), ("onnx_bytes", 1e6, ".2f"),
             )
         ]  # fmt: skip
-        rows.append([entry.measured.id, *numbers, entry.measured.origin.hardware, "; ".join(entry.places)])
+        origin = entry.measured.origin
+        rows.append([entry.measured.id, origin.deployed, *numbers, origin.hardware, "; ".join(entry.places)])
     return _rows(
         head, rows, "One streaming step on one CPU core; the yardstick is a fixed stack of matrix products."
     )

@@ -200,7 +200,7 @@ def load(folder: Path, stages: Sequence[str] | None = None) -> Measured:
     deployments = [run.deployment(name) for name in stages or () if run.deployment(name).done]
     deployed = (deployments or [run.preferred_deployment])[-1]
     latency = deployed.record
-    origin = replace(_evaluated(_origin(manifest), reports), deployed=_deployed(latency))
+    origin = replace(_evaluated(_origin(manifest), reports), deployed=deployed_precision(latency))
     origin = replace(origin, recipes={**origin.recipes, **deployed.recipes})
     training = _training(run, manifest)
     return Measured(run.id, means, clips, groups, _costs(latency), origin, latency, run, sources, training)
@@ -265,10 +265,15 @@ def _read(path: Path) -> dict[str, Any]:
     return content
 
 
-def _deployed(latency: Mapping[str, Any]) -> str:
+def deployed_precision(latency: Mapping[str, Any]) -> str:
     """Return the precision of the file that a deployment was asked for, where it has it; else fp32."""
     precision = str((latency.get("settings") or {}).get("precision", "fp32"))
     return precision if precision in latency else "fp32"
+
+
+def as_deployed(latency: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what was measured of a streaming step, with size and times of the file that was asked for."""
+    return {**latency, **latency.get(deployed_precision(latency), {})}
 
 
 def _costs(latency: Mapping[str, Any]) -> dict[str, float]:
@@ -277,10 +282,10 @@ def _costs(latency: Mapping[str, Any]) -> dict[str, float]:
     Size and times are those of the file in the precision that was asked for; the network alone has no other
     than that in float32, whose time it is.
     """
-    less_precise = latency.get(_deployed(latency), {})
+    measured = as_deployed(latency)
 
     def of(name: str) -> float:
-        return float(less_precise.get(name, latency.get(name, np.nan)))
+        return float(measured.get(name, np.nan))
 
     costs = {
         "FLOPs": of("flops") / 1e9,

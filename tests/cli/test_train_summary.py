@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 
 from fake_runs import fake_run
+from rich.console import Console
 
-from memmlp.cli.train_summary import size, source_tables
+from memmlp.cli.train_summary import show_latency, size, source_tables
 from memmlp.runs.evaluation_file import write_report
 
 MEASURED = {"parameters": 19_238, "parameters_with_vqvae": 27_050, "macs": 218_048, "onnx_bytes": 995_047}
@@ -38,3 +40,14 @@ def test_tables_of_sources_are_of_the_evaluation_that_is_shown(tmp_path: Path):
     assert len(first("stream-0")) == 2
     for once, thrice in zip(first("stream-0"), first("stream-1"), strict=True):
         assert abs(thrice - 3 * once) < 0.03
+
+
+def test_times_and_size_are_those_of_the_file_that_was_asked_for():
+    times = {"median_ms": 3.39, "p95_ms": 3.5, "ratio_to_yardstick": 1.2, "settings": {"precision": "int8"}}
+    record = MEASURED | times
+    record["int8"] = {"median_ms": 1.27, "p95_ms": 1.4, "ratio_to_yardstick": 0.45, "onnx_bytes": 600_000}
+    said = io.StringIO()
+    show_latency(Console(file=said), record)
+    first, last = said.getvalue().splitlines()
+    assert first.startswith("a frame on one CPU core in int8: 1.27 ms median, 1.40 ms p95 (0.45 x")
+    assert "ONNX file 0.6 MB" in last

@@ -203,6 +203,21 @@ def test_deployments_of_one_run_have_a_row_each(tmp_path: Path):
     assert f"{len(runs) - 1} finished runs stand" in found
 
 
+def test_latencies_are_those_of_the_file_that_was_asked_for(tmp_path: Path):
+    sweep = replace(load_sweep(SHIPPED / "table14.yaml"), seeds=(0,))
+    runs = runs_of(sweep, fake_sweep(tmp_path, sweep))
+    one = next(iter(runs))
+    run = runs[one][0]
+    less = {"settings": {"precision": "int8"}, "int8": {"median_ms": 0.25, "p95_ms": 0.5, "onnx_bytes": 6e6}}
+    runs[one] = {
+        0: replace(run, latency={**run.latency, **less}, origin=replace(run.origin, deployed="int8"))
+    }
+    found = page([Chapter(sweep, make_table(sweep, runs), runs)], [], "now", "0")
+    (row,) = re.findall(rf"<tr><th[^>]*><code>{run.id}</code></th>(<td>int8.*?)</tr>", found)
+    cells = re.findall(r"<td>(.*?)</td>", row)
+    assert (cells[:3], cells[7]) == (["int8", "0.25", "0.50"], "6.00")
+
+
 def test_more_may_be_better(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Of a metric of one's own that counts what is right."""
     monkeypatch.setattr("memmlp.tables.table_text.HIGHER", {"MPJPE"})
