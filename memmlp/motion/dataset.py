@@ -139,13 +139,29 @@ class WindowSampler:
         self.first_end = np.minimum(window, lengths) - 1
         self.windows = np.maximum(lengths - window + 1, 1)
         weights = self.windows if weighting == "frames" else np.ones_like(self.windows)
-        self.bounds = np.cumsum(_shared(weights, dataset.sources, shares) if shares else weights)
+        self.weights = _shared(weights, dataset.sources, shares) if shares else weights
+        self.bounds = np.cumsum(self.weights)
 
     def draw(self, step: int) -> tuple[Tensor, Tensor]:
         """Draw clips (B,) and the last frames (B,) of their windows, int64, on the dataset's device."""
         random = np.random.Generator(np.random.Philox(key=[self.seed, step]))
         clip = np.searchsorted(self.bounds, random.integers(0, self.bounds[-1], self.batch), side="right")
         end = self.first_end[clip] + random.integers(0, self.windows[clip])
+        return torch.from_numpy(clip).to(self.device), torch.from_numpy(end).to(self.device)
+
+    def draw_beginnings(self, step: int, stride: int) -> tuple[Tensor, Tensor]:
+        """Draw where streams begin that go through a clip to its end, `stride` frames a step.
+
+        They begin at one of the clip's first windows, and a clip is the rarer the longer a stream stays in
+        it, so that streams see each window as often as `draw` draws it.
+
+        Returns:
+            Clips (B,) and the last frames (B,) of the windows, as of `draw`, which they don't depend on.
+        """
+        random = np.random.Generator(np.random.Philox(key=[self.seed, step], counter=[0, 0, 1, 0]))
+        bounds = np.cumsum(self.weights / np.maximum(self.windows / stride, 1))
+        clip = np.searchsorted(bounds, random.random(self.batch) * bounds[-1], side="right")
+        end = self.first_end[clip] + random.integers(0, np.minimum(stride, self.windows[clip]))
         return torch.from_numpy(clip).to(self.device), torch.from_numpy(end).to(self.device)
 
 

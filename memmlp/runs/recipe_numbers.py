@@ -60,7 +60,7 @@ RECIPES: dict[str, int] = {
     "warmup": 1,
     "rollout.teacher_forcing": 1,
     "rollout.own_predictions": 1,
-    "rollout.streams": 1,
+    "rollout.streams": 2,
     "loss.uncertainty": 1,
     "loss.manual": 1,
     "loss.agrol": 1,

@@ -93,8 +93,9 @@ class OwnPredictions(Rollout):
 class PersistentStreams(Rollout):
     """Many streams that run through the clips during the whole training, each on its own history.
 
-    Every step takes the next `batch` of the streams one stride further. A stream that reaches its clip's end
-    starts afresh in a clip drawn anew. The streams' states are part of the checkpoint.
+    Every step takes the next `batch` of the streams one stride further. A stream begins somewhere in a clip;
+    when it reaches the clip's end it starts afresh at the beginning of another, so that every window is seen
+    as often as the sampler says. The streams' states are part of the checkpoint.
 
     Args:
         streams: number of streams.
@@ -123,9 +124,10 @@ class PersistentStreams(Rollout):
 
     def draw(self, model: MotionModel, dataset: MotionDataset, sampler: WindowSampler, step: int) -> Call:
         """Draw the call of a training step: the next streams, each one stride further."""
-        # The drawn clips and frames are where streams that have ended, or not begun, start afresh.
         clips, end = sampler.draw(step)
         who = (step * len(clips) + torch.arange(len(clips), device=clips.device)) % self.streams
+        again = sampler.draw_beginnings(step, model.stride)
+        clips, end = (torch.where(self.lives[who], *pair) for pair in zip(again, (clips, end), strict=True))
         going = self.lives[who] & (self.end[who] + model.stride < dataset.lengths[self.clip[who]])
         self.clip[who] = torch.where(going, self.clip[who], clips)
         self.end[who] = torch.where(going, self.end[who] + model.stride, end)
