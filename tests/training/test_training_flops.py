@@ -52,3 +52,14 @@ def test_an_lstms_gradients_are_counted():
         output.sum().backward()
     assert forward == 2 * 3 * 5 * 24 * (54 + 6)
     assert counter.get_total_flops() == 3 * forward
+
+
+def test_free_running_without_a_gradient_is_not_counted():
+    """RPM draws for each call how many frames it runs freely before the trained step."""
+    task = tiny_tasks.baseline_task("rpm", tiny_tasks.OPTIM)
+    counts = set()
+    for seed in range(6):
+        torch.manual_seed(seed)
+        counts.add(training_flops(task.model, task.loss, tiny_tasks.OPTIM))
+    assert len(counts) == 1
+    assert counts.pop() > 0
