@@ -92,6 +92,17 @@ def test_the_most_literal_reading():
     assert (composed([]).data.weighting, composed([]).evaluation.ik) == ("frames", "off")
 
 
+@pytest.mark.parametrize("experiment", ["profile=paper", "experiment=paper"])
+def test_the_literal_reading_leaves_other_networks_their_coordinates(experiment: str):
+    def seen(model: str) -> tuple[str, bool]:
+        frame = composed([experiment, f"model={model}"]).frame
+        return frame.coordinates, frame.normalize
+
+    assert seen("agrol_diffusion") == ("world", True)
+    assert seen("recurrent_poser") == ("heading", True)
+    assert seen("avatar_poser") == ("world", False)
+
+
 def test_a_network_without_positions_has_no_inverse_kinematics_in_the_literal_reading():
     assert composed(["experiment=paper", "model=agrol_mlp"]).evaluation.ik == "off"
     with pytest.raises(InputError, match=r"evaluation\.ik=lbfgs needs positions"):

@@ -56,6 +56,7 @@ from memmlp.config.schema.rules import (
     DEVICE,
     EachOf,
     OneOf,
+    OneOfOrPath,
     Registered,
     Text,
     Within,
@@ -136,6 +137,8 @@ class ProfileConfig:
     code_lr: float = positive()
     evaluation_batch: int = at_least(1)
     latency_steps: int = at_least(1)
+    coordinates: str = standing("heading", OneOfOrPath(("heading", "head_relative", "world")))
+    normalize: bool = standing(True)
     memory_shift: str = one_of("frame", "window")
     memory_history: str = one_of("first", "latest")
     ik: str = one_of("off", "lbfgs", "arms")
