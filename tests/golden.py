@@ -155,6 +155,12 @@ def loss(make: Callable[[], Loss]) -> Numbers:
     return found | {"total": float(total.detach())} | summary("slope", motion.grad)
 
 
+def mixed() -> Numbers:
+    """A loss in a training of mixed precision, which is that in float32."""
+    with torch.autocast("cpu", torch.bfloat16):
+        return loss(partial(TermsLoss, "absolute", **dict.fromkeys(TERMS, 0.5)))
+
+
 def weighted(make: Callable[[], Loss]) -> Numbers:
     """A loss, and its terms' weights after a step of what it learns."""
     one = make()
@@ -242,6 +248,7 @@ CASES: dict[str, Callable[[], Numbers]] = {
     "optim.schedule_free": partial(optimised, ScheduleFree),
     "ema": partial(optimised, ema=0.5),
     "warmup": partial(optimised, warmup=3),
+    "precision.bf16": mixed,
     "rollout.teacher_forcing": partial(rollout, TeacherForcing),
     "rollout.own_predictions": partial(rollout, partial(OwnPredictions, 2)),
     "rollout.streams": partial(rollout, partial(PersistentStreams, 4)),

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from memmlp.common.mixed_precision import in_float32
 from memmlp.motion.body import (
     FRAME_DIM,
     HEAD,
@@ -102,8 +103,10 @@ class Normalizer(nn.Module):
         They follow by forward kinematics, translated so that the head stands where its tracker says in the
         world inputs (..., 54) (reading 22).
         """
-        local = sixd_to_matrix(motion[..., ROTATION].unflatten(-1, (N_JOINTS, 6)))
-        _, positions = forward_kinematics(local, torch.zeros_like(sparse[..., :3]), self.rest)
+        rotations = motion[..., ROTATION].to(sparse.dtype).unflatten(-1, (N_JOINTS, 6))
+        with in_float32(sparse.device):
+            root = torch.zeros_like(sparse[..., :3])
+            _, positions = forward_kinematics(sixd_to_matrix(rotations), root, self.rest)
         head = sparse[..., SPARSE_POSITION][..., :3]
         return positions + (head - positions[..., HEAD, :]).unsqueeze(-2)
 

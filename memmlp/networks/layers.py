@@ -5,8 +5,6 @@ Also what a network's layers must be like for several processes to train it toge
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -14,15 +12,6 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from torch.nn.modules.dropout import _DropoutNd
 
 from memmlp.common import distributed
-
-
-def in_float32(device: torch.device) -> AbstractContextManager[object]:
-    """Compute in float32 what is inside, in a training of mixed precision too.
-
-    Where precision is not mixed this is nothing, and nothing of it is in an exported graph.
-    """
-    mixed = torch.is_autocast_enabled(device.type)
-    return torch.autocast(device.type, enabled=False) if mixed else nullcontext()
 
 
 class TimeMix(nn.Module):

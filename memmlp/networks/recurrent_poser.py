@@ -8,10 +8,10 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from memmlp.common.mixed_precision import in_float32
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.layers import in_float32
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import Learned
 from memmlp.networks.reaching import reached, tracked

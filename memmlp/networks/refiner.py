@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from memmlp.common.mixed_precision import in_float32
 from memmlp.motion.body import POSITION, ROTATION
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.layers import in_float32
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import MotionModel
 

@@ -207,6 +207,8 @@ def trained_components(kind: str, config: Mapping[str, Any]) -> Iterable[str]:
     if schedule := config.get("optim", {}).get("schedule"):
         yield f"schedule.{schedule}"
     yield from (name for name in ("warmup", "ema") if config.get("optim", {}).get(name))
+    if config.get("optim", {}).get("precision") == "bf16":
+        yield "precision.bf16"
     if kind == "vqvae" or names["memory"] == "vq_joint":
         yield from ("vqvae", f"codebook.{config.get('vqvae', {}).get('codebook')}")
     if kind == "vqvae":

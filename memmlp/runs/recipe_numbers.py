@@ -58,6 +58,7 @@ RECIPES: dict[str, int] = {
     "optim.schedule_free": 1,
     "ema": 1,
     "warmup": 1,
+    "precision.bf16": 1,
     "rollout.teacher_forcing": 1,
     "rollout.own_predictions": 1,
     "rollout.streams": 2,

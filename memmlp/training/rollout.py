@@ -86,6 +86,7 @@ class OwnPredictions(Rollout):
             for done in range(passes):
                 start = past + done * stride
                 _, state = model.advance(sparse[:, start : start + stride], state, stride)
+        torch.clear_autocast_cache()  # weights that were cast without a gradient would have none below
         model.train()
         return Call(sparse[:, -stride:], state, segment[:, -model.frames :], clips)
 

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common import distributed
+from memmlp.common.mixed_precision import in_float32
 from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.networks.baselines.sage import HIDDEN, HalfVQVAE
 from memmlp.networks.baselines.sage_net import SAGENet
@@ -82,7 +83,8 @@ def half_errors(
     full[:, own] = made.to(true)
     motions = [net.normalizer.posed(sixd.flatten(-2)[:, None], sparse) for sixd in (full, true)]
     bodies = [Body(motion, net.normalizer) for motion in motions]
-    (found, placed), (expected, true_placed) = [(one.sixd, one.posed[1]) for one in bodies]
+    with in_float32(frame.device):
+        (found, placed), (expected, true_placed) = [(one.sixd, one.posed[1]) for one in bodies]
     errors = {
         "orientation": F.smooth_l1_loss(found[..., ROOT, :], expected[..., ROOT, :]),
         "rotation": F.smooth_l1_loss(found[..., own[1:], :], expected[..., own[1:], :]),

@@ -200,3 +200,20 @@ def test_a_learned_weight_is_never_zero():
     with pytest.raises(InputError, match=r"loss\.rotation=0: allowed"):
         TermsLoss(weighting="learned", rotation=0.0)
     assert TermsLoss(rotation=0.0).weighting.weights() == {"rotation": 0.0}
+
+
+def test_mixed_precision_computes_losses_in_float32():
+    """Velocities and jerk are small differences, which bfloat16 has no bits for."""
+    truth = TRUE[..., SPARSE_DIM:]
+    made = (truth + 1e-3 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(0))).bfloat16()
+    loss = TermsLoss("absolute", **dict.fromkeys(TERMS, 1.0))
+    found = []
+    for mixed in (False, True):
+        motion = made.float().requires_grad_()
+        with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
+            total, terms = loss(motion, truth, TRUE[..., :SPARSE_DIM], NORMALIZER)
+            posed = NORMALIZER.pose(motion, TRUE[..., :SPARSE_DIM])
+        total.backward()
+        found.append((total, *terms.values(), posed, motion.grad))
+    for alone, beside in zip(*found, strict=True):
+        torch.testing.assert_close(beside, alone)

@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from memmlp.common.mixed_precision import in_float32
 from memmlp.motion.body import (
     ROTATION,
     SPARSE_ANGULAR_VELOCITY,
@@ -24,7 +25,6 @@ from memmlp.motion.body import (
 from memmlp.motion.geometry import matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.encoder import EncoderLayer
-from memmlp.networks.layers import in_float32
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import Learned
 from memmlp.networks.windowless_model import WindowlessModel

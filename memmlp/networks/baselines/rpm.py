@@ -168,6 +168,7 @@ class RPM(WindowlessModel):
         with torch.no_grad():
             for index in range(begin, now):
                 _, state = self.rolled(encoded[:, index : index + 1], state)
+        torch.clear_autocast_cache()  # weights that were cast without a gradient would have none below
         made, state = self.rolled(encoded[:, now : now + 1], state)
         return Learned(self.normalizer.posed(made, sparse[:, now:]), state, {})
 

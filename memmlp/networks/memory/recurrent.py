@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.flop_counter import register_flop_formula
 
+from memmlp.common.mixed_precision import in_float32
 from memmlp.motion.body import SPARSE_DIM
-from memmlp.networks.layers import in_float32
 from memmlp.networks.memory.memory_block import Past, Recurred, RecurredFeature, State
 from memmlp.networks.memory.slot import FeatureMemory
 from memmlp.networks.vqvae import VQVAE

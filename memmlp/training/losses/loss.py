@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.common.errors import InputError
+from memmlp.common.mixed_precision import in_float32
 from memmlp.motion.body import N_JOINTS, POSITION
 from memmlp.motion.normalizer import Normalizer
 
@@ -146,6 +147,10 @@ class Loss(nn.Module):
     def forward(
         self, motion: Tensor, truth: Tensor, sparse: Tensor, normalizer: Normalizer
     ) -> tuple[Tensor, Terms]:
-        """Return the loss and its unweighted terms; the arguments are those of `terms`."""
-        terms = self.terms(motion, truth, sparse, normalizer)
-        return self.weighting(terms), terms
+        """Return the loss and its unweighted terms; the arguments are those of `terms`.
+
+        In float32, whatever precision made the motion: velocities and jerk are small differences.
+        """
+        with in_float32(truth.device):
+            terms = self.terms(motion.to(truth.dtype), truth, sparse, normalizer)
+            return self.weighting(terms), terms
