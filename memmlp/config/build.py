@@ -212,7 +212,7 @@ def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
     baseline's loss is complete and ignores the branches.
 
     Raises:
-        InputError: for a term beside a complete loss.
+        InputError: for a term beside a complete loss, or of a branch that the predictor lacks.
     """
     loss = built(cfg.loss)
     if isinstance(loss, Loss):
@@ -222,6 +222,10 @@ def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
             )
         return lambda branches: loss
     term = built(cfg.term) if cfg.term is not None else Term()
+    branches = get_class(cfg.predictor._target_).branches
+    if cfg.term is not None and term.branch not in branches:
+        lacking = f"looks at the {term.branch} branch, which predictor={cfg.predictor.name} lacks"
+        raise InputError(f"term={cfg.term.name}: {lacking}; allowed is a term of {' or '.join(branches)}")
     return partial(MotionLoss, loss, built(cfg.hand), term=term)
 
 

@@ -265,6 +265,8 @@ def refused(options: tuple[str, str]) -> str:
         return "evaluation.ik=lbfgs"
     if "memory=none" in options and any(option.endswith("_memory") for option in options):
         return "memory=none"
+    if {"memory=none", "rollout=own_predictions"} == set(options):
+        return "rollout=own_predictions"
     if of_memory and "memory=none" in options:
         return of_memory
     if of_memory not in ("", "memory.fusion") and set(RECURRENT) & set(options):

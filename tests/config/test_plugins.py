@@ -122,6 +122,8 @@ def test_a_loss_has_the_term_with_its_weight(on_path: Path):
     whole = composed([*OWN, "predictor=rotation_only", "hand=off", "loss=agrol", "evaluation.ik=off"])
     with pytest.raises(InputError, match=r"term=skate: loss=agrol is"):
         build_experiment(whole)
+    with pytest.raises(InputError, match=r"term=skate: looks at the position branch, which predictor=rot"):
+        build_experiment(composed([*OWN, "predictor=rotation_only", "hand=off"]))
     with pytest.raises(InputError, match=r"term: AGRoLMLP has none"):
         composed([f"plugins=[{PACKAGE}]", "model=agrol_mlp", "term=skate"])
 

@@ -17,6 +17,7 @@ from memmlp.config.schema.network import (
     AvatarJLMConfig,
     BaselineConfig,
     BoDiffusionConfig,
+    NoMemoryConfig,
     RecurrentPoserConfig,
     RPMConfig,
     SAGEConfig,
@@ -26,6 +27,7 @@ from memmlp.config.schema.training import (
     BaselineLossConfig,
     NoHandConfig,
     OwnLossConfig,
+    OwnPredictionsConfig,
     StreamsConfig,
     TeacherForcingConfig,
     TermsLossConfig,
@@ -266,6 +268,11 @@ def _check_slots(cfg: DictConfig) -> None:
         raise InputError(
             "predictor with memory blocks needs a memory, and memory=none is none: "
             "allowed is another memory, predictor=two_branch or predictor=rotation_only"
+        )
+    if _is(cfg.memory, NoMemoryConfig) and _is(cfg.rollout, OwnPredictionsConfig):
+        raise InputError(
+            "rollout=own_predictions makes the past that a memory recalls, and memory=none recalls none: "
+            "allowed is another memory, rollout=teacher_forcing or rollout=streams"
         )
     if cfg.evaluation.ik == "lbfgs" and predictor.startswith("RotationOnly"):
         raise InputError(
