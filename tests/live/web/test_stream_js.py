@@ -53,6 +53,13 @@ def jittered(seconds: float, hz: float) -> np.ndarray:
     return times
 
 
+def bursts() -> np.ndarray:
+    """Times of arrival: every fifth sample comes right before the next, just before a frame is due."""
+    times = 100 + np.arange(90) / 60 - 4e-4 * (np.arange(90) > 0)
+    times[3::5] = times[4::5] - 2e-5
+    return times
+
+
 def t_pose() -> list[dict[str, Any]]:
     """Devices that sit crookedly on a person in T-pose who looks to the left."""
     turns = [[0.1, 0.2, 0.05, 1], [0.3, -0.6, 0.2, 1], [-0.2, 0.5, 0.4, 1]]
@@ -84,6 +91,7 @@ PARTS: dict[str, dict[str, Any]] = {
     "lost hands": {"samples": samples(np.arange(144) / 72, {**gone(30, 70, 1), **gone(60, 100, 1, 2)})},
     "lost head": {"samples": samples(np.arange(100) / 60, {**gone(0, 12, 0, 2), **gone(50, 80, 0)})},
     "gaps": {"samples": samples(gaps())},
+    "bursts": {"samples": samples(bursts())},
     "calibrated": {"samples": samples(np.arange(90) / 90), "calibrate": t_pose(), "height": HEIGHT},
 }  # fmt: skip
 
