@@ -115,15 +115,18 @@ class TrackedClip:
         return first, time * FPS - first
 
 
-def npz_frames(path: Path) -> np.ndarray:
-    """Return the frames (N, 252) of an AMASS npz, resampled to 60 Hz, on the built-in body.
+def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
+    """Return the frames (N, 252) of an AMASS npz, resampled to 60 Hz, on a network's body.
+
+    Args:
+        path: the file.
+        rest: the body's joints in the rest pose (22, 3), metres, SMPL's body frame.
 
     Raises:
         InputError: for a clip of fewer than 3 frames at 60 Hz.
     """
     import torch
 
-    from memmlp.motion.body import builtin_rest_joints
     from memmlp.motion.clip import resample
     from memmlp.motion.features import motion_frames
     from memmlp.motion.formats.npz import read_clip
@@ -134,7 +137,7 @@ def npz_frames(path: Path) -> np.ndarray:
     clip, _ = resample(recorded)
     if len(clip) < 3:
         raise InputError(f"{path}: {len(clip)} frames at 60 Hz; allowed are 3 or more")
-    tensors = (torch.tensor(part) for part in (clip.poses, clip.trans, builtin_rest_joints()))
+    tensors = (torch.tensor(part) for part in (clip.poses, clip.trans, rest))
     return motion_frames(*tensors).numpy()
 
 
