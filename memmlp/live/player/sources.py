@@ -105,14 +105,14 @@ class TrackedClip:
         return head, left, right
 
     def truth(self, time: float) -> np.ndarray:
-        """Return the joints (22, 3), metres, world, at a time, interpolated."""
+        """Return the joints (22, 3), metres, world, at a time, interpolated; outside the clip the nearest."""
         first, weight = self._place(time)
         return self.joints[first] + weight * (self.joints[first + 1] - self.joints[first])
 
     def _place(self, time: float) -> tuple[int, float]:
         """Return the index of the frame before a time, and the fraction of the way to the next frame."""
         first = min(max(int(time * FPS), 0), len(self.joints) - 2)
-        return first, time * FPS - first
+        return first, min(max(time * FPS - first, 0.0), 1.0)
 
 
 def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
@@ -205,7 +205,8 @@ class ClipSource:
 
     def truth(self, time: float) -> np.ndarray:
         """Return the true joints (22, 3), metres, AMASS' world."""
-        return self.clip.truth(time % self.round)
+        half = PAUSE / 2  # nearer to a round's beginning it belongs to it, even where floats put it before
+        return self.clip.truth((time + half) % self.round - half)
 
     def close(self) -> None:
         """Do nothing, for nothing is held."""
