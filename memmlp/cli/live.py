@@ -288,7 +288,8 @@ def serve(given: InputOptions, shown: ShowOptions) -> None:
             if not shown.no_browser:
                 webbrowser.open(server.url)
             stopped = threading.Event()
-            play(stream, source, hub.publish, stopped, outputs, fitting, shown.avatar is not None)
+            avatar = shown.avatar is not None
+            play(stream, source, hub.publish, stopped, outputs, fitting, avatar, tell=note)
 
 
 def open_stream(given: InputOptions, space: SpaceName, shown: ShowOptions) -> tuple[Stream, str]:
