@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 from rich.console import Console
@@ -99,7 +99,7 @@ def sorted_by(listed: Sequence[Run], records: Mapping[str, Record], sort: str) -
 
     key, down = sort.removeprefix("-"), sort.startswith("-")
     check_key(key, records.values(), "--sort")
-    found = {run.id: records[run.id].get(key) for run in listed}
+    found: dict[str, Any] = {run.id: records[run.id].get(key) for run in listed}
     known = [run for run in listed if not _is_missing(found[run.id])]
     numbers = all(isinstance(found[run.id], int | float) for run in known)
     ranked = sorted(known, key=lambda run: found[run.id] if numbers else str(found[run.id]), reverse=down)
