@@ -227,16 +227,18 @@ def clip_source(given: InputOptions, rounds: float = float("inf")) -> ClipSource
 
 
 def load_clip(given: InputOptions) -> TrackedClip:
-    """Load the clip of --clip: an AMASS npz on the built-in body, or a test clip of the run.
+    """Load the clip of --clip: an AMASS npz on the network's body, or a test clip of the run.
 
     Raises:
         InputError: for a test clip where the network is an ONNX file, which has none, or an unknown name.
     """
     from memmlp.common.errors import InputError
+    from memmlp.live.exported import ExportedNetwork
     from memmlp.live.player.sources import TrackedClip, npz_frames
 
     if given.clip is not None and given.clip.endswith(".npz"):
-        return TrackedClip(Path(given.clip).stem, npz_frames(Path(given.clip)))
+        body = ExportedNetwork(network_file(given)[0]).skeleton.rest
+        return TrackedClip(Path(given.clip).stem, npz_frames(Path(given.clip), body))
     if given.network.endswith(".onnx"):
         raise InputError(
             f"{given.network}: has no test clips; allowed with it are --clip FILE.npz, --udp and --osc"
@@ -286,7 +288,8 @@ def serve(given: InputOptions, shown: ShowOptions) -> None:
             if not shown.no_browser:
                 webbrowser.open(server.url)
             stopped = threading.Event()
-            play(stream, source, hub.publish, stopped, outputs, fitting, shown.avatar is not None)
+            avatar = shown.avatar is not None
+            play(stream, source, hub.publish, stopped, outputs, fitting, avatar, tell=note)
 
 
 def open_stream(given: InputOptions, space: SpaceName, shown: ShowOptions) -> tuple[Stream, str]:

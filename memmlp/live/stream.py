@@ -17,7 +17,7 @@ from memmlp.common.errors import InputError
 from memmlp.live.exported import ExportedNetwork
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
 from memmlp.live.spaces import SpaceName, space_of
-from memmlp.live.trackers import TRACKERS, Features, Lost, TrackerFrames, t_pose
+from memmlp.live.trackers import TRACKERS, UPRIGHT, Features, Lost, TrackerFrames, heading_of, t_pose
 from memmlp.live.wearer import wearer
 from memmlp.runs.run import Run
 
@@ -29,6 +29,7 @@ NOTHING = np.full((3, 12), np.nan)
 NEUTRAL = np.concatenate([np.zeros(3), IDENTITY.reshape(9)])
 FARTHEST = 1e6  # metres; a tracker farther from the origin is taken as lost
 LATEST = 1e10  # seconds; at much later times floats can't tell frames of 1/60 s apart
+TILTED = np.radians(60)  # from upright; which way a device that is tilted further looks, nobody knows
 UNIT = 1e-2  # how far a quaternion's norm may be from 1, or a matrix from orthonormal
 
 TrackerPose = tuple[ArrayLike, ArrayLike] | None
@@ -214,7 +215,8 @@ class Stream:
             The offsets, which later streams can be given.
 
         Raises:
-            InputError: for a lost tracker, or hands that are not apart.
+            InputError: for a lost tracker, hands that are not apart, or a head that looks backwards as seen
+                from them.
         """
         positions, rotations, lost = read_trackers((head, left, right))
         if any(lost):
@@ -223,7 +225,13 @@ class Stream:
         across = world[1] - world[2]
         if np.hypot(*across[:2]) < 0.1:
             raise InputError("calibrate: the hands are not apart; allowed is a T-pose, the arms to the sides")
-        pose = t_pose(self.network.skeleton, world[0], float(np.arctan2(across[1], across[0])))
+        heading = float(np.arctan2(across[1], across[0]))
+        if _looks_back(self.space.rotations_in(rotations)[0], heading):
+            raise InputError(
+                "calibrate: the head looks backwards as seen from the hands; left and right look exchanged, "
+                "or the head's device is mounted backwards; allowed is neither"
+            )
+        pose = t_pose(self.network.skeleton, world[0], heading)
         joints = pose.positions + (world - pose.positions).mean(0)
         inverse = rotations.swapaxes(1, 2)
         away = self._positions_out(joints) - positions
@@ -354,6 +362,14 @@ def _check_time(time: float | None) -> None:
         raise InputError(
             f"time={time}: allowed is a number of seconds, at most {LATEST:g}, or None for one frame"
         )
+
+
+def _looks_back(head: np.ndarray, heading: float) -> bool:
+    """Return whether a head's device (3, 3) in AMASS' world looks away from a heading, radians, by over 90
+    degrees. One that is far from upright, and so no headset, is not asked.
+    """
+    upright = (head @ UPRIGHT.T)[2, 2] > np.cos(TILTED)
+    return bool(upright and np.cos(heading_of(head) - heading) < 0)
 
 
 def checked_offsets(offsets: Offsets) -> Offsets:

@@ -9,6 +9,7 @@ The rules apply in this order:
 - **Frames** lie on a grid of 1 / fps from the first sample on. A frame is made as soon as there is a sample
   at or after its time, by interpolation between the samples beside it (positions linearly, rotations by
   slerp). No sample of the future is waited for, and a pose is at most one frame older than the newest sample.
+  A frame that is ahead of its sample, by `EARLY` at most, takes it as it is.
   A slow tracker gives several frames at once, a fast one none at some samples, and the rate may change at any
   time.
 - A sample that is not newer than the last one is **ignored**.
@@ -59,8 +60,12 @@ class TrackerSample(NamedTuple):
 
 
 def between(a: TrackerSample, b: TrackerSample, time: float) -> TrackerSample:
-    """Return the trackers at a time, interpolated between the samples before and after it."""
-    weight = (time - a.time) / (b.time - a.time)
+    """Return the trackers at a time, interpolated between the samples before and after it.
+
+    At a time after both they are where the second has them: from two samples that came together, speeds can't
+    be told.
+    """
+    weight = min((time - a.time) / (b.time - a.time), 1.0)
     positions = a.positions + weight * (b.positions - a.positions)
     return TrackerSample(time, positions, slerp(a.rotations, b.rotations, weight))
 

@@ -152,10 +152,13 @@ def _reach(found: Trends) -> list[str]:
     where = f"`{found.predict}`"
     if found.compute is None:
         return [f"no compute of {where} is kept; memmlp results save counts it"]
-    beyond, span = math.log10(found.compute / ends[1]), math.log10(ends[1] / ends[0])
     here = f"{where} is {power(found.compute)} FLOP"
-    if beyond <= 0:
+    if ends[0] <= found.compute <= ends[1]:
         return [f"{here}, within what was measured"]
+    above = found.compute > ends[1]
+    times = found.compute / ends[1] if above else ends[0] / found.compute
+    end = "times the largest" if above else "times below the smallest"
+    beyond, span = math.log10(times), math.log10(ends[1] / ends[0])
     near = beyond <= NEAR * span
     trust = (
         "a short way, for which a straight line may do"
@@ -163,10 +166,9 @@ def _reach(found: Trends) -> list[str]:
         else "too far to trust a straight line: the intervals hold if it goes on straight, and nothing "
         "measured here can show that it does"
     )
-    times = found.compute / ends[1]
     factor = f"{times:.2g}" if times < 10 else f"{float(f'{times:.2g}'):,.0f}"
     return [
-        f"{here}, {factor} times the largest measured compute: {beyond:.1f} decades further than the "
+        f"{here}, {factor} {end} measured compute: {beyond:.1f} decades further than the "
         f"{span:.1f} that were measured, {trust}",
         *_held(found, where),
     ]

@@ -15,7 +15,7 @@ import shutil
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -85,7 +85,11 @@ def _files(run: Run) -> dict[str, Path]:
 
 
 def import_run(
-    path: Path, outputs: Path, sha256: str | None = None, largest: int = LARGEST
+    path: Path,
+    outputs: Path,
+    sha256: str | None = None,
+    largest: int = LARGEST,
+    tell: Callable[[str], None] = lambda line: None,
 ) -> tuple[Run, bool]:
     """Take the run of an archive among the runs of an outputs folder.
 
@@ -94,9 +98,11 @@ def import_run(
         outputs: the outputs folder.
         sha256: the digest that the archive must have; None for any.
         largest: bytes of all files together at most.
+        tell: gets a line where the run is there already, without evaluations or deployments that the archive
+            has.
 
     Returns:
-        The run, and whether it is new; one that is there already with the same results stays as it is.
+        The run, and whether it is new; one that is there already with the same weights stays as it is.
 
     Raises:
         InputError: if the file is no archive of a run, is too large, or a digest does not hold.
@@ -108,11 +114,20 @@ def import_run(
     try:
         with zipfile.ZipFile(path) as archive:
             run_id, files = _index(archive, path, largest)
-            return _placed(archive, path, run_id, files, outputs)
+            run, new = _placed(archive, path, run_id, files, outputs)
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: not an archive of a run ({error})") from None
+    if not new and (more := _missing(run, files)):
+        tell(f"{path}: has {', '.join(more)}, which run {run.id} here lacks; that is not taken in")
+    return run, new
+
+
+def _missing(run: Run, files: Iterable[str]) -> list[str]:
+    """Return the evaluations and deployments among an archive's files that a run lacks."""
+    lacking = (name for name in files if "/" in name and not (run.folder / name).exists())
+    return sorted({"/".join(name.split("/")[:2]) for name in lacking})
 
 
 def _index(archive: zipfile.ZipFile, path: Path, largest: int) -> tuple[str, Mapping[str, Mapping[str, Any]]]:

@@ -6,6 +6,7 @@ A condition is made of comparisons, `and`, `or`, `not` and parentheses. Nothing 
 from __future__ import annotations
 
 import difflib
+import math
 import operator
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -26,6 +27,7 @@ ORDER: dict[str, Callable[[Any, Any], bool]] = {
 }  # fmt: skip
 COMPARISONS = ("=", "==", "!=", *ORDER)
 WORDS = ("and", "or", "not")
+NUMBERS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}  # by their words in JSON (common.files)
 SHORT = 8  # digits of a digest that tell data apart
 DEEPEST = 50  # parentheses and "not"s in one another
 
@@ -39,7 +41,8 @@ def record(run: Run) -> dict[str, Any]:
     `stream.rotation.MPJPE`).
     """
     manifest, config, notes = run.manifest, run.config, read_notes(run)
-    results, flat = flatten(run.results), flatten(config)
+    results = {key: _measured(value) for key, value in flatten(run.results).items()}
+    flat = flatten(config)
     short = {key.replace(".rotation.", "."): value for key, value in results.items()}
     slots = {slot: chosen(config, slot) for slot in SLOTS if slot in config}
     facts = {name: manifest.get(name) for name in ("kind", "started", "upstream", "user")}
@@ -48,6 +51,11 @@ def record(run: Run) -> dict[str, Any]:
     facts |= {"id": run.id, "name": run_name(manifest, flat), "status": run.status}
     facts |= {"tag": notes.tags, "note": notes.note}
     return {**flat, **slots, **short, **results, **facts}
+
+
+def _measured(value: Any) -> Any:
+    """Return what JSON holds for a measured number as that number, with NaN and infinities."""
+    return NUMBERS.get(value, value) if isinstance(value, str) else value
 
 
 def data_labels(records: Sequence[Record]) -> list[str]:
@@ -244,7 +252,9 @@ class _Parser:
 
 
 def _holds(own: Any, sign: str, value: str) -> bool:
-    """Return whether a comparison holds. What a run does not have is neither smaller nor larger."""
+    """Return whether a comparison holds. What a run does not have is neither smaller nor larger, nor is NaN,
+    which fulfils != alone.
+    """
     if sign in ORDER:
         if isinstance(own, str):
             return ORDER[sign](own, value)
@@ -255,10 +265,11 @@ def _holds(own: Any, sign: str, value: str) -> bool:
 
 
 def _equal(own: Any, value: str) -> bool:
+    """Return whether a run's value is one that was typed in; a number may be typed as it is shown."""
     if isinstance(own, tuple):  # tags: it has the tag
         return value in own
     if isinstance(own, int | float) and not isinstance(own, bool):
-        return own == _number(value)
+        return _number(value) in (own, float(as_typed(own)))
     return as_typed(own) == value.replace(", ", ",")
 
 

@@ -11,6 +11,9 @@ from typing import Any
 
 from memmlp.tracking.view import Facts, Point, SweepFacts
 
+LONGEST = 120  # characters of a folder's name
+OWN = len(" · 01234567")  # of these, what tells a run from all others
+
 
 @dataclass(frozen=True)
 class TensorBoard:
@@ -123,5 +126,6 @@ class EventFile:
 
 
 def file_name(title: str) -> str:
-    """Return a title as the name of a folder, as TensorBoard shows it."""
-    return re.sub(r"[^\w=.,·+() -]", "_", title)[:120]
+    """Return a title as the name of a folder, as TensorBoard shows it; of a long one the run's id is kept."""
+    name = re.sub(r"[^\w=.,·+() -]", "_", title)
+    return name if len(name) <= LONGEST else name[: LONGEST - OWN] + name[-OWN:]

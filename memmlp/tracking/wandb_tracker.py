@@ -16,6 +16,8 @@ from memmlp.tracking.view import Facts, Point, SweepFacts
 
 OFFLINE = {"WANDB_MODE": "offline", "WANDB_SILENT": "true", "WANDB_ERROR_REPORTING": "false"}
 
+AXES = {"train/*": "step", "val/*": "step", "system/*": "system/time"}  # what curves are drawn over
+
 
 @dataclass(frozen=True)
 class WandB:
@@ -46,7 +48,10 @@ class WandB:
             facts.note or None,
             {**facts.config, "run": {**facts.origin, "folder": str(facts.folder)}},
         )
-        shown = ShownInWandB(self._begun(facts.id, facts.name, facts.tags, notes, config))
+        run = self._begun(facts.id, facts.name, facts.tags, notes, config)
+        for curves, axis in AXES.items():
+            run.define_metric(curves, step_metric=axis)
+        shown = ShownInWandB(run)
         shown.log(points)
         return shown
 
@@ -85,21 +90,29 @@ class WandB:
 
 
 class ShownInWandB:
-    """A run that W&B's client has open."""
+    """A run that W&B's client has open.
+
+    Values of one training step, and of one of the machine's samples, are a row of W&B's history. Rows only go
+    forth there, and so their numbers are those of the steps until the machine's lie between; each row says
+    itself of which step or time it is (`AXES`).
+    """
 
     def __init__(self, run: Any):
-        self.run, self.step = run, 0
+        self.run, self.row = run, -1
 
     def log(self, points: Sequence[Point]) -> None:
-        """Log values, those of one step together. W&B takes no step back, so a machine's come at the last."""
+        """Log values, those of training before those of the machine."""
         training = [point for point in points if not point.key.startswith("system/")]
         machine = [point for point in points if point.key.startswith("system/")]
         for step, group in groupby(sorted(training, key=lambda point: point.step), lambda point: point.step):
-            self.step = max(self.step, step)
-            self.run.log({point.key: point.value for point in group}, step=self.step)
-        for _, group in groupby(machine, lambda point: point.step):
-            values = {point.key: point.value for point in group}
-            self.run.log({**values, "system/time": points[-1].time}, step=self.step)
+            self._log({point.key: point.value for point in group} | {"step": step}, step)
+        for time_, group in groupby(machine, lambda point: point.time):
+            self._log({point.key: point.value for point in group} | {"system/time": time_})
+
+    def _log(self, values: dict[str, float], wanted: int = 0) -> None:
+        """Log a row, under a wanted number where that is free."""
+        self.row = max(self.row + 1, wanted)
+        self.run.log(values, step=self.row)
 
     def end(self, facts: Facts, results: Sequence[Point]) -> None:
         """Give results to the run's summary, and end it as the run ended."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
 import subprocess
 import sys
@@ -11,14 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 from conftest import Memmlp, one_line
 from glb import Glb
 from processes import PATIENCE, hearing_interrupts, started
 
-from memmlp.cli.live import ShowOptions, known_of
+from memmlp.cli.live import InputOptions, ShowOptions, known_of, load_clip
 from memmlp.live.calibration import Calibration, save_calibration
 from memmlp.live.stream import Offsets, Stream
+from memmlp.motion.body import PARENTS
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.synthetic import synthesize_clip
 
@@ -60,6 +63,20 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def step(step_files) -> Path:
     return step_files("no_memory")
+
+
+def test_a_clip_of_a_file_is_on_the_network_s_body(step: Path, clip: Path, tmp_path: Path):
+    """As in `memmlp predict`: trackers of another body would be those of another person than it learned."""
+    model = onnx.load(step)
+    (told,) = [entry for entry in model.metadata_props if entry.key == "rest"]
+    rest = 0.9 * np.array(json.loads(told.value))
+    told.value = json.dumps(rest.tolist())
+    onnx.save(model, tmp_path / "small.onnx")
+    given = InputOptions(str(tmp_path / "small.onnx"), str(clip), None, None, (), "amass", 60.0, tmp_path)
+    joints = load_clip(given).joints
+    for joint, parent in enumerate(PARENTS[1:], 1):
+        bone = np.linalg.norm(joints[:, joint] - joints[:, parent], axis=-1)
+        np.testing.assert_allclose(bone, np.linalg.norm(rest[joint] - rest[parent]), atol=1e-5)
 
 
 @pytest.mark.slow

@@ -228,6 +228,15 @@ def test_where_sort_and_columns(memmlp: Memmlp, outputs: Path):
     assert one_line(memmlp("runs", "list", "--where", "seed="), "it ends where a value")
 
 
+@pytest.mark.parametrize(("sort", "order"), [("stream.MPJPE", [B, A, C]), ("-stream.MPJPE", [A, B, C])])
+def test_a_run_that_diverged_is_sorted_behind_all(memmlp: Memmlp, outputs: Path, sort: str, order: list[str]):
+    """Its NaN is a word in its file; the order of the others stays that of numbers, not of texts."""
+    for name, error in ((A, 12.4), (B, 5.3), (C, float("nan"))):
+        write_json(Run.of(outputs, name).results_path, {"stream": {"rotation": {"MPJPE": error}}})
+    lines = memmlp("runs", "list", "--sort", sort).out.splitlines()
+    assert [line[:16] for line in lines if line[:16] in order] == order
+
+
 def test_a_damaged_run_is_listed_and_named(memmlp: Memmlp, outputs: Path):
     (outputs / "runs" / A / "config.yaml").write_text("{")
     ran = memmlp("runs", "list")

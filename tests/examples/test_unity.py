@@ -151,6 +151,13 @@ def test_other_rates_and_gaps(play: Player, stream: Stream):
     np.testing.assert_allclose(play(samples), poses(stream, samples), atol=1e-4)
 
 
+def test_samples_that_come_together(play: Player, stream: Stream):
+    """A frame ahead of the second takes it as it is; on the line through both it would be far away."""
+    samples = [(max(time - 4e-4, 0.0), *rest) for time, *rest in rows(trackers("unity")[:40])]
+    samples[9] = (samples[10][0] - 2e-5, *samples[9][1:])
+    np.testing.assert_allclose(play(samples), poses(stream, samples), atol=1e-4)
+
+
 def test_a_lost_hand_is_held_and_comes_back_slowly(play: Player, stream: Stream):
     frames = trackers("unity").copy()
     frames[20:35, 1] = np.nan

@@ -19,6 +19,7 @@ from processes import finished
 from scipy.spatial.transform import Rotation
 
 import memmlp
+from memmlp.common.errors import InputError
 from memmlp.deploy.export import export
 from memmlp.evaluation.ik import LBFGS
 from memmlp.evaluation.modes import joint_positions, local_rotations, stream
@@ -316,6 +317,20 @@ def test_calibration_finds_how_the_devices_sit(name, file):
         person = PERSON.positions[index], PERSON.rotations[index]
         joint = plain.step(*zip(space.positions_out(person[0]), space.rotations_out(person[1]), strict=True))
         np.testing.assert_allclose(exact.step(*devices(*person)).positions, joint.positions, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", SPACES)
+@pytest.mark.parametrize(("heading", "tilt"), [(0.0, 0), (2.1, 40), (-3.0, -40)])
+def test_exchanged_controllers_are_not_calibrated(name, heading, tilt, file):
+    """The body would face backwards, and everything else would seem right."""
+    space, stream = SPACES[name], Stream(file, space=name)
+    pose = t_pose(stream.network.skeleton, np.array([0.3, -0.2, 1.6]), heading)
+    rotations = pose.rotations @ Rotation.from_euler("x", tilt, degrees=True).as_matrix()
+    head, left, right = zip(space.positions_out(pose.positions), space.rotations_out(rotations), strict=True)
+    with pytest.raises(InputError, match="exchanged, or the head's device is mounted backwards"):
+        stream.calibrate(head, right, left)
+    assert stream.offsets is None
+    stream.calibrate(head, left, right)
 
 
 # A long stream

@@ -56,6 +56,20 @@ def test_frames_lie_between_samples(rate, millimetres):
     np.testing.assert_allclose(np.stack([f.rotations for f in frames]), truth.rotations, atol=2e-2)
 
 
+@pytest.mark.parametrize("apart", [1e-3, 1e-4, 1e-5])
+def test_two_samples_that_come_together_throw_no_frame_away(apart):
+    """The frame is 0.1 to 0.5 ms ahead of the second; on the line through both it would be up to 80 cm on."""
+    trackers = TrackerFrames(SKELETON, 60)
+    trackers.take(0.0, *SAMPLES[0][1:], NOBODY)
+    first, second = SAMPLES[30], SAMPLES[31]
+    early = 1 / 60 - 4.95e-4
+    assert not trackers.take(early - apart, *first[1:], NOBODY).frames
+    (frame,) = trackers.take(early, *second[1:], NOBODY).frames
+    assert frame.time == pytest.approx(1 / 60)
+    np.testing.assert_allclose(frame.positions, second.positions, atol=1e-9)
+    np.testing.assert_allclose(frame.rotations, second.rotations, atol=1e-9)
+
+
 def test_no_frame_is_lost_in_an_hour_of_unix_time():
     """Such times have a resolution of 2e-7 s; at 60 Hz each sample still makes one frame, at its own time."""
     trackers, start = TrackerFrames(SKELETON, 60), 1.7e9

@@ -53,7 +53,15 @@ def test_the_section_has_what_the_lines_say(found: Trends):
 
 @pytest.mark.parametrize(
     ("compute", "words"),
-    [(4e12, "within what was measured"), (1.5e13, "a short way, for which"), (None, "is kept; memmlp")],
+    [
+        (4e12, "within what was measured"),
+        (1.5e13, "a short way, for which"),
+        (4e11, "1.2 times below the smallest measured compute: 0.1 decades further"),
+        (4e11, "a short way, for which"),
+        (5e9, "100 times below the smallest measured compute: 2.0 decades further"),
+        (5e9, "too far to trust a straight line"),
+        (None, "is kept; memmlp"),
+    ],
 )
 def test_how_far_a_prediction_may_be_trusted_follows_from_the_numbers(found: Trends, compute, words: str):
     assert words in scaling_section(replace(found, compute=compute))

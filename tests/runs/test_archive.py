@@ -13,6 +13,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import file_digest
 from memmlp.runs.archive import INDEX, export_run, import_run
 from memmlp.runs.deployment_folder import ONNX_FILES
+from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.notes import add_tags, read_notes
 from memmlp.runs.run import Run
 
@@ -84,6 +85,26 @@ def test_it_arrives_as_it_was_without_checkpoint_and_strange_files(run: Run, arc
         or not import_run(archive, tmp_path / "there")[1]
     )
     assert [path.name for path in there.folder.parent.iterdir()] == [NAME]
+
+
+def test_what_a_run_lacks_that_is_there_already_is_named(run: Run, archive: Path, tmp_path: Path):
+    """It is not taken in: results of one run are never mixed of two machines without a word."""
+    told: list[str] = []
+    there, _ = import_run(archive, tmp_path / "there", tell=told.append)
+    import_run(archive, tmp_path / "there", tell=told.append)
+    assert told == []
+    report = {"name": "window-1", "run": NAME, "mode": "window", "settings": {"mode": "window"}}
+    write_report(run.evaluation("window-1"), report | {"mean": {"rotation": {"MPJPE": 4.0}}, "clips": []})
+    place = run.deployment("int8-0")
+    place.folder.mkdir()
+    place.file("int8").write_bytes(b"onnx")
+    place.finish({"settings": {}})
+    export_run(run, archive)
+    before = sorted(there.folder.rglob("*"))
+    assert not import_run(archive, tmp_path / "there", tell=told.append)[1]
+    assert sorted(there.folder.rglob("*")) == before
+    (line,) = told
+    assert f"has deployments/int8-0, evaluations/window-1.json, which run {NAME} here lacks" in line
 
 
 def test_deployments_of_every_precision_arrive(run: Run, tmp_path: Path):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from memmlp.common.errors import InputError
 from memmlp.common.files import write_json
 from memmlp.runs.notes import add_tags
-from memmlp.runs.query import data_labels, differing, parse, record
+from memmlp.runs.query import as_typed, data_labels, differing, parse, record
 
 ONE = {
     "memory": "gru", "seed": 1, "optim.lr": 1e-3, "memory.layers": [2, 4], "stream.MPJPE": 6.25,
@@ -78,6 +78,36 @@ def test_an_unknown_key_names_its_neighbour():
     with pytest.raises(InputError, match="no run has the key 'memry'; did you mean memory"):
         parse("memry=gru").of([ONE])
     assert parse("anything=1").of([]) == []
+
+
+@pytest.mark.parametrize("own", [float("nan"), "nan"])
+def test_a_network_that_diverged_fulfils_no_comparison(own: float | str, tmp_path: Path):
+    """Files hold NaN as a word, which as a text is larger than any number."""
+    one = measured(tmp_path, own)
+    for text in ("<1", "<=1", ">1", ">=1", "=1", "=nan", "<nan", ">nan"):
+        assert parse(f"stream.MPJPE{text}").of([one]) == [False]
+    assert parse("stream.MPJPE!=1").of([one]) == [True]
+
+
+def test_an_infinite_error_is_larger_than_all(tmp_path: Path):
+    one = measured(tmp_path, float("inf"))
+    assert parse("stream.MPJPE>1e300").of([one]) == [True]
+    assert parse("stream.MPJPE<6").of([one]) == [False]
+
+
+def measured(folder: Path, value: float | str) -> dict[str, Any]:
+    """What may be asked of a run with that MPJPE."""
+    run = begun(folder, {"seed": 0})
+    write_json(run.results_path, {"stream": {"rotation": {"MPJPE": value}}})
+    return dict(record(run))
+
+
+@pytest.mark.parametrize("own", [0.000123456, 1234567.0, 6.51234, 3])
+def test_a_number_equals_what_is_shown_of_it(own: float):
+    assert parse(f"a={as_typed(own)}").of([{"a": own}]) == [True]
+    assert parse(f"a!={as_typed(own)}").of([{"a": own}]) == [False]
+    assert parse(f"a={own!r}").of([{"a": own}]) == [True]
+    assert parse(f"a={own * 1.01!r}").of([{"a": own}]) == [False]
 
 
 def test_a_run_may_be_asked_for_slots_results_and_facts(tmp_path: Path):

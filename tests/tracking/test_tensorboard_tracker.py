@@ -56,6 +56,21 @@ def test_a_curve_grows_and_is_written_once(tmp_path: Path):
     assert [path.name for path in Path(tracker.place).iterdir()] == ["memory=gru · seed 1 · 00000000"]
 
 
+def test_runs_with_long_names_have_a_folder_each(tmp_path: Path):
+    """Names of seeds differ at their end alone, which is behind what there is room for."""
+    tracker = TensorBoard(tmp_path)
+    runs = [a_run(tmp_path, 16 * digit) for digit in "12"]
+    for seed, run in enumerate(runs):
+        run.write_manifest({"name": f"{'optim.weight_decay=0.05 · ' * 5}seed {seed}"})
+    for _ in range(2):
+        sync(tracker, runs, tmp_path, print)
+        folders = [path.name for path in Path(tracker.place).iterdir()]
+        assert sorted(name[-11:] for name in folders) == [f" · {run.id[:8]}" for run in runs]
+        assert {len(name) for name in folders} == {120}
+    assert sync(tracker, runs, tmp_path, print) == {"same": 2}
+    assert all(tracker.has(run.id) for run in runs)
+
+
 def test_it_tells_how_a_run_ended_and_what_people_said(tmp_path: Path):
     tracker, run = TensorBoard(tmp_path), a_run(tmp_path)
     run.fail("loss is nan")

@@ -17,11 +17,12 @@ from memmlp.runs.metrics_log import MetricsLog
 from memmlp.runs.notes import add_tags
 from memmlp.tracking.sync import sync
 from memmlp.tracking.tracker import Session
-from memmlp.tracking.view import SYSTEM, SweepFacts
-from memmlp.tracking.wandb_tracker import WandB
+from memmlp.tracking.view import SYSTEM, Point, SweepFacts, facts_of
+from memmlp.tracking.wandb_tracker import AXES, WandB
 
 pytest.importorskip("wandb")
 pytestmark = pytest.mark.slow
+CPU, LOSS = "system/cpu_percent", "train/loss"
 
 
 @pytest.fixture(autouse=True)
@@ -61,14 +62,19 @@ def pieces(content: bytes) -> Iterator[bytes]:
             whole = b""
 
 
-def curve(found: list[Any], key: str) -> list[tuple[int, float]]:
-    """A curve's steps and values."""
-    rows = [
+def curve(found: list[Any], key: str) -> list[tuple[float, float]]:
+    """A curve's values, and the numbers of their rows."""
+    return rows(found, "_step", key)
+
+
+def rows(found: list[Any], axis: str, key: str) -> list[tuple[float, float]]:
+    """A curve's values over an axis."""
+    history = [
         {item.key or item.nested_key[0]: json.loads(item.value_json) for item in record.history.item}
         for record in found
         if record.WhichOneof("record_type") == "history"
     ]
-    return [(row["_step"], row[key]) for row in rows if key in row]
+    return [(row[axis], row[key]) for row in history if key in row]
 
 
 def test_a_failed_run_with_its_curve_name_tags_and_machine_once(tmp_path: Path):
@@ -92,6 +98,26 @@ def test_a_failed_run_with_its_curve_name_tags_and_machine_once(tmp_path: Path):
     assert (begun.display_name, begun.project, list(begun.tags)) == ("memory=gru · seed 1", "mine", ["good"])
     (end,) = [record.exit for record in found if record.WhichOneof("record_type") == "exit"]
     assert end.exit_code == 1
+
+
+def test_each_sample_of_the_machine_and_each_step_is_kept_at_its_own_place(tmp_path: Path):
+    """More samples than steps lie between two batches; W&B's own count is ahead of the second one's steps."""
+    tracker, run = WandB("mine", tmp_path), a_run(tmp_path, steps=0)
+
+    def batch(first: int) -> list[Point]:
+        samples = [Point(CPU, 10.0 * n, n, 1000.0 + 10 * n) for n in range(5 * first, 5 * first + 5)]
+        return [Point(LOSS, float(step), step, 0.0) for step in (first + 1, first + 2)] + samples
+
+    facts = facts_of(run)
+    shown = tracker.begin(facts, batch(0))
+    shown.log(batch(2))
+    shown.end(facts, [])
+    found = records(tracker, run.id)
+    assert rows(found, "step", LOSS) == [(1, 1.0), (2, 2.0), (3, 3.0), (4, 4.0)]
+    numbers = [*range(5), *range(10, 15)]
+    assert rows(found, "system/time", CPU) == [(1000 + 10 * n, 10 * n) for n in numbers]
+    defined = [record.metric for record in found if record.WhichOneof("record_type") == "metric"]
+    assert {metric.glob_name or metric.name: metric.step_metric for metric in defined}.items() >= AXES.items()
 
 
 def test_a_sweep_is_a_run_with_its_verdicts(tmp_path: Path):

@@ -93,7 +93,8 @@ namespace Memmlp
 
         /// <summary>
         /// Learn where the joints are on the devices, from a wearer who stands upright in a T-pose. The line from
-        /// hand to hand tells where the wearer looks. Return whether all three were tracked, and hands apart.
+        /// hand to hand tells where the wearer looks. Return whether all three were tracked, hands apart, and the
+        /// head did not look backwards, as it does where the controllers are exchanged.
         /// </summary>
         public bool Calibrate()
         {
@@ -102,6 +103,8 @@ namespace Memmlp
             if (!(tracked[0] && tracked[1] && tracked[2]) || across.magnitude < 0.1f)
                 return false;
             Quaternion turn = Quaternion.LookRotation(Vector3.Cross(across, Vector3.up), Vector3.up);
+            if (Vector3.Dot(devices[0].rotation * Vector3.forward, turn * Vector3.forward) < 0)
+                return false;
             Vector3 place = Vector3.zero; // where the T-pose's origin is, so that the joints are near the devices
             for (int k = 0; k < 3; k++)
                 place += (devices[k].position - turn * rest[k]) / 3;
@@ -131,7 +134,7 @@ namespace Memmlp
             bool any = false;
             for (; nextFrame <= time + Early; nextFrame += FrameTime, any = true)
             {
-                float weight = last == null ? 1 : (float)((nextFrame - lastTime) / (time - lastTime));
+                float weight = last == null ? 1 : (float)Math.Min(1, (nextFrame - lastTime) / (time - lastTime));
                 body.Step(Between(last ?? newest, newest, weight));
             }
             last = newest;

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 from rich.console import Console
@@ -93,18 +94,21 @@ def is_finished_upstream(run: Run) -> bool:
 
 
 def sorted_by(listed: Sequence[Run], records: Mapping[str, Record], sort: str) -> list[Run]:
-    """Return the runs sorted by a key; those that have no such value come last."""
+    """Return the runs sorted by a key; those that have no such value, or NaN, come last."""
     from memmlp.runs.query import check_key
 
     key, down = sort.removeprefix("-"), sort.startswith("-")
     check_key(key, records.values(), "--sort")
-    known = [run for run in listed if records[run.id].get(key) not in (None, "", ())]
-    values = [records[run.id][key] for run in known]
-    numbers = all(isinstance(value, int | float) for value in values)
-    ranked = sorted(
-        known, key=lambda run: records[run.id][key] if numbers else str(records[run.id][key]), reverse=down
-    )
+    found: dict[str, Any] = {run.id: records[run.id].get(key) for run in listed}
+    known = [run for run in listed if not _is_missing(found[run.id])]
+    numbers = all(isinstance(found[run.id], int | float) for run in known)
+    ranked = sorted(known, key=lambda run: found[run.id] if numbers else str(found[run.id]), reverse=down)
     return [*ranked, *(run for run in listed if run not in known)]
+
+
+def _is_missing(value: object) -> bool:
+    """Whether a value has no place in an order: there is none, or NaN."""
+    return value in (None, "", ()) or (isinstance(value, float) and math.isnan(value))
 
 
 def wanted(columns: str | None, records: Mapping[str, Record], listed: Sequence[Run]) -> list[str]:

@@ -85,9 +85,10 @@ def export(run: str, out: Path | None, outputs: Path) -> None:
 def import_(path: Path, sha256: str | None, max_gb: float, outputs: Path) -> None:
     """Take a run from a file that `memmlp runs export` wrote.
 
-    It is refused if a digest in it does not hold. With --sha256 it is the very file that was exported.
+    It is refused if a digest in it does not hold. With --sha256 it is the very file that was exported. A run
+    that is there already stays as it is, also where the file has more of its evaluations and deployments.
     """
     from memmlp.runs.archive import import_run
 
-    run, new = import_run(path, outputs, sha256, int(max_gb * 1e9))
+    run, new = import_run(path, outputs, sha256, int(max_gb * 1e9), lambda line: click.echo(line, err=True))
     click.echo(f"run {run.id}: {'imported' if new else 'was there already'}")

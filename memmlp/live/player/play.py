@@ -16,6 +16,7 @@ from memmlp.live.player.sources import SourceSample, TrackerSource
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES, Space
 from memmlp.live.stream import Pose, Stream
+from memmlp.live.trackers import GAP
 from memmlp.motion.body import FPS, JOINTS, PARENTS
 from memmlp.motion.formats.humanoid_bones import VRM
 from memmlp.motion.limb_shapes import LIMBS
@@ -23,6 +24,7 @@ from memmlp.render.error_colours import HEAT
 
 PAGE_SPACE = SPACES["openxr"]  # the page's axes: those of three.js
 TOP = 20  # cm at the top of the page's colour scale
+JUMPS = 5  # samples in a row
 UNIT = 10_000  # whole numbers that a quaternion's 1 is sent as
 
 Publish = Callable[[dict[str, Any]], None]
@@ -55,14 +57,15 @@ def play(
     outputs: Outputs | None = None,
     fitting: Fitting | None = None,
     avatar: bool = False,
+    tell: Callable[[str], None] = lambda line: None,
 ) -> None:
     """Feed samples to the stream, and its frames to the outputs and to who watches, until `stopped` is set.
 
     A message has the frame's number and time (s); milliseconds that the network itself took (`ms`) and that
     the whole pose took, from the sample's arrival until all outputs had it (`whole`); how many samples were
-    dropped, malformed, or foreign so far; the trackers that are held; and the joints, predicted and true (66
-    whole millimetres, axes of openxr). Packets that were not taken are reported at once, by a message that
-    has the counts alone.
+    dropped, malformed, or foreign so far; whether their times jump (`Jumps`); the trackers that are held; and
+    the joints, predicted and true (66 whole millimetres, axes of openxr). Packets that were not taken are
+    reported at once, by a message that has the counts alone.
 
     Args:
         stream: the network.
@@ -72,7 +75,9 @@ def play(
         outputs: get the frames first.
         fitting: fits the stream to its wearer between the samples.
         avatar: whether messages have the joints' rotations as well.
+        tell: gets a line where the samples' times jump.
     """
+    jumps = Jumps(tell)
     number, refused, dropped, told = 0, 0, 0, (0, 0)
     while not stopped.is_set():
         sample = source.read()
@@ -84,6 +89,7 @@ def play(
         if sample is None:
             continue
         dropped += sample.dropped
+        jumps.take(sample.time)
         arrived = sample.arrived or time.perf_counter()
         pose = take_step(stream, sample)
         if pose is None:
@@ -96,7 +102,7 @@ def play(
         whole = 1000 * (time.perf_counter() - arrived)
         times = {"ms": round(1000 * stream.network_seconds, 3), "whole": round(whole, 3)}
         told = source.malformed + refused, source.foreign
-        head = {"number": number, "time": round(pose.time, 4), "held": pose.held}
+        head = {"number": number, "time": round(pose.time, 4), "held": pose.held, "jumping": jumps.many}
         message = (
             head
             | times
@@ -105,6 +111,35 @@ def play(
         )
         publish(message | (rotations_message(stream.space, pose) if avatar else {}))
         number += 1
+
+
+class Jumps:
+    """Notices times that jump with every sample, as milliseconds do; the network begins anew each time.
+
+    Args:
+        tell: gets a line when it is noticed first.
+    """
+
+    def __init__(self, tell: Callable[[str], None]):
+        self.tell, self.told = tell, False
+        self.last: float | None = None
+        self.row = 0
+
+    @property
+    def many(self) -> bool:
+        """Whether so many times in a row jumped that it is no pause."""
+        return self.row >= JUMPS
+
+    def take(self, time: float) -> None:
+        """Take a sample's time, seconds."""
+        jumped = self.last is not None and abs(time - self.last) > GAP
+        self.row, self.last = self.row + 1 if jumped else 0, time
+        if self.many and not self.told:
+            self.told = True
+            self.tell(
+                f"{JUMPS} samples in a row are over {GAP:g} s apart by their times, and the network begins "
+                "anew with each; is `time` in seconds?"
+            )
 
 
 def take_step(stream: Stream, sample: SourceSample) -> Pose | None:

@@ -105,25 +105,28 @@ class TrackedClip:
         return head, left, right
 
     def truth(self, time: float) -> np.ndarray:
-        """Return the joints (22, 3), metres, world, at a time, interpolated."""
+        """Return the joints (22, 3), metres, world, at a time, interpolated; outside the clip the nearest."""
         first, weight = self._place(time)
         return self.joints[first] + weight * (self.joints[first + 1] - self.joints[first])
 
     def _place(self, time: float) -> tuple[int, float]:
         """Return the index of the frame before a time, and the fraction of the way to the next frame."""
         first = min(max(int(time * FPS), 0), len(self.joints) - 2)
-        return first, time * FPS - first
+        return first, min(max(time * FPS - first, 0.0), 1.0)
 
 
-def npz_frames(path: Path) -> np.ndarray:
-    """Return the frames (N, 252) of an AMASS npz, resampled to 60 Hz, on the built-in body.
+def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
+    """Return the frames (N, 252) of an AMASS npz, resampled to 60 Hz, on a network's body.
+
+    Args:
+        path: the file.
+        rest: the body's joints in the rest pose (22, 3), metres, SMPL's body frame.
 
     Raises:
         InputError: for a clip of fewer than 3 frames at 60 Hz.
     """
     import torch
 
-    from memmlp.motion.body import builtin_rest_joints
     from memmlp.motion.clip import resample
     from memmlp.motion.features import motion_frames
     from memmlp.motion.formats.npz import read_clip
@@ -134,7 +137,7 @@ def npz_frames(path: Path) -> np.ndarray:
     clip, _ = resample(recorded)
     if len(clip) < 3:
         raise InputError(f"{path}: {len(clip)} frames at 60 Hz; allowed are 3 or more")
-    tensors = (torch.tensor(part) for part in (clip.poses, clip.trans, builtin_rest_joints()))
+    tensors = (torch.tensor(part) for part in (clip.poses, clip.trans, rest))
     return motion_frames(*tensors).numpy()
 
 
@@ -202,7 +205,8 @@ class ClipSource:
 
     def truth(self, time: float) -> np.ndarray:
         """Return the true joints (22, 3), metres, AMASS' world."""
-        return self.clip.truth(time % self.round)
+        half = PAUSE / 2  # nearer to a round's beginning it belongs to it, even where floats put it before
+        return self.clip.truth((time + half) % self.round - half)
 
     def close(self) -> None:
         """Do nothing, for nothing is held."""

@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
-from memmlp.common.files import plain
+from memmlp.common.files import file_digest, plain
 from memmlp.evaluation.units import UNITS
 from memmlp.report.ui.index import Index
 from memmlp.runs.identity import NETWORK, training_settings
 from memmlp.runs.run import STAGE_WORDS
 from memmlp.sweep.board import name as task_name
+from memmlp.sweep.kept_sweep import NAME as SWEEP_FILE
 from memmlp.sweep.kept_sweep import kept
 from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
@@ -71,9 +72,10 @@ class Sweeps:
         return [plan for _, plan in sorted(found.values(), key=lambda one: -one[0])]
 
     def stamp(self) -> str:
-        """Return a text that changes when a sweep comes, goes, is planned anew, or took a look."""
-        found = sorted(self.plans.items())
-        return repr([(str(p), seen, _changed(p.with_name(ROUNDS_FILE))) for p, (seen, _) in found])
+        """Return a text that changes when a sweep comes, goes, changes, is planned anew, or took a look."""
+        found = [(path, seen) for path, (seen, _) in sorted(self.plans.items())]
+        beside = [[_changed(path.with_name(name)) for name in (SWEEP_FILE, ROUNDS_FILE)] for path, _ in found]
+        return repr([(str(path), seen, *others) for (path, seen), others in zip(found, beside, strict=True)])
 
     def rows(self) -> dict[str, Any]:
         """Return a row for each sweep."""
@@ -180,10 +182,14 @@ class Sweeps:
         return left * statistics.median(paces) / len(running) if left else None
 
     def made(self, plan: Plan) -> Made:
-        """Return what was made of a sweep's runs, made again when one of them or its rounds changed."""
+        """Return what was made of a sweep's runs.
+
+        It is made again when one of them, the sweep, its plan or its rounds changed.
+        """
         with self.lock:
-            runs = [(entry.key, self.index.signatures.get(entry.id)) for entry in plan.entries]
-            stamp = (runs, _changed(self._rounds_path(plan)))
+            runs = [self.index.signatures.get(entry.id) for entry in plan.entries]
+            folder = self.index.outputs / "sweeps" / plan.name
+            stamp = (plan, runs, _digest(folder / SWEEP_FILE), _digest(folder / ROUNDS_FILE))
             known = self.tables.get(plan.name)
             if known and known[0] == stamp:
                 return known[1]
@@ -293,6 +299,14 @@ def _changed(path: Path) -> int:
         return path.stat().st_mtime_ns
     except OSError:
         return 0
+
+
+def _digest(path: Path) -> str:
+    """Return the digest of a file's content; "" where there is none."""
+    try:
+        return file_digest(path)
+    except OSError:
+        return ""
 
 
 def _pace(facts: Mapping[str, Any] | None) -> float | None:

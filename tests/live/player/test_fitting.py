@@ -89,6 +89,15 @@ def test_who_stands_otherwise_is_told_and_nothing_changes(worn: Wearing):
     assert worn.stream.offsets is before
 
 
+def test_exchanged_controllers_are_told_and_nothing_changes(worn: Wearing):
+    head, left, right = worn.pose()
+    worn.order("calibrate", 0)
+    worn.fitting.step((head, right, left))
+    assert worn.stream.offsets is None
+    assert worn.told[-1]["failed"]
+    assert "left and right look exchanged" in worn.told[-1]["said"]
+
+
 def test_height_and_floor(worn: Wearing):
     worn.order("height", 1.86)
     worn.order("touch_floor", 0)

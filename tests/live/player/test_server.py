@@ -14,7 +14,7 @@ from processes import PATIENCE
 
 from memmlp.common.errors import InputError
 from memmlp.live.player import server as module
-from memmlp.live.player.play import greeting, play
+from memmlp.live.player.play import JUMPS, Jumps, greeting, play
 from memmlp.live.player.server import FILES, Hub, Server
 from memmlp.live.player.sources import ClipSource, SourceSample, TrackedClip
 from memmlp.live.stream import Stream
@@ -89,6 +89,31 @@ def test_held_trackers_and_refused_samples_are_told(network: Path, clip: Tracked
     assert messages[45]["held"] == ("left",)
     assert messages[50]["malformed"] == 0
     assert messages[-1]["malformed"] == 1
+
+
+class InMilliseconds(Instant):
+    """A clip whose sender takes milliseconds for seconds."""
+
+    def read(self) -> SourceSample | None:
+        sample = super().read()
+        return sample._replace(time=1000 * sample.time)
+
+
+def test_times_in_milliseconds_are_told_once(network: Path, clip: TrackedClip):
+    stopped, messages, told = threading.Event(), [], []
+    source = InMilliseconds(clip, 60, stopped)
+    play(Stream(network), source, messages.append, stopped, tell=told.append)
+    assert len(told) == 1
+    assert told[0].endswith("is `time` in seconds?")
+    assert [message["jumping"] for message in messages] == [n >= JUMPS for n in range(len(messages))]
+
+
+def test_pauses_are_no_other_unit():
+    told: list[str] = []
+    jumps = Jumps(told.append)
+    for time in (0.0, 1.0, 2.0, 3.0, 4.0, 4.1, 5.1, 3.1, 3.2):
+        jumps.take(time)
+    assert not told
 
 
 @pytest.fixture

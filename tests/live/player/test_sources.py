@@ -87,6 +87,21 @@ def test_a_round_follows_after_a_pause(clip: TrackedClip):
     assert np.array_equal(played.truth(samples[120].time), played.truth(0.0))
 
 
+@pytest.mark.parametrize("hz", [50.0, 60.0, 72.0, 90.0, 120.0])
+def test_the_truth_of_each_round_is_that_of_the_first(clip: TrackedClip, hz: float):
+    """A round's beginning is a multiple of its length but for rounding, and may lie before it."""
+    played = source(clip, hz, Clock())
+    for turn in range(1, 200):
+        for step in (0, 1, played.count - 1):
+            truth = played.truth(turn * played.round + step / hz)
+            np.testing.assert_allclose(truth, clip.truth(step / hz), atol=1e-6)
+
+
+def test_beyond_a_clip_there_is_its_end(clip: TrackedClip):
+    np.testing.assert_array_equal(clip.truth(-1.0), clip.joints[0])
+    np.testing.assert_array_equal(clip.truth(clip.seconds + 1), clip.joints[-1])
+
+
 def test_who_is_late_at_the_end_gets_the_last_sample(clip: TrackedClip):
     clock = Clock()
     played = source(clip, 60, clock)

@@ -13,12 +13,17 @@ const answers = [];
 for (const { calibrate, height, samples } of parts) {
   const scale = height ? body.height / height : 1;
   const stream = new Stream({ fps: 60, body, scale, run: frame => session.pose(frame) });
-  if (calibrate) stream.calibrate(...calibrate);
+  let refused = null;
+  try {
+    if (calibrate) stream.calibrate(...calibrate);
+  } catch (error) {
+    refused = error.message;
+  }
   const poses = [];
   for (const { trackers, time } of samples) {
     const pose = await stream.step(...trackers, time);
     poses.push({ ...pose, positions: [...pose.positions], rotations: [...pose.rotations], joints: [...pose.joints] });
   }
-  answers.push({ offsets: stream.offsets, poses });
+  answers.push({ offsets: stream.offsets, refused, poses });
 }
 writeFileSync(`${job}.answer`, JSON.stringify(answers));

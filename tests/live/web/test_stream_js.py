@@ -13,6 +13,7 @@ import wearer
 from live.web.conftest import RUN, Made
 from processes import finished
 
+from memmlp.common.errors import InputError
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Pose, Stream
@@ -53,6 +54,13 @@ def jittered(seconds: float, hz: float) -> np.ndarray:
     return times
 
 
+def bursts() -> np.ndarray:
+    """Times of arrival: every fifth sample comes right before the next, just before a frame is due."""
+    times = 100 + np.arange(90) / 60 - 4e-4 * (np.arange(90) > 0)
+    times[3::5] = times[4::5] - 2e-5
+    return times
+
+
 def t_pose() -> list[dict[str, Any]]:
     """Devices that sit crookedly on a person in T-pose who looks to the left."""
     turns = [[0.1, 0.2, 0.05, 1], [0.3, -0.6, 0.2, 1], [-0.2, 0.5, 0.4, 1]]
@@ -84,8 +92,12 @@ PARTS: dict[str, dict[str, Any]] = {
     "lost hands": {"samples": samples(np.arange(144) / 72, {**gone(30, 70, 1), **gone(60, 100, 1, 2)})},
     "lost head": {"samples": samples(np.arange(100) / 60, {**gone(0, 12, 0, 2), **gone(50, 80, 0)})},
     "gaps": {"samples": samples(gaps())},
+    "bursts": {"samples": samples(bursts())},
     "calibrated": {"samples": samples(np.arange(90) / 90), "calibrate": t_pose(), "height": HEIGHT},
 }  # fmt: skip
+
+
+EXCHANGED = {"samples": [], "calibrate": [t_pose()[k] for k in (0, 2, 1)]}
 
 
 def in_python(step: Path, part: dict[str, Any]) -> tuple[Stream, list[Pose]]:
@@ -113,7 +125,7 @@ def answers(site: Made, node: str, tmp_path_factory: pytest.TempPathFactory) -> 
     for name in ("session.js", "stream.js", "trackers.js", "rotations.js", "ort/wasm.js"):
         (page / Path(name).name).write_bytes((site.folder / name).read_bytes())
     job = folder / "job.json"
-    job.write_text(json.dumps({"body": entry["body"], "parts": list(PARTS.values())}))
+    job.write_text(json.dumps({"body": entry["body"], "parts": [*PARTS.values(), EXCHANGED]}))
     command = [
         node,
         HERE / "play.mjs",
@@ -124,7 +136,8 @@ def answers(site: Made, node: str, tmp_path_factory: pytest.TempPathFactory) -> 
         job,
     ]
     finished([str(word) for word in command])
-    return dict(zip(PARTS, json.loads(Path(f"{job}.answer").read_text()), strict=True))
+    names = [*PARTS, "exchanged"]
+    return dict(zip(names, json.loads(Path(f"{job}.answer").read_text()), strict=True))
 
 
 @pytest.mark.parametrize("name", PARTS)
@@ -153,6 +166,15 @@ def test_it_is_python_s_stream(name: str, site: Made, answers: dict[str, Any]):
             (np.array(offsets["rotations"]) * matrix_to_quaternion(stream.offsets.rotations)).sum(1)
         )
         np.testing.assert_allclose(turns, 1, atol=1e-9)
+
+
+def test_exchanged_controllers_are_not_calibrated(site: Made, answers: dict[str, Any]):
+    with pytest.raises(InputError) as refused:
+        in_python(site.step, EXCHANGED)
+    said = answers["exchanged"]["refused"]
+    assert said.endswith("exchanged, or the head's device is mounted backwards")
+    assert said in str(refused.value)
+    assert answers["exchanged"]["offsets"] is None
 
 
 def entry_is_of(site: Made) -> bool:

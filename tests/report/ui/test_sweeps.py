@@ -120,6 +120,33 @@ def test_a_sweep_from_before_has_its_first_arm_as_control_and_says_so(outputs: P
     assert page["table"]["control"] == "none"
 
 
+def test_a_sweep_with_another_control_has_another_table(outputs: Path):
+    """The runs stay as they are: an arm's control, metrics and margins are the sweep's own."""
+    folder = outputs / "sweeps" / "mine"
+    sweeps, sweep = sweeps_of(outputs), kept(folder)
+    assert sweep is not None
+    assert sweeps.page("mine")["table"]["control"] == "none"
+    before = sweeps.stamp()
+    keep(replace(sweep, control="gru", metrics=("MPJRE",)), folder)
+    table = sweeps.page("mine")["table"]
+    assert (table["control"], table["metrics"]) == ("gru", ["MPJRE"])
+    assert sweeps.stamp() != before
+
+
+def test_a_sweep_that_is_planned_anew_has_another_table(outputs: Path):
+    """The same runs under each other's labels, as after a slip in the sweep's file was mended."""
+    sweeps, path = sweeps_of(outputs), outputs / "sweeps" / "mine" / "plan.json"
+    plan, other = Plan.load(path), {"none": "gru", "gru": "none"}
+
+    def effect() -> float:
+        return sweeps.page("mine")["table"]["rows"][1]["cells"]["stream"]["MPJPE"]["effect"]["mean"]
+
+    before = effect()
+    entries = [replace(one, label=other[one.label]) for one in plan.entries]
+    replace(plan, entries=tuple(entries)).save(path)
+    assert effect() == pytest.approx(-before)
+
+
 def looked(outputs: Path) -> Rounds:
     """Take the first look, at the three seeds that there are."""
     folder = outputs / "sweeps" / "mine"

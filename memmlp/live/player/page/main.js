@@ -114,6 +114,7 @@ function tell(frame) {
   $('frames').textContent = frame.number + 1;
   $('foreign').textContent = foreign;
   $('strangers').hidden = !foreign;
+  $('jumping').hidden = !frame.jumping;
   for (const item of $('trackers').children) item.classList.toggle('held', frame.held.includes(item.dataset.name));
   for (const row of document.querySelectorAll('#latency [data-key]')) {
     const timing = history.timing(row.dataset.key);

@@ -11,6 +11,7 @@ export const TRACKERS = ['head', 'left', 'right'];
 const FARTHEST = 1e6; // metres; a tracker farther from the origin is taken as lost
 const UNIT = 1e-2; // how far a quaternion's norm may be from 1
 const APART = 0.1; // metres between the hands, at least, in a T-pose
+const TILTED = Math.PI / 3; // from upright; which way a device that is tilted further looks, nobody knows
 const NEUTRAL = { position: [0, 0, 0], rotation: [0, 0, 0, 1], lost: true };
 
 export class Stream {
@@ -56,7 +57,11 @@ export class Stream {
     const world = devices.map(device => times(device.position, this.scale));
     const across = minus(world[1], world[2]);
     if (Math.hypot(across[0], across[2]) < APART) throw new Error('the hands are not apart; stand in T-pose, the arms to the sides');
-    const pose = tPose(this.body, world[0], Math.atan2(across[2], -across[0]));
+    const heading = Math.atan2(across[2], -across[0]);
+    if (looksBack(devices[0].rotation, heading)) {
+      throw new Error("the head looks backwards as seen from the hands; left and right look exchanged, or the head's device is mounted backwards");
+    }
+    const pose = tPose(this.body, world[0], heading);
     const away = [0, 1, 2].map(axis => mean(world.map((place, i) => place[axis] - pose.positions[i][axis])));
     this.offsets = {
       positions: devices.map((device, i) =>
@@ -96,6 +101,10 @@ export class Stream {
     };
   }
 }
+
+// Whether a head's device looks away from a heading by over 90 degrees. One that is far from upright is not asked.
+const looksBack = (rotation, heading) =>
+  rotate(rotation, [0, 1, 0])[1] > Math.cos(TILTED) && Math.cos(headingOf(rotation) - heading) < 0;
 
 // The heading of a head, radians to the left of -Z.
 export const heading = tracker => headingOf(tracker.rotation);

@@ -11,9 +11,10 @@ const EARLY = 5e-4; // seconds that a frame may be ahead of its sample, for time
 const SAME = 1e-6; // seconds; a sample this near to a frame is taken as the frame
 const WHO = [0, 1, 2];
 
-// The trackers at a time, interpolated between the samples before and after it.
+// The trackers at a time, interpolated between the samples before and after it. At a time after both they are where the
+// second has them: from two samples that came together, speeds can't be told.
 export function between(a, b, time) {
-  const weight = (time - a.time) / (b.time - a.time);
+  const weight = Math.min((time - a.time) / (b.time - a.time), 1);
   return {
     time,
     positions: WHO.map(i => plus(a.positions[i], minus(b.positions[i], a.positions[i]), weight)),

@@ -171,7 +171,7 @@ class Wear {
       mirror.tell(`Calibrated, ${worn.tall.toFixed(2)} m tall.`, 'Pull a trigger or pinch to do it again.');
       worn.tape?.push({ calibrated: worn.stream.offsets, height: worn.tall, at: trackers });
     } catch (error) {
-      mirror.tell('Not calibrated:', error.message, INVITE[0]);
+      mirror.tell('Not calibrated:', ...error.message.split('; '), INVITE[0]);
     }
   }
 
