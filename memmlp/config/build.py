@@ -222,7 +222,7 @@ def build_loss(cfg: DictConfig) -> Callable[[frozenset[str]], Loss]:
             )
         return lambda branches: loss
     term = built(cfg.term) if cfg.term is not None else Term()
-    branches = get_class(cfg.predictor._target_).branches
+    branches: frozenset[str] = get_class(cfg.predictor._target_).branches  # type: ignore[attr-defined]
     if cfg.term is not None and term.branch not in branches:
         lacking = f"looks at the {term.branch} branch, which predictor={cfg.predictor.name} lacks"
         raise InputError(f"term={cfg.term.name}: {lacking}; allowed is a term of {' or '.join(branches)}")
