@@ -9,7 +9,7 @@ The rules apply in this order:
 - **Frames** lie on a grid of 1 / fps from the first sample on. A frame is made as soon as there is a sample
   at or after its time, by interpolation between the samples beside it (positions linearly, rotations by
   slerp). No sample of the future is waited for, and a pose is at most one frame older than the newest sample.
-  A frame that is ahead of its sample, by `EARLY` at most, takes it as it is.
+  A frame that is ahead of its sample, by `EARLY` at most, goes on a little way past it (`FURTHEST`).
   A slow tracker gives several frames at once, a fast one none at some samples, and the rate may change at any
   time.
 - A sample that is not newer than the last one is **ignored**.
@@ -35,6 +35,7 @@ from memmlp.motion.body import (
 GAP = 0.5  # seconds without a sample after which everything begins anew
 RECOVERY = 0.2  # seconds over which a tracker that returns is led to its true pose
 EARLY = 5e-4  # seconds that a frame may be ahead of its sample, for times that are rounded to milliseconds
+FURTHEST = 1.1  # of the way from one sample to the next; two that came together tell no speed
 SAME = 1e-6  # seconds; a sample this near to a frame is taken as the frame
 
 TRACKERS = ("head", "left", "right")
@@ -62,10 +63,10 @@ class TrackerSample(NamedTuple):
 def between(a: TrackerSample, b: TrackerSample, time: float) -> TrackerSample:
     """Return the trackers at a time, interpolated between the samples before and after it.
 
-    At a time after both they are where the second has them: from two samples that came together, speeds can't
-    be told.
+    A time a little after both is taken as of rounded times, but no further than `FURTHEST`: from two samples
+    that came together, speeds can't be told.
     """
-    weight = min((time - a.time) / (b.time - a.time), 1.0)
+    weight = min((time - a.time) / (b.time - a.time), FURTHEST)
     positions = a.positions + weight * (b.positions - a.positions)
     return TrackerSample(time, positions, slerp(a.rotations, b.rotations, weight))
 

@@ -152,7 +152,7 @@ def test_other_rates_and_gaps(play: Player, stream: Stream):
 
 
 def test_samples_that_come_together(play: Player, stream: Stream):
-    """A frame ahead of the second takes it as it is; on the line through both it would be far away."""
+    """A frame ahead of the second goes a tenth further; on the line through both it would be far away."""
     samples = [(max(time - 4e-4, 0.0), *rest) for time, *rest in rows(trackers("unity")[:40])]
     samples[9] = (samples[10][0] - 2e-5, *samples[9][1:])
     np.testing.assert_allclose(play(samples), poses(stream, samples), atol=1e-4)

@@ -134,7 +134,7 @@ namespace Memmlp
             bool any = false;
             for (; nextFrame <= time + Early; nextFrame += FrameTime, any = true)
             {
-                float weight = last == null ? 1 : (float)Math.Min(1, (nextFrame - lastTime) / (time - lastTime));
+                float weight = last == null ? 1 : (float)Math.Min(1.1, (nextFrame - lastTime) / (time - lastTime));
                 body.Step(Between(last ?? newest, newest, weight));
             }
             last = newest;

@@ -8,13 +8,14 @@ import { aboutVertical, headingOf, IDENTITY, inverse, minus, multiply, plus, rot
 export const GAP = 0.5; // seconds without a sample after which everything begins anew
 export const RECOVERY = 0.2; // seconds over which a tracker that returns is led to its true pose
 const EARLY = 5e-4; // seconds that a frame may be ahead of its sample, for times that are rounded to milliseconds
+const FURTHEST = 1.1; // of the way from one sample to the next; two that came together tell no speed
 const SAME = 1e-6; // seconds; a sample this near to a frame is taken as the frame
 const WHO = [0, 1, 2];
 
-// The trackers at a time, interpolated between the samples before and after it. At a time after both they are where the
-// second has them: from two samples that came together, speeds can't be told.
+// The trackers at a time, interpolated between the samples before and after it. A time a little after both is taken as of
+// rounded times, but no further than FURTHEST: from two samples that came together, speeds can't be told.
 export function between(a, b, time) {
-  const weight = Math.min((time - a.time) / (b.time - a.time), 1);
+  const weight = Math.min((time - a.time) / (b.time - a.time), FURTHEST);
   return {
     time,
     positions: WHO.map(i => plus(a.positions[i], minus(b.positions[i], a.positions[i]), weight)),
