@@ -13,6 +13,7 @@ from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.coordinates import World
 from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.normalizer import Normalizer
+from memmlp.networks.baselines.sage import LATENT, ProductQuantiser
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import Learned, MotionModel
 from memmlp.networks.refiner import SAGERefiner
@@ -25,6 +26,12 @@ from memmlp.training.train_network import MotionTask
 from memmlp.training.train_refiner import RefinerTask, RefinerTraining, sage_loss
 from memmlp.training.train_sage import PARTS, DroppingOptim, PartTask
 from memmlp.training.train_vqvae import VQVAETask
+
+
+ROUNDED = ("quantiser.vectors", "key.bias")
+"""Parameters that processors' rounding moves: the nearest of almost equal codes, and the biases of attention's
+keys, whose gradient is 0 but for rounding. `parts` sees codes that are far apart by themselves.
+"""
 
 
 def frames() -> MotionDataset:
@@ -51,7 +58,8 @@ def _trained(task: VQVAETask | MotionTask | RefinerTask | PartTask, optim: Optim
         average.update(step + 1)
         found |= {f"{name} {step}": float(term.detach()) for name, term in result.terms.items()}
     average.put_in_place()
-    weights = torch.cat([p.detach().flatten() for p in task.module.parameters()])
+    named = task.module.named_parameters()
+    weights = torch.cat([p.detach().flatten() for name, p in named if not name.endswith(ROUNDED)])
     return found | summary("weights", weights)
 
 
@@ -108,11 +116,18 @@ def refiner() -> Numbers:
 
 
 def parts() -> Numbers:
-    """Three steps of each of SAGE-Net's parts that has a training of its own, and its errors then."""
+    """Three steps of each of SAGE-Net's parts that has a training of its own, and its errors then.
+
+    The codes are moved towards latents that are far from each other.
+    """
     optim = DroppingOptim(steps=3, batch=4, lr=1e-2, drops=(0.5,), drop=0.25)
-    found = {}
+    torch.manual_seed(4)
+    quantiser = ProductQuantiser()
+    for _ in range(3):
+        quantiser(torch.randn(5, LATENT))
+    found = summary("codes moved", quantiser.vectors) | summary("codes used", quantiser.usage)
     for kind in PARTS[:-1]:
         task = part_task(kind, optim)
         numbers = _trained(task, optim) | task.validate()
-        found |= {f"{kind} {name}": value for name, value in numbers.items()}
+        found |= {f"{kind} {name}": value for name, value in numbers.items() if name != "codebook"}
     return found

@@ -124,16 +124,18 @@ def build_upstream(cfg: DictConfig, config: dict[str, Any]) -> tuple[UpstreamTra
     if cfg.memory is None or not memory_class(cfg).uses_codes:
         return ()
     codes = {"frame": config["frame"], "vqvae": config["vqvae"]}
-    return (VQVAETraining(codes, seed=cfg.vqvae.seed, optim=partial(build_vqvae_optim, cfg)),)
+    codes |= {"data": {"mirror": True}} if cfg.data.mirror else {}
+    optim = partial(build_vqvae_optim, cfg)
+    return (VQVAETraining(codes, seed=cfg.vqvae.seed, optim=optim, mirror=cfg.data.mirror),)
 
 
 def build_training(cfg: DictConfig, metrics: dict[str, OwnMetric]) -> NetworkTraining | RefinerTraining:
     """Build how a checked config's network is trained, or the refiner behind it."""
     common = {"seed": cfg.seed, "optim": built(cfg.optim), "weighting": cfg.data.weighting}
-    common |= {"shares": shares(cfg.data), "metrics": metrics}
+    common |= {"shares": shares(cfg.data), "mirror": cfg.data.mirror, "metrics": metrics}
     if cfg.refiner is not None:
         return RefinerTraining(refiner=built(cfg.refiner), **common)
-    return NetworkTraining(loss=build_loss(cfg), rollout=built(cfg.rollout), mirror=cfg.data.mirror, **common)
+    return NetworkTraining(loss=build_loss(cfg), rollout=built(cfg.rollout), **common)
 
 
 def untrained(overrides: Sequence[str]) -> MotionModel:

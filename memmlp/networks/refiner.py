@@ -79,6 +79,11 @@ class Refined(MotionModel):
         """Whether the network has no window: this one corrects a stream."""
         return True
 
+    def count_parameters(self) -> int:
+        """Return how many parameters the network uses, with those of the refiner."""
+        own = (p.numel() for part in (self.layers, self.head) for p in part.parameters())
+        return self.network.count_parameters() + sum(own)
+
     @property
     def length(self) -> int:
         """How many past frames of inputs the network's buffer holds."""

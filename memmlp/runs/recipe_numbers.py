@@ -49,7 +49,7 @@ RECIPES: dict[str, int] = {
     "codebook.gradient": 1,
     # how they are trained (memmlp.training)
     "sampler": 1,
-    "mirror": 1,
+    "mirror": 2,
     "training": 1,
     "schedule.step": 1,
     "schedule.cosine": 1,

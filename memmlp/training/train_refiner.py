@@ -13,6 +13,7 @@ from memmlp.evaluation import modes
 from memmlp.evaluation.metrics import OwnMetrics
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset, WindowSampler
+from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.motion_source import Prepared
 from memmlp.networks import checkpoint
 from memmlp.networks.architecture import Architecture, RefinedArchitecture
@@ -51,6 +52,7 @@ class RefinerTraining:
         optim: steps, learning rates and intervals; a batch is of pieces.
         weighting: how pieces are drawn, "frames" or "clips" (see WindowSampler).
         shares: how often a piece is of each source (see WindowSampler).
+        mirror: whether half of the pieces are mirrored (see MirroredDataset).
         metrics: metrics of one's own, measured at validations.
     """
 
@@ -59,6 +61,7 @@ class RefinerTraining:
     optim: Optim
     weighting: str
     shares: Mapping[str, float] | None = None
+    mirror: bool = False
     metrics: OwnMetrics = field(default_factory=dict)
 
     def train(
@@ -85,7 +88,8 @@ class RefinerTraining:
         """
         assert isinstance(architecture, RefinedArchitecture)
         assert upstream is not None
-        dataset = data.open("train").to(device)
+        plain = data.open("train").to(device)
+        dataset = MirroredDataset(plain) if self.mirror else plain
         finished = architecture.network.load(upstream).to(device).requires_grad_(False)
         torch.manual_seed(self.seed)
         model = self.refiner.around(finished).to(device)

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from memmlp.common import distributed
 from memmlp.motion.dataset import MotionDataset, WindowSampler
+from memmlp.motion.mirror import MirroredDataset
 from memmlp.motion.motion_source import Prepared
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks import checkpoint
@@ -30,11 +31,13 @@ class VQVAETraining:
         config: the part of the resolved config that determines the result.
         seed: seed of its weights and batches.
         optim: returns the optimisation, given the number of training frames.
+        mirror: whether half of the training frames are mirrored (see MirroredDataset).
     """
 
     config: dict[str, Any]
     seed: int
     optim: Callable[[int], Optim]
+    mirror: bool = False
     kind: ClassVar[str] = "vqvae"
     told: ClassVar[str] = "VQ-VAE: train it, whose code-vectors the network's memory uses"
 
@@ -59,7 +62,8 @@ class VQVAETraining:
         normalizer = architecture.normalizer(data.manifest, dataset.frames).to(device)
         model = architecture.vqvae().to(device)
         optim = self.optim(len(dataset.frames))
-        task = VQVAETask(model, normalizer, dataset, validation, optim, self.seed)
+        shown = MirroredDataset(dataset) if self.mirror else dataset
+        task = VQVAETask(model, normalizer, shown, validation, optim, self.seed)
         train(task, optim, run, self.seed, "VQ-VAE")
         if distributed.first():
             checkpoint.write(run.model, checkpoint.module_tensors("model", model), {})
