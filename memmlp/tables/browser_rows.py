@@ -165,10 +165,15 @@ def _costs(row: Mapping[str, Any]) -> dict[str, float | None]:
 
 def _told(measured: BrowserBench) -> list[str]:
     """Say how the rows were measured."""
-    about, first = measured.about, measured.rows[0]
-    clock = f"a clock of {about['clock_ms']:.2g} ms"
-    how = f"{first['threads']} thread, the median of {first['steps']} steps, {clock}"
+    about, clock = measured.about, f"a clock of {measured.about['clock_ms']:.2g} ms"
+    threads, steps = (_values(measured, key) for key in ("threads", "steps"))
+    how = f"{threads} thread{'s' * (threads != '1')}, the median of {steps} steps, {clock}"
     return [
         f"{measured.name}: onnxruntime-web {about['onnxruntime_web']}, {how}, {about['date'][:10]}; a whole "
         "pose is by the full graph; differences are from AvatarPoser as published, there on the same backend"
     ]
+
+
+def _values(measured: BrowserBench, key: str) -> str:
+    """Return the counts that the rows have under a key: one number, or all of them where rows differ."""
+    return " or ".join(map(str, sorted({int(row[key]) for row in measured.rows})))

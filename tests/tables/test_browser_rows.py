@@ -60,6 +60,13 @@ def test_they_stand_below_the_table_s_own_with_device_and_browser(tmp_path: Path
     assert "onnxruntime-web 1.2.3, 1 thread, the median of 500 steps" in shown.flags[-1]
 
 
+def test_rows_of_several_threads_or_lengths_are_not_said_to_be_like_the_first(tmp_path: Path):
+    rows = [ROW, OURS | {"threads": 4, "steps": 200}]
+    table = without_runs(find_sweep("17", ()), ("stream",), "nothing measured")
+    shown = with_rows(table, read(written(tmp_path, FILE | {"rows": rows})))
+    assert "1 or 4 threads, the median of 200 or 500 steps" in shown.flags[-1]
+
+
 def test_another_backend_s_rows_are_not_compared_with_this_one_s(tmp_path: Path):
     rows = [ROW, OURS | {"backend": "webgpu"}]
     table = without_runs(find_sweep("17", ()), ("stream",), "nothing measured")
