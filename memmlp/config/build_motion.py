@@ -21,8 +21,8 @@ from memmlp.motion.preparing.splits import MixedSplit, SeededSplit, Split
 def build_motion(cfg: DictConfig) -> MotionSource:
     """Build the source of an experiment's motion.
 
-    A synthetic folder's name holds its length and seed, or the settings of a generator of one's own, so that
-    other settings never find stale files.
+    A synthetic folder's name holds its length and seed, or the path and settings of a generator of one's own,
+    so that other settings and other generators never find stale files.
 
     Raises:
         InputError: if a list of groups can't be read, two folders of a list have one name, or there is no
@@ -32,9 +32,10 @@ def build_motion(cfg: DictConfig) -> MotionSource:
     root, split = _clips(data)
     generate: Callable[[Path], object] | None = None
     if data.synth is not None and "_target_" in data.synth:
+        path = str(data.synth._target_)
         settings = {str(key): value for key, value in data.synth.items() if key != "_target_"}
-        root = Path(data.root) / "-".join(f"{key}{value}" for key, value in settings.items())
-        generate = partial(located(data.synth._target_, "data.synth"), **settings)
+        root = Path(data.root) / "-".join([path, *(f"{key}{value}" for key, value in settings.items())])
+        generate = partial(located(path, "data.synth"), **settings)
     elif data.synth is not None:
         root = Path(data.root) / f"{data.synth.minutes:g}min-seed{data.synth.seed}"
         generate = partial(_synthesize, minutes=data.synth.minutes, seed=data.synth.seed)

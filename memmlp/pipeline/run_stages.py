@@ -24,6 +24,7 @@ from memmlp.evaluation.predictions import save_predictions
 from memmlp.live.latency import measure_pose
 from memmlp.motion.motion_source import Prepared
 from memmlp.motion.preparing.amass import divided_subjects
+from memmlp.motion.preparing.groups import unfitting
 from memmlp.motion.preparing.manifest import ClipRecord
 from memmlp.pipeline.devices import described
 from memmlp.pipeline.experiment import Experiment, UpstreamTraining
@@ -89,7 +90,8 @@ def run_experiment(experiment: Experiment, watch: Watch = unwatched) -> Outcome:
     data = experiment.data.prepare()
     clips = data.manifest.clips
     tell(f"data: {len(clips)} clips ({of_tests(clips)}), prepared in {data.cache}")
-    if said := of_subjects(experiment.config["data"], clips):
+    untied = unfitting(data.manifest.split, [clip.name for clip in clips])
+    for said in filter(None, (of_subjects(experiment.config["data"], clips), untied)):
         tell(f"data: {said}")
     run = Run.of(experiment.outputs, experiment.identity(data.digest).id)
     if not run.done:

@@ -256,6 +256,9 @@ from memmlp.config.schema.rules import target
 def walks(folder, minutes, seed):
     (folder / f"{minutes} {seed}").touch()
 
+def runs(folder, minutes, seed):
+    pass
+
 @dataclass
 class Walks(SynthConfig):
     _target_: str = target("mine.walks")
@@ -278,12 +281,16 @@ def test_a_data_source_of_ones_own(folder: Path):
     write(folder, {"mine/__init__.py": WALKS, "mine/conf/data/walks.yaml": WALKS_YAML})
     cfg = composed(["plugins=[mine]", "data=walks", "data.synth.minutes=2", "data.synth.seed=3"])
     source = build_motion(cfg)
-    assert source.source.root == Path("made/minutes2.0-seed3")
+    assert source.source.root == Path("made/mine.walks-minutes2.0-seed3")
     source.generate(folder)
     assert (folder / "2.0 3").exists()
     config = build_experiment(cfg).config
     assert config["plugins"] == ["mine"]
     assert restored(config).data == cfg.data
+    cfg.data.synth._target_ = "mine.runs"  # the same settings, but other motion
+    other = build_motion(cfg)
+    assert other.source.root == Path("made/mine.runs-minutes2.0-seed3")
+    assert other.cache != source.cache
 
 
 def test_an_executor_of_ones_own(folder: Path):

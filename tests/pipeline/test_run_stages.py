@@ -273,6 +273,7 @@ def test_a_single_group_of_test_clips_is_told_to_decide_nothing():
     [
         (("CMU/01/a", "CMU/01/b", "KIT/3/a", "KIT/3/b"), {}, "clips of CMU/01 and 1 more are in"),
         (("BMLrub/BioMotionLab_NTroje/7/a", "BMLrub/BioMotionLab_NTroje/7/b"), {}, "clips of BioMotion"),
+        (("amass/CMU/01/a", "amass/CMU/01/b"), {}, "clips of CMU/01 are in"),
         (("CMU/01/a", "CMU/02/b"), {}, None),
         (("CMU/a", "CMU/b", "mine/01/a", "mine/01/b"), {}, None),
         (("CMU/01/a", "CMU/01/b"), {"split": {"folder": "LISTS"}}, None),

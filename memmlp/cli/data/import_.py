@@ -26,6 +26,7 @@ from memmlp.common.errors import InputError
     metavar="auto|none|METRES",
     help="auto puts the lowest stable contact of the feet at 0; METRES is the floor's height in the files.",
 )
+@click.option("--up", type=click.Choice(["y", "z"]), help="The files' up axis; by default the map's.")
 @click.option(
     "--take", multiple=True, metavar="REGEX", help="Clips that match alike share one floor; repeatable."
 )
@@ -38,6 +39,7 @@ def import_(
     skeleton: str | None,
     fps: tuple[str, ...],
     ground: str,
+    up: str | None,
     take: tuple[str, ...],
     body: str,
     strict: bool,
@@ -50,7 +52,8 @@ def import_(
     """
     from memmlp.motion.importing.folder import ImportSettings, import_folder
 
-    how = ImportSettings(skeleton, dict(map(_rate, fps)), body, _height(ground), take, strict, sound)
+    rates = dict(map(_rate, fps))
+    how = ImportSettings(skeleton, rates, body, _height(ground), take, strict, sound, up)
     report = import_folder(source, out, how)
     for note in report.notes:
         click.echo(f"note: {note}")

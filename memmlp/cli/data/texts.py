@@ -13,6 +13,7 @@ from rich.table import Table
 from memmlp.common.errors import one_line
 from memmlp.motion.body import FPS
 from memmlp.motion.preparing.folders import source_of
+from memmlp.motion.preparing.groups import unfitting
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -42,6 +43,8 @@ def show_manifest(manifest: Manifest) -> None:
         f"{len(manifest.clips)} clips; skipped {len(manifest.skipped)}, left out by the split {left_out}, "
         f"listed but missing {len(manifest.missing)}; body {manifest.body}"
     )
+    if said := unfitting(manifest.split, [clip.name for clip in manifest.clips]):
+        click.echo(said)
     if not manifest.coverage.whole:
         click.echo(f"{manifest.coverage}: {manifest.coverage.gaps}")
 

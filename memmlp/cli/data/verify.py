@@ -16,8 +16,9 @@ from memmlp.cli.options import PATH
 @click.argument("source", type=PATH)
 @click.option("--skeleton", help="A shipped joint map or the path of one.")
 @click.option("--body", default="builtin", show_default=True, help="builtin, or an SMPL-H model.npz.")
+@click.option("--up", type=click.Choice(["y", "z"]), help="The files' up axis; by default the map's.")
 @click.option("--all", "every", is_flag=True, help="Show every file and not only those with faults.")
-def verify(source: Path, skeleton: str | None, body: str, every: bool) -> None:
+def verify(source: Path, skeleton: str | None, body: str, up: str | None, every: bool) -> None:
     """Check imports against the files themselves.
 
     Each file is imported, and what would be kept is compared with the file's own joints: "worst mm" is the
@@ -35,7 +36,7 @@ def verify(source: Path, skeleton: str | None, body: str, every: bool) -> None:
         table.add_column(name, justify="right")
     table.add_column("at")
     sound, bad, worst = 0, [], (0.0, 0.0)
-    for row in verify_folder(source, skeleton=skeleton, body=body):
+    for row in verify_folder(source, skeleton=skeleton, body=body, up=up):
         if isinstance(row, Unusable):
             bad.append(f"{row.name}: {row.reason}")
             continue

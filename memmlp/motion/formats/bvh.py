@@ -11,6 +11,7 @@ import re
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from decimal import Decimal
 from pathlib import Path
 from typing import NoReturn
 
@@ -29,6 +30,8 @@ MAX_HEAD = 2**22  # bytes before MOTION
 MAX_LINE = 200_000  # bytes
 MAX_VALUES = 2**24  # in all frames: 25 minutes of 93 channels at 120 Hz
 RATE_DIGITS = 1e-4  # relative: 1 / 0.00833333 s is 120 Hz, as the header has no more digits
+USUAL_RATES = (15, 24, 25, 30, 48, 50, 60, 72, 75, 90, 100, 120, 144, 150, 180, 200, 240, 300)  # Hz
+COARSEST = 0.05  # relative rounding of a frame time that still means one of them: two digits
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,7 @@ class Bvh:
         ends: the E end sites.
         frame_time: seconds between frames.
         values: channel values (N, C), degrees and the file's unit.
+        rounding: half of the last digit that the header has of the frame time, seconds.
     """
 
     path: Path
@@ -69,6 +73,7 @@ class Bvh:
     ends: tuple[EndSite, ...]
     frame_time: float
     values: np.ndarray
+    rounding: float = 0.0
 
     def __len__(self) -> int:
         return len(self.values)
@@ -85,9 +90,12 @@ class Bvh:
 
     @property
     def fps(self) -> float:
-        """Frames per second; a whole number where the header's few digits mean one."""
+        """Frames per second: a whole number, or else a usual rate, where the header's few digits mean one."""
         rate = 1 / self.frame_time
-        return float(round(rate)) if abs(rate - round(rate)) <= RATE_DIGITS * rate else rate
+        if abs(rate - round(rate)) <= RATE_DIGITS * rate:
+            return float(round(rate))
+        off, usual = min((abs(1 / usual - self.frame_time), float(usual)) for usual in USUAL_RATES)
+        return usual if off <= self.rounding <= COARSEST * self.frame_time else rate
 
     def zero_pose(self) -> np.ndarray:
         """Return positions (J+E, 3) of the nodes with all rotations zero and the root at the origin."""
@@ -175,7 +183,7 @@ def read_bvh(path: Path) -> Bvh:
     """
     lines = _lines(path)
     hierarchy = _Hierarchy(_Words(path, _head(path, lines)))
-    frame_time, values = _motion(path, lines, sum(map(len, hierarchy.channels)))
+    frame_time, rounding, values = _motion(path, lines, sum(map(len, hierarchy.channels)))
     return Bvh(
         path=path,
         names=tuple(hierarchy.names),
@@ -185,6 +193,7 @@ def read_bvh(path: Path) -> Bvh:
         ends=tuple(hierarchy.ends),
         frame_time=frame_time,
         values=values,
+        rounding=rounding,
     )
 
 
@@ -344,8 +353,8 @@ class _Hierarchy:
         return name
 
 
-def _motion(path: Path, lines: Iterator[tuple[int, bytes]], width: int) -> tuple[float, np.ndarray]:
-    """Read frame time and values (N, width) from the lines after MOTION; blank lines do not count."""
+def _motion(path: Path, lines: Iterator[tuple[int, bytes]], width: int) -> tuple[float, float, np.ndarray]:
+    """Read frame time, its rounding and values (N, width) from the lines after MOTION, but for blank ones."""
     rows = ((number, line) for number, line in lines if line.strip())
     first, second = next(rows, None), next(rows, None)
     if first is None or second is None or width == 0:
@@ -365,7 +374,8 @@ def _motion(path: Path, lines: Iterator[tuple[int, bytes]], width: int) -> tuple
     if len(values) != int(frames) * width:
         wrong = f"Frames: {int(frames)}, but {len(values) // width} lines of values follow"
         _fail(path, first[0], wrong, "one line for each frame")
-    return seconds, np.array(values).reshape(-1, width)
+    rounding = 0.5 * 10.0 ** int(Decimal(word).as_tuple().exponent)
+    return seconds, rounding, np.array(values).reshape(-1, width)
 
 
 def _header(path: Path, number: int, line: bytes, key: str) -> str:

@@ -1,4 +1,9 @@
-"""A recording's unit and up axis: as its skeleton's map tells them, or found from the person in it."""
+"""A recording's unit and up axis: as its skeleton's map tells them, or found from the person in it.
+
+Up is where the zero pose has the head, if that is a person who stands, whoever lies in the motion. Where the
+motion has the head along the other axis, two things may be meant, and it has to be told which: a person who
+lies all the time, or one who walks while the root's rotation alone has the other axis up.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +13,14 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import HEAD, JOINTS
-from memmlp.motion.importing.anatomy import LEGS
+from memmlp.motion.importing.anatomy import LEGS, why_no_stance
 from memmlp.motion.importing.recording import Recording
-from memmlp.motion.importing.skeleton import SkeletonMap
+from memmlp.motion.importing.skeleton import REQUIRED, UPRIGHT, SkeletonMap
 
 UNITS = (1.0, 0.1, 0.0254 / 0.45, 0.0254, 0.01, 0.001)  # metres; 0.0254 / 0.45 is CMU's inch
 LEG = (0.55, 1.15)  # metres from hip to ankle, by which a unit is found
 TOLD_LEG = (0.3, 1.5)  # metres that a told unit may give: children, giants
+TELL = "--up y or z, or up in the skeleton's map"
 MOST_UPRIGHT = 0.5  # how much of the way from pelvis to head lies along the up axis on average, to be found
 
 
@@ -36,7 +42,7 @@ def settle(recording: Recording, skeleton: SkeletonMap) -> SkeletonMap:
         return skeleton
     return replace(
         skeleton,
-        up=skeleton.up or _up(recording, positions[:, at["head"]] - positions[:, at["pelvis"]]),
+        up=skeleton.up or _up(recording, positions[:, at["head"]] - positions[:, at["pelvis"]], at),
         unit=_unit(recording, skeleton, _leg(positions, at)),
     )
 
@@ -63,13 +69,30 @@ def _unit(recording: Recording, skeleton: SkeletonMap, leg: float) -> float:
     return min(fitting, key=lambda unit: abs(leg * unit - 0.85))
 
 
-def _up(recording: Recording, trunk: np.ndarray) -> str:
-    """Return the axis, `y` or `z`, along which the way from pelvis to head (N, 3) leads."""
+def _up(recording: Recording, trunk: np.ndarray, at: dict[str, int]) -> str:
+    """Return the axis, `y` or `z`, that is up in a file with the ways from pelvis to head (N, 3)."""
     mean = (trunk / np.linalg.norm(trunk, axis=-1, keepdims=True).clip(1e-9)).mean(0)
-    axis = "y" if mean[1] >= mean[2] else "z"
-    if max(mean[1], mean[2]) < MOST_UPRIGHT:
+    along = dict(zip("yz", mean[1:].tolist(), strict=True))
+    moving = max(along, key=lambda axis: along[axis])
+    standing = _standing(recording, at)
+    if along[moving] >= MOST_UPRIGHT and standing in (None, moving):
+        return moving
+    if standing is None or along[standing] <= -MOST_UPRIGHT:
         wrong = f"the head is along ({mean[0]:.2f}, {mean[1]:.2f}, {mean[2]:.2f}) from the pelvis on average"
-        raise InputError(
-            f"{recording.path}: {wrong}, so no up axis is found; allowed: up in the skeleton's map"
-        )
-    return axis
+        raise InputError(f"{recording.path}: {wrong}, so no up axis is found; allowed: {TELL}")
+    if along[moving] >= MOST_UPRIGHT:
+        wrong = f"the person stands along {standing} in the zero pose, but along {moving} in the motion"
+        either = f"--up {standing} if the person lies, else --up {moving}"
+        raise InputError(f"{recording.path}: {wrong}; allowed: {TELL}: {either}")
+    return standing
+
+
+def _standing(recording: Recording, at: dict[str, int]) -> str | None:
+    """Return the axis along which the person stands in the zero pose; None where that is no stance."""
+    if not set(REQUIRED) <= set(at):
+        return None
+    zero, pose = recording.zero_pose(), np.zeros((len(JOINTS), 3))
+    for joint, node in at.items():
+        pose[JOINTS.index(joint)] = zero[node]
+    turned = {axis: pose @ rotation.T for axis, rotation in UPRIGHT.items()}
+    return next((axis for axis in turned if why_no_stance(turned[axis]) is None), None)

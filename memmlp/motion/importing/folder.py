@@ -97,6 +97,7 @@ class ImportSettings:
             floor.
         strict: whether a bad file raises; otherwise it is skipped and reported.
         sound: whether a clip with faults is skipped, too; otherwise it is written and its faults are told.
+        up: the files' up axis, `y` or `z`; None leaves it to the map.
     """
 
     skeleton: str | None = None
@@ -106,6 +107,7 @@ class ImportSettings:
     takes: Sequence[str] = ()
     strict: bool = False
     sound: bool = False
+    up: str | None = None
 
 
 def import_folder(source: Path, out: Path, how: ImportSettings | None = None) -> ImportReport:
@@ -134,7 +136,7 @@ def import_folder(source: Path, out: Path, how: ImportSettings | None = None) ->
         for relative, path in progress_bar(files.items(), "import", len(files)):
             try:
                 recording = read_recording(path)
-                skeleton = find_skeleton(recording, chosen)
+                skeleton = find_skeleton(recording, chosen).with_up(how.up)
                 clips.append(_import_file(recording, relative, folder, skeleton, how, rest, source))
                 maps[skeleton.name] = skeleton
             except InputError as error:

@@ -18,6 +18,7 @@ from memmlp.motion.importing.recording import Recording
 
 SKELETONS = Path(__file__).parent / "skeletons"
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # Y-up axes to the world's: y becomes z
+UPRIGHT = {"y": np.eye(3), "z": Z_UP.T}  # up axis of a file -> rotation from its axes to Y-up axes
 REQUIRED = (
     "pelvis", "head", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle",
     "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
@@ -49,10 +50,14 @@ class SkeletonMap:
     rest: str | int | dict[str, list[float]] = FOUND
     note: str = ""
 
+    def with_up(self, up: str | None) -> SkeletonMap:
+        """Return the map with an up axis, `y` or `z`, that a person told; None leaves it as it is."""
+        return self if up is None else replace(self, up=up)
+
     @property
     def upright(self) -> np.ndarray:
         """The rotation (3, 3) from the file's axes to Y-up axes; the up axis is known by now."""
-        return {"y": np.eye(3), "z": Z_UP.T}[str(self.up)]
+        return UPRIGHT[str(self.up)]
 
 
 def shipped_skeletons() -> tuple[str, ...]:

@@ -38,6 +38,7 @@ def verify(
     body: str = "builtin",
     name: str | None = None,
     floor: str | float = AUTO,
+    up: str | None = None,
 ) -> Fidelity:
     """Import a file, read the npz that came of it, and compare it with the file.
 
@@ -47,12 +48,13 @@ def verify(
         body: `builtin`, or an SMPL-H model.npz.
         name: the name to report; by default the file's.
         floor: as `convert` has it.
+        up: the file's up axis, `y` or `z`; None leaves it to the map.
 
     Raises:
         InputError: if the file is damaged or fits no map.
     """
     recording, rest = read_recording(path), load_rest_joints(body)
-    chosen = find_skeleton(recording, load_skeleton(skeleton) if skeleton else None)
+    chosen = find_skeleton(recording, load_skeleton(skeleton) if skeleton else None).with_up(up)
     with one_thread():
         converted = convert(recording, chosen, rest, name=name or path.name, floor=floor)
     with tempfile.TemporaryDirectory() as folder:
@@ -62,7 +64,12 @@ def verify(
 
 
 def verify_folder(
-    source: Path, *, skeleton: str | None = None, body: str = "builtin", floor: str | float = AUTO
+    source: Path,
+    *,
+    skeleton: str | None = None,
+    body: str = "builtin",
+    floor: str | float = AUTO,
+    up: str | None = None,
 ) -> Iterator[Fidelity | Unusable]:
     """Verify each file of a folder, or a single one.
 
@@ -76,6 +83,6 @@ def verify_folder(
     for relative, path in progress_bar(files.items(), "verify", len(files)):
         name = relative.as_posix()
         try:
-            yield verify(path, skeleton=skeleton, body=body, name=name, floor=floor)
+            yield verify(path, skeleton=skeleton, body=body, name=name, floor=floor, up=up)
         except InputError as error:
             yield Unusable(name, str(error).replace(f"{path}: ", ""))

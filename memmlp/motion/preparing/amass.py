@@ -4,7 +4,7 @@ Three namings are known. The first SMPL+H release has folders like `BioMotionLab
 files that end in `_poses`. Later downloads call the folders `BMLrub` and `HDM05`. The SMPL-X release has
 those folders, files that end in `_stageii`, and `_` where a name had a blank. BABEL's paths, and archives
 that are unpacked each into a folder of its own, have the subset's folder twice, as in
-`BMLrub/BioMotionLab_NTroje/...`.
+`BMLrub/BioMotionLab_NTroje/...`, or in a folder of any other name, as in `archive-1/CMU/...`.
 """
 
 from __future__ import annotations
@@ -34,18 +34,6 @@ def subset(name: str) -> str:
     return RENAMED.get(top, top)
 
 
-def unpacked(name: str) -> str:
-    """Return a clip's name without the folder of an archive around the folder of the subset itself."""
-    archive, _, rest = name.partition("/")
-    return rest if rest.count("/") and subset(archive) == subset(rest) else name
-
-
-def clip_key(name: str) -> str:
-    """Return what is equal for all names of one clip, whichever release they are from, but for case."""
-    _, _, rest = unpacked(name).partition("/")
-    return f"{subset(unpacked(name))}/{SUFFIX.sub('', rest.replace(' ', '_'))}"
-
-
 S2_TRAIN = (
     "CMU", "MPI_Limits", "TotalCapture", "Eyes_Japan_Dataset", "KIT", "BioMotionLab_NTroje", "BMLmovi",
     "EKUT", "ACCAD", "MPI_mosh", "SFU", "MPI_HDM05",
@@ -57,6 +45,30 @@ AMASS = frozenset(map(subset, (*S2_TRAIN, *S2_TEST)))
 """The subsets of protocol S2 as `subset` names them."""
 
 
+FOLDERS = frozenset((
+    *S2_TRAIN, *S2_TEST, "PosePrior", "EyesJapanDataset", "BMLrub", "MoSh", "HDM05", "Transitions",
+    "DFaust_67", "DFaust", "DanceDB", "SSM_synced", "SSM", "TCD_handMocap", "TCDHands", "BMLhandball", "CNRS",
+    "GRAB", "HUMAN4D", "MOYO", "SOMA", "WEIZMANN",
+))  # fmt: skip
+"""The subsets' folders as the releases spell them, by which one is told in a folder of another name."""
+
+
+def unpacked(name: str) -> str:
+    """Return a clip's name without the folders of archives around the folder of the subset itself."""
+    archive, _, rest = name.partition("/")
+    if "/" not in rest:
+        return name
+    twice = subset(archive) == subset(rest)
+    within = archive not in FOLDERS and rest.split("/")[0] in FOLDERS and rest.count("/") > 1
+    return unpacked(rest) if twice or within else name
+
+
+def clip_key(name: str) -> str:
+    """Return what is equal for all names of one clip, whichever release they are from, but for case."""
+    _, _, rest = unpacked(name).partition("/")
+    return f"{subset(unpacked(name))}/{SUFFIX.sub('', rest.replace(' ', '_'))}"
+
+
 def divided_subjects(parts: Iterable[tuple[str, str]]) -> list[str]:
     """Return AMASS' subjects, SUBSET/SUBJECT, of whom clips are both in training and in test.
 
@@ -66,6 +78,6 @@ def divided_subjects(parts: Iterable[tuple[str, str]]) -> list[str]:
     found: dict[str, set[str]] = defaultdict(set)
     for name, part in parts:
         folders = unpacked(name).split("/")[:-1]
-        if len(folders) >= 2 and subset(name) in AMASS:
+        if len(folders) >= 2 and subset(folders[0]) in AMASS:
             found["/".join(folders[:2])].add(part)
     return sorted(subject for subject, of in found.items() if {"train", "test"} <= of)

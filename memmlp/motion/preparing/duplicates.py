@@ -1,10 +1,11 @@
 """Clips of the same frames: never in two parts of a split, and one group.
 
-They are told by their frames, so a file that was saved again is one, too; clips without any motion are not
-told apart, and so are no copies. Where the split divides whatever there is, copies are drawn together, like
-any group. Where it is a published list that has them in several parts, those in training give way to those in
-validation, and both to those in testing: the test set stays as published, and nothing in it was seen. Copies
-within one part stay, as the list has them; statistics count their group once.
+They are told by their frames, so a file that was saved again is one, too, and so is one at another frame rate
+(`resampled_copies`); clips without any motion are not told apart, and so are no copies. Where the split
+divides whatever there is, copies are drawn together, like any group. Where it is a published list that has
+them in several parts, those in training give way to those in validation, and both to those in testing: the
+test set stays as published, and nothing in it was seen. Copies within one part stay, as the list has them;
+statistics count their group once.
 """
 
 from __future__ import annotations

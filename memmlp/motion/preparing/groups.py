@@ -14,8 +14,10 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from memmlp.common.errors import InputError
+from memmlp.motion.preparing.amass import unpacked
 
 COLUMNS = ("clip", "group")
 KEY = "data.split.groups_file"
@@ -101,6 +103,23 @@ class Grouping:
         """Map each clip to its group's name: the column file's, or else that of the first clip in it."""
         rows = self.rows or {}
         return {name: rows.get(group[0], group[0]) for group in self.tied(seen) for name in group}
+
+
+def unfitting(split: Mapping[str, Any], names: Collection[str]) -> str:
+    """Say that a split has patterns of which none fits a clip, so that they tie none; empty otherwise.
+
+    Args:
+        split: the split's settings (`Split.describe`).
+        names: clips' names.
+    """
+    said = []
+    for source, own in split.get("sources", {}).items():
+        below = [name.removeprefix(f"{source}/") for name in names if name.startswith(f"{source}/")]
+        said += [f"{source}: {one}"] if (one := unfitting(own, below)) else []
+    patterns = split.get("groups", ())
+    if patterns and not any(re.search(one, unpacked(name)) for one in patterns for name in names):
+        said += [f"no clip fits any of the {len(patterns)} patterns of groups (the first is {patterns[0]})"]
+    return "; ".join(said)
 
 
 def read_groups(file: Path) -> dict[str, str]:

@@ -15,7 +15,7 @@ from memmlp.common.files import atomic_write
 from memmlp.motion.clip import Skipped
 from memmlp.motion.preparing.coverage import Coverage
 
-FORMAT = 4  # number of the cache's format; a new one makes every cache again
+FORMAT = 5  # number of the cache's format; a new one makes every cache again
 MANIFEST = "manifest.json"
 STILL = "still"  # the content of every clip without motion
 
@@ -32,8 +32,8 @@ class ClipRecord:
         start: its first frame in that part's array.
         length: its number of frames there.
         sha256: digest of the source file.
-        content: digest of its frames in single precision, the same for every copy of them; `STILL`
-            without motion.
+        content: digest of its frames in single precision, the same for every copy of them, at another frame
+            rate too (`resampled_copies`); `STILL` without motion.
         fps: frame rate of the source, Hz.
         resampling: how it was brought to 60 Hz.
     """

@@ -2,7 +2,8 @@
 
 A clip's name is its path below the data root without suffix, `/`-separated. Clips that belong together
 (`Grouping`) are never divided (`memmlp.motion.preparing.dividing`). Entries of lists and names of subsets fit
-AMASS' clips whatever release these are from (`memmlp.motion.preparing.amass`).
+AMASS' clips whatever release these are from (`memmlp.motion.preparing.amass`), and patterns of groups don't
+see the folder of an archive around that of a subset.
 """
 
 from __future__ import annotations
@@ -99,7 +100,7 @@ class SeededSplit(Grouped):
         check_fractions(self.train_fraction, test=self.test, val=self.val)
 
     def assign(self, names: Sequence[str]) -> Assignment:
-        seen = {name: name for name in names}
+        seen = {name: unpacked(name) for name in names}
         parts, groups = self.divided(seen, {"test": self.test, "val": self.val}), self.grouping.names(seen)
         return Assignment(self.limited(parts, groups), groups)
 
@@ -265,18 +266,23 @@ class SubsetSplit(Grouped):
 
     def __post_init__(self) -> None:
         check_fractions(self.train_fraction, val=self.val)
+        if deeper := [name for name in (*self.train, *self.test) if "/" in name]:
+            raise InputError(
+                f"data.split: {deeper[0]} is no subset; allowed: names of folders below data.root"
+            )
         both = set(map(subset, self.train)) & set(map(subset, self.test))
         if both:
             raise InputError(f"data.split: subsets {', '.join(sorted(both))} are both in train and in test")
 
     def assign(self, names: Sequence[str]) -> Assignment:
         phase = {subset(name): part for part in PHASES for name in getattr(self, part)}
-        parts = {name: phase.get(subset(name)) for name in names}
+        seen = {name: unpacked(name) for name in names}
+        parts = {name: phase.get(subset(name), phase.get(subset(own))) for name, own in seen.items()}
         check_once(name for name, part in parts.items() if part)
-        return _carved(parts, {name: unpacked(name) for name in names}, self, self.missing(names))
+        return _carved(parts, seen, self, self.missing(names))
 
     def missing(self, names: Collection[str]) -> tuple[str, ...]:
-        present = set(map(subset, names))
+        present = {subset(one) for name in names for one in (name, unpacked(name))}
         return tuple(name for name in (*self.train, *self.test) if subset(name) not in present)
 
     @property

@@ -18,6 +18,7 @@ from memmlp.motion.plausible import check_plausible, unusual
 from memmlp.motion.preparing.find import FoundFiles, clip_name
 from memmlp.motion.preparing.folders import Root, find_all
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
+from memmlp.motion.preparing.resampled_copies import copies_alike, first_frame
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Survey:
 
     @property
     def duplicates(self) -> dict[str, str]:
-        """Clip -> the first clip of the same frames."""
+        """Clip -> the first clip of the same frames, at whatever rate."""
         firsts: dict[str, str] = {}
         moving = [clip for clip in self.clips if clip.content != STILL]
         pairs = {clip.name: firsts.setdefault(clip.content, clip.name) for clip in moving}
@@ -65,6 +66,7 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
         InputError: if there are none, or at the first bad one if `strict`.
     """
     clips: dict[str, ClipRecord] = {}
+    firsts: dict[str, np.ndarray] = {}
     odd: dict[str, str] = {}
     short, ignored, found = [], 0, find_all(root)
     skipped = [Skipped(folder, reason) for folder, reason in found.unreadable.items()]
@@ -82,8 +84,10 @@ def survey(root: Root, min_frames: int = 2, strict: bool = False) -> Survey:
             skipped.append(Skipped(one_line(file), str(error).removeprefix(one_line(f"{root / file}: "))))
             short += [name] if isinstance(error, TooShort) else []
         else:
+            firsts[name] = first_frame(clip)
             odd |= {name: reason} if (reason := unusual(clip)) else {}
-    return Survey(tuple(clips.values()), tuple(skipped), ignored, tuple(short), odd, found)
+    alike = copies_alike(root, list(clips.values()), firsts)
+    return Survey(alike, tuple(skipped), ignored, tuple(short), odd, found)
 
 
 def _check_name(path: Path, file: str, clips: dict[str, ClipRecord]) -> None:

@@ -66,3 +66,30 @@ def test_another_up_axis_is_refused(tmp_path: Path, walk: Clip, axis: str) -> No
 def test_the_calibration_frame_does_not_count(tmp_path: Path) -> None:
     bvh = read(tmp_path, "cmu_daz", frames=1)
     assert settle(bvh, replace(FOUND, calibration_frame=True)).up is None
+
+
+def lying(clip: Clip, head: str) -> Clip:
+    """Turn a clip's person down to lie with the head along an axis of Y-up axes."""
+    turn = {"z": [np.pi / 2, 0.0, 0.0], "x": [0.0, np.pi / 2, 0.0], "-z": [-np.pi / 2, 0.0, 0.0]}[head]
+    poses, trans = clip.poses.astype(float), np.zeros(clip.trans.shape)
+    poses[:, 0] = (Rotation.from_rotvec(turn) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+    return replace(clip, poses=poses, trans=trans)
+
+
+@pytest.mark.parametrize(("up", "head"), [("y", "x"), ("y", "-z"), ("z", "x"), ("z", "z")])
+def test_who_lies_in_a_file_whose_zero_pose_stands_lies(
+    tmp_path: Path, walk: Clip, up: str, head: str
+) -> None:
+    chosen = replace(TOLD, up=up)
+    assert settle(file(tmp_path, chosen, lying(walk, head), turned=False), FOUND).up == up
+
+
+def test_a_zero_pose_and_a_motion_of_two_minds_are_refused(tmp_path: Path, walk: Clip) -> None:
+    """It may be a person who lies, or one who walks while only the root's rotation has Z up."""
+    bvh = file(tmp_path, TOLD, lying(walk, "z"), turned=False)
+    with refuse(tmp_path / "clip.bvh", "stands along y in the zero pose", "along z in the motion", "--up y"):
+        settle(bvh, FOUND)
+    assert [settle(bvh, replace(FOUND, up=up)).up for up in "yz"] == ["y", "z"]
+    upside_down = lying(lying(walk, "z"), "z")
+    with refuse(tmp_path / "clip.bvh", "no up axis is found"):
+        settle(file(tmp_path, TOLD, upside_down, turned=False), FOUND)

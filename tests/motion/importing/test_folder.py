@@ -11,14 +11,17 @@ import numpy as np
 import pytest
 from bvh_samples import mutate, performed, person, random_turns, refuse, tree, write
 from plain_kinematics import npz_kinematics
+from scipy.spatial.transform import Rotation
 
 from memmlp.common.errors import InputError
 from memmlp.motion.body import JOINTS, builtin_rest_joints
 from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.importing.convert import NONE, convert
+from memmlp.motion.importing.fidelity import pose
 from memmlp.motion.importing.folder import ImportSettings, import_folder
 from memmlp.motion.importing.skeleton import SKELETONS, find_skeleton, load_skeleton
+from memmlp.motion.importing.verify import verify
 from memmlp.motion.synthetic import synthesize_clip
 
 REST = builtin_rest_joints()
@@ -297,6 +300,19 @@ def test_several_up_axes_of_one_skeleton_are_noted(tmp_path: Path) -> None:
         write(tmp_path / "source", text, f"{name}.bvh")
     notes = import_folder(tmp_path / "source", tmp_path / "out", ImportSettings(skeleton=str(path))).notes
     assert "cmu_daz: up is found as y in 2 clips, z in 1 clips; tell it in the map if that is wrong" in notes
+
+
+def test_who_lies_is_imported_lying_where_up_is_told(tmp_path: Path) -> None:
+    chosen, walk = load_skeleton("smpl_words"), synthesize_clip("walking", 1, seconds=2.0)
+    poses, trans = walk.poses.astype(float), np.tile([0.0, 0.0, -0.8], (len(walk), 1))
+    poses[:, 0] = (Rotation.from_euler("x", 90, degrees=True) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+    write(tmp_path, performed(chosen, replace(walk, poses=poses, trans=trans)).text())
+    with refuse(tmp_path / "clip.bvh", "stands along y in the zero pose, but along z in the motion"):
+        import_folder(tmp_path / "clip.bvh", tmp_path / "out")
+    import_folder(tmp_path / "clip.bvh", tmp_path / "out", ImportSettings(up="y"))
+    places = pose(read_clip(tmp_path / "out" / "clip.npz", "clip"), REST)[1]
+    assert np.abs(places[:, 15, 2] - places[:, 0, 2]).max() < 0.2  # the head is as high as the pelvis
+    assert verify(tmp_path / "clip.bvh", up="y").mm.value < 1
 
 
 def test_faults_are_kept_in_the_record(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import pytest
 
 from memmlp.common.errors import InputError
-from memmlp.motion.preparing.groups import Grouping, read_groups
+from memmlp.motion.preparing.groups import Grouping, read_groups, unfitting
 
 
 def written(folder, text):
@@ -50,3 +50,14 @@ def test_a_group_is_named_by_the_file_else_after_its_first_clip(tmp_path):
     seen = {name: name for name in ("b", "a", "x2", "x1")}
     assert rows.names(seen) == {"a": "ann", "b": "ann", "x1": "ben", "x2": "ben"}
     assert Grouping.of(["^(x)"], None).names(seen) == {"a": "a", "b": "b", "x1": "x1", "x2": "x1"}
+
+
+def test_patterns_that_fit_no_clip_are_told():
+    split = {"groups": ["^(S[0-9])_", "^([^/]+/[^/]+)/take"]}
+    assert unfitting(split, ["ann/1", "ben/2"]) == (
+        "no clip fits any of the 2 patterns of groups (the first is ^(S[0-9])_)"
+    )
+    assert unfitting(split, ["ann/1", "S1_2"]) == unfitting({"groups": []}, ["ann/1"]) == ""
+    assert unfitting(split, ["CMU/CMU/01/take1"]) == ""
+    mixed = {"kind": "mixed", "sources": {"one": split, "two": {"groups": ["(ann)"]}}}
+    assert unfitting(mixed, ["one/ann/1", "two/ann/2"]).startswith("one: no clip fits any of the 2")

@@ -227,3 +227,24 @@ def test_a_column_file_ties_clips_beside_patterns(tmp_path):
     assert split.describe() != bare.describe()
     file.write_text(file.read_text().replace("martial\n", "other\n"))
     assert SeededSplit(0.3, 0.1, 0, TWINS, groups_file=file).describe() != split.describe()
+
+
+@pytest.mark.parametrize("write", [in_archives, "archive-1/{}".format, "amass/CMU/{}".format])
+def test_a_seeded_split_sees_subjects_within_archives(write):
+    """A subject's folder is below the subset's, however deep that lies, and what is drawn is the same."""
+    names = [f"CMU/{subject:02}/{subject:02}_0{take}_poses" for subject in range(20) for take in range(3)]
+    split = SeededSplit(0.2, 0.2, 1, ["^([^/]+/[^/]+)/"])
+    expected, found = split.assign(names), split.assign([write(name) for name in names])
+    assert len(set(found.groups.values())) == 20
+    assert found.parts == {write(name): part for name, part in expected.parts.items()}
+
+
+def test_subsets_are_found_within_archives_and_by_folders_of_ones_own():
+    split = SubsetSplit(["CMU", "mine"], ["MPI_HDM05"])
+    names = ["amass-1/CMU/01/a", "amass-2/MPI_HDM05/dg/b", "mine/CMU/01/c", "other/CMU/d"]
+    found = split.assign(names)
+    assert (found.missing, split.missing(names)) == ((), ())
+    assert [part is None for part in found.parts.values()] == [False, False, False, True]
+    assert found.parts["amass-2/MPI_HDM05/dg/b"] == "test"
+    with pytest.raises(InputError, match=r"data\.split: CMU/01 is no subset"):
+        SubsetSplit(["KIT"], ["CMU/01"])

@@ -1,0 +1,81 @@
+"""Copies of a clip at another frame rate, which have other frames and yet are the same motion.
+
+Such a copy begins with the original's first frame and is as long as it, to a frame of the slower one. A pair
+of clips of which that is true is read whole and compared at the times of the slower one's frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from memmlp.motion.body import FPS
+from memmlp.motion.clip import Clip, resample
+from memmlp.motion.formats.npz import read_clip
+from memmlp.motion.preparing.folders import Root
+from memmlp.motion.preparing.manifest import STILL, ClipRecord
+
+DEGREES, METRES = 1.0, 0.01  # by which a copy is off at most, on average over frames and joints
+
+
+def first_frame(clip: Clip) -> np.ndarray:
+    """Return what copies at any frame rate begin with: rotations and place of the first frame (201,)."""
+    rotations = Rotation.from_rotvec(clip.poses[0]).as_matrix()
+    return np.concatenate([rotations.ravel(), clip.trans[0]]).astype(np.float32)
+
+
+def copies_alike(
+    root: Root, clips: Sequence[ClipRecord], firsts: Mapping[str, np.ndarray]
+) -> tuple[ClipRecord, ...]:
+    """Return the clips, each copy of another one at another frame rate with that one's content.
+
+    Args:
+        root: where their files are.
+        clips: records of sound clips.
+        firsts: clip -> its first frame (`first_frame`).
+    """
+    content: dict[str, str] = {}  # of a copy -> of what it is a copy of
+
+    def original(of: str) -> str:
+        while of in content:
+            of = content[of]
+        return of
+
+    for one, other in _candidates(clips, firsts):
+        first, second = original(one.content), original(other.content)
+        if first != second and _same_motion(*(read_clip(root / c.file, c.name) for c in (one, other))):
+            content[second] = first
+    return tuple(replace(clip, content=original(clip.content)) for clip in clips)
+
+
+def _candidates(
+    clips: Sequence[ClipRecord], firsts: Mapping[str, np.ndarray]
+) -> Iterator[tuple[ClipRecord, ClipRecord]]:
+    """Yield pairs of moving clips of different rates, but of one length and with one first frame."""
+    moving = sorted((clip for clip in clips if clip.content != STILL), key=lambda clip: clip.length)
+    if len({clip.fps for clip in moving}) < 2:
+        return
+    rates, lengths = (np.array([getattr(clip, key) for clip in moving]) for key in ("fps", "length"))
+    begin = np.stack([firsts[clip.name] for clip in moving])
+    ends = np.searchsorted(lengths, lengths + FPS / rates.min() + 1, "right")
+    for index, end in enumerate(ends):
+        near = np.arange(index + 1, end)
+        slower = np.minimum(rates[near], rates[index])
+        near = near[(rates[near] != rates[index]) & (lengths[near] - lengths[index] <= FPS / slower + 1)]
+        off = np.abs(begin[near] - begin[index]).max(-1, initial=0.0)
+        for other in near[off <= METRES]:  # and as large a difference of a rotation's matrix
+            yield moving[index], moving[other]
+
+
+def _same_motion(one: Clip, other: Clip) -> bool:
+    """Return whether two clips are the same motion at their frame rates."""
+    slow, fast = sorted((one, other), key=lambda clip: clip.fps)
+    fast, _ = resample(fast, slow.fps)
+    frames = min(len(slow), len(fast))
+    turns = [Rotation.from_rotvec(clip.poses[:frames].reshape(-1, 3)) for clip in (slow, fast)]
+    angle = np.degrees((turns[0].inv() * turns[1]).magnitude().mean())
+    way = np.linalg.norm(slow.trans[:frames] - fast.trans[:frames], axis=-1).mean()
+    return bool(angle <= DEGREES and way <= METRES)
