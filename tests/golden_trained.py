@@ -27,10 +27,9 @@ from memmlp.training.train_refiner import RefinerTask, RefinerTraining, sage_los
 from memmlp.training.train_sage import PARTS, DroppingOptim, PartTask
 from memmlp.training.train_vqvae import VQVAETask
 
-
 ROUNDED = ("quantiser.vectors", "key.bias")
-"""Parameters that processors' rounding moves: the nearest of almost equal codes, and the biases of attention's
-keys, whose gradient is 0 but for rounding. `parts` sees codes that are far apart by themselves.
+"""Parameters that processors' rounding moves: the nearest of almost equal codes, and the biases of keys of
+attention, whose gradient is 0 but for rounding. `parts` sees codes that are far apart by themselves.
 """
 
 
