@@ -22,7 +22,7 @@ from memmlp.motion.body import (
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.agrol import WholeWindow
-from memmlp.networks.baselines.encoder import EncoderLayer
+from memmlp.networks.baselines.encoder import EncoderLayer, draw_weights
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import Learned
 
@@ -111,6 +111,7 @@ class AvatarJLM(WholeWindow):
             nn.LeakyReLU(0.1),
             nn.Linear(hidden, self.outputs),
         )
+        draw_weights(self)
 
     def coarse_joints(self, embedded: Tensor) -> tuple[Tensor, Tensor]:
         """Return the coarse pose of embeddings (..., 2 d), in the network's coordinates without z-scores.

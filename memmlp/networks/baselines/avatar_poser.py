@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from memmlp.motion.body import N_JOINTS, SPARSE_DIM
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.baselines.encoder import EncoderLayer
+from memmlp.networks.baselines.encoder import EncoderLayer, draw_weights
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import MotionModel
 
@@ -91,6 +91,7 @@ class AvatarPoser(OwnWindows):
         self.layers = nn.ModuleList(EncoderLayer(width, heads, feedforward, dropout) for _ in range(depth))
         self.orientation = head(width, ROOT)
         self.rotation = head(width, 6 * self.rotated)
+        draw_weights(self)
 
     def rotations(self, encoded: Tensor) -> Tensor:
         """Map windows (B, T, 54) to their last frames' rotations (B, 132), both in network space."""

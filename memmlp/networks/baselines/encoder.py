@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.networks.layers import Dropout
+
+GAIN = 0.2  # by which the weights at the beginning are smaller than Kaiming's
 
 
 class Attention(nn.Module):
@@ -76,3 +79,23 @@ class EncoderLayer(nn.Module):
         h = self.attention_norm(h + self.dropout(attended))
         wide = self.dropout(self.activation(self.widen(h)))
         return self.norm(h + self.dropout(self.narrow(wide)))
+
+
+@torch.no_grad()
+def draw_weights(part: nn.Module) -> None:
+    """Draw the first weights of linear layers as AvatarPoser's released code does, and those made from it.
+
+    They are of Kaiming's normal distribution (He et al. 2015, Eq. 10) times 0.2, with biases of 0, so that a
+    network begins near the mean pose. Queries, keys and values of torch's own attention are of one matrix,
+    which that code leaves as torch draws it, by Xavier's uniform distribution (Glorot & Bengio 2010, Eq. 16).
+    """
+    for layer in part.modules():
+        if isinstance(layer, nn.Linear):
+            nn.init.kaiming_normal_(layer.weight).mul_(GAIN)
+            nn.init.zeros_(layer.bias)
+    for attention in part.modules():
+        if isinstance(attention, Attention):
+            layers = (attention.query, attention.key, attention.value)
+            together = nn.init.xavier_uniform_(torch.cat([layer.weight for layer in layers]))
+            for layer, weight in zip(layers, together.chunk(len(layers)), strict=True):
+                layer.weight.copy_(weight)

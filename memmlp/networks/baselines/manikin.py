@@ -33,6 +33,7 @@ from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_m
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.avatar_jlm import AvatarJLM
 from memmlp.networks.baselines.avatar_poser import AvatarPoser, head
+from memmlp.networks.baselines.encoder import draw_weights
 from memmlp.networks.baselines.limb_solver import (
     ANKLES,
     BASES,
@@ -250,6 +251,8 @@ class ManikinS(Manikin, AvatarPoser):
         )
         self.parts, self.turned = parts, turned
         self.swivel, self.places = head(width, SWIVELS), head(width, PLACES)
+        for added in (self.swivel, self.places):
+            draw_weights(added)
 
     def read(self, newest: Tensor) -> Tensor:
         """Map the newest frame's feature (..., d) to outputs (..., 86)."""
