@@ -85,8 +85,8 @@ def test_a_wrong_unit_is_said_by_both(source: Path) -> None:
     [
         (("--fps", "fast"), "--fps fast: no frame rate"),
         (("--fps", "waltz=60"), "fps: 60.0 for 'waltz'"),
-        (("--ground", "low"), "--ground low: no height"),
-        (("--ground", "nan"), "--ground nan: no height"),
+        (("--floor", "low"), "--floor low: no height"),
+        (("--ground", "nan"), "--floor nan: no height"),
         (("--take", "("), "take: '('"),
         (("--skeleton", "none.yaml"), "skeleton: 'none.yaml' is no file"),
     ],

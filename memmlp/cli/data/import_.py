@@ -20,7 +20,9 @@ from memmlp.common.errors import InputError
 )
 @click.option("--fps", multiple=True, metavar="[FOLDER=]HZ", help="True frame rate, for all or one folder.")
 @click.option(
+    "--floor",
     "--ground",
+    "floor",
     default="auto",
     show_default=True,
     metavar="auto|none|METRES",
@@ -38,7 +40,7 @@ def import_(
     out: Path,
     skeleton: str | None,
     fps: tuple[str, ...],
-    ground: str,
+    floor: str,
     up: str | None,
     take: tuple[str, ...],
     body: str,
@@ -53,7 +55,7 @@ def import_(
     from memmlp.motion.importing.folder import ImportSettings, import_folder
 
     rates = dict(map(_rate, fps))
-    how = ImportSettings(skeleton, rates, body, _height(ground), take, strict, sound, up)
+    how = ImportSettings(skeleton, rates, body, _height(floor), take, strict, sound, up)
     report = import_folder(source, out, how)
     for note in report.notes:
         click.echo(f"note: {note}")
@@ -84,5 +86,5 @@ def _height(text: str) -> str | float:
     except ValueError:
         height = math.nan
     if not abs(height) <= 1000:
-        raise InputError(f"--ground {text}: no height; allowed: auto, none, or metres up to 1000")
+        raise InputError(f"--floor {text}: no height; allowed: auto, none, or metres up to 1000")
     return height
