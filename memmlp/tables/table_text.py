@@ -231,8 +231,9 @@ def value_words(cell: Cell, metric: str) -> str:
         return MISSING
     if metric in COSTS and (metric != "ms" or cell.sd is None):
         return f"{cell.mean:.3g}" if cell.mean < 1000 else f"{cell.mean:.0f}"
-    sd = "" if cell.sd is None else f" ± {cell.sd:.2f}"
-    return f"{cell.mean:.2f}{sd}"
+    digits = decimals(cell.mean)
+    sd = "" if cell.sd is None else f" ± {cell.sd:.{digits}f}"
+    return f"{cell.mean:.{digits}f}{sd}"
 
 
 def effect_words(cell: Cell, metric: str) -> tuple[str, ...]:
@@ -245,9 +246,10 @@ def effect_words(cell: Cell, metric: str) -> tuple[str, ...]:
         return (MISSING,)
     if metric in COSTS:
         return signed(effect.mean, "+.3g"), *_ratio(cell.mean, effect.mean)
+    least = 2 if cell.mean is None else decimals(cell.mean)
     if effect.low is None or effect.high is None:
-        return (signed(effect.mean, "+.2f"),)
-    digits = places(effect.high - effect.low)
+        return (signed(effect.mean, f"+.{least}f"),)
+    digits = places(effect.high - effect.low, least)
     low, high = (signed(number, f".{digits}f") for number in (effect.low, effect.high))
     star = "*" if effect.significant else ""
     at = f" ({effect.decided})" if effect.decided else ""
@@ -272,9 +274,14 @@ def signed(number: float, form: str) -> str:
     return format(number, form).replace("-", MINUS) if number else "0"
 
 
-def places(width: float) -> int:
-    """Return the decimals (2 or 3) that show two digits of an interval's half width."""
-    return min(max(1 - math.floor(math.log10(width / 2)), 2), 3) if width > 0 else 2
+def decimals(value: float) -> int:
+    """Return the decimals of an error: 2, or as many as show two digits of one below 0.1."""
+    return max(1 - math.floor(math.log10(abs(value))), 2) if value and math.isfinite(value) else 2
+
+
+def places(width: float, least: int = 2) -> int:
+    """Return the decimals, `least` or one more, that show two digits of an interval's half width."""
+    return min(max(1 - math.floor(math.log10(width / 2)), least), least + 1) if width > 0 else least
 
 
 def paper_words(cell: Cell, metric: str) -> str:

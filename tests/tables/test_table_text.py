@@ -10,8 +10,8 @@ from fake_table import SHIPPED, printed
 
 from memmlp.sweep.parsing import load_sweep
 from memmlp.sweep.spec import Sweep
-from memmlp.tables.table import Table
-from memmlp.tables.table_text import heading
+from memmlp.tables.table import Cell, Effect, Table
+from memmlp.tables.table_text import effect_words, heading, value_words
 
 
 def test_costs_show_how_many_times_the_controls_they_are(tmp_path: Path):
@@ -26,6 +26,19 @@ def test_costs_show_how_many_times_the_controls_they_are(tmp_path: Path):
 
 def test_heads_tell_unit_and_direction():
     assert [heading(name) for name in ("Jitter", "ms", "FPS")] == ["Jitter [10² m/s³] ↓", "ms ↓", "FPS ↑"]
+
+
+def test_an_error_below_a_tenth_has_two_digits_as_its_difference_has():
+    """A metric of one's own may have any unit."""
+    effect = Effect(-0.0004, low=-0.0011, high=0.0003)
+    small = Cell({0: 0.0031, 1: 0.0035}, effect=effect)
+    assert value_words(small, "slide") == "0.0033 ± 0.0003"
+    assert effect_words(small, "slide") == ("\N{MINUS SIGN}0.00040", "[\N{MINUS SIGN}0.00110, 0.00030]")
+    assert effect_words(Cell({0: 0.0031}, effect=Effect(0.0004)), "slide") == ("+0.0004",)
+    usual = Cell({0: 4.25, 1: 4.31}, effect=Effect(0.123, low=0.05, high=0.196))
+    assert value_words(usual, "MPJRE") == "4.28 ± 0.04"
+    assert effect_words(usual, "MPJRE") == ("+0.123", "[0.050, 0.196]")
+    assert value_words(Cell({0: 0.0, 1: 0.0}), "slide") == "0.00 ± 0.00"
 
 
 def test_an_arm_in_which_nothing_would_have_been_found_is_named(sweep: Sweep, tmp_path: Path):
