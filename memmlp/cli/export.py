@@ -223,7 +223,7 @@ def write_exact(
             checked = [full_tolerated(model, path, *one, space) for one in zip(clips, apart, strict=True)]
         else:
             apart = [parity(model, path, clip) for clip in clips]
-            checked = [tolerated(model, *one) for one in zip(clips, apart, strict=True)]
+            checked = [tolerated(model, path, *one) for one in zip(clips, apart, strict=True)]
         worst = float(np.max(apart))  # NaN as soon as one is NaN, unlike max()
         said = f"differs from torch by {worst:.1e} at most on {len(clips)} test clips"
         if not all(checked):

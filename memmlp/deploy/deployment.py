@@ -79,7 +79,7 @@ class Deployment:
         network = GRAPHS[self.graph](model)
         export(network, deployed.onnx, run_id, self.opset)
         worst = parity(model, deployed.onnx, test[0])
-        if not tolerated(model, test[0], worst):
+        if not tolerated(model, deployed.onnx, test[0], worst):
             raise RuntimeError(
                 f"{deployed.onnx}: ONNX Runtime differs from torch by {worst:.2e} (> {TOLERANCE:.0e}), "
                 "which is more than rounding explains"

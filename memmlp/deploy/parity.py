@@ -6,6 +6,7 @@ import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -17,9 +18,11 @@ from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.motion.threads import one_thread
 from memmlp.networks.memory import Blend
 from memmlp.networks.motion_model import MotionModel
+from memmlp.networks.vqvae import Codebook
 
 TOLERANCE = 1e-4  # on 6D components and metres
 ROUNDING = 10 * TOLERANCE  # the most that is put down to rounding; see `tolerated`
+TIE = 1e-4  # the margin below which rounding may choose another code-vector; see `Codebook.margins`
 
 
 @contextmanager
@@ -36,18 +39,24 @@ def deterministic(model: nn.Module) -> Iterator[None]:
             blend.value = value
 
 
-@torch.no_grad()
 def parity(model: MotionModel, path: Path, clip: Tensor) -> float:
     """Return the largest difference between torch and ONNX Runtime, each on its own history, over a clip.
-
-    The positions of a network without a position branch are compared with those that follow, in float64, from
-    ONNX Runtime's rotations. Where 6D columns are almost parallel, which an untrained network produces now
-    and then, a difference between rotations within float32's rounding would otherwise come out a hundredfold.
 
     Args:
         model: the trained network.
         path: the exported file.
         clip: (N, 252).
+    """
+    return float(differences(model, path, clip).max())
+
+
+@torch.no_grad()
+def differences(model: MotionModel, path: Path, clip: Tensor) -> Tensor:
+    """Return each frame's largest difference (N,) between torch and ONNX Runtime over a clip (N, 252).
+
+    The positions of a network without a position branch are compared with those that follow, in float64, from
+    ONNX Runtime's rotations. Where 6D columns are almost parallel, which an untrained network produces now
+    and then, a difference between rotations within float32's rounding would otherwise come out a hundredfold.
     """
     model, clip = model.cpu().eval(), clip.cpu()
     made, found = in_torch(model, clip), streamed(OnnxStream(path), clip)
@@ -55,37 +64,86 @@ def parity(model: MotionModel, path: Path, clip: Tensor) -> float:
         exact = copy.deepcopy(model.normalizer).double()
         positions = exact.pose(found.double(), clip[:, :SPARSE_DIM].double())
         made = torch.cat([made[:, ROTATION], positions.flatten(1)], 1)
-    return float((made - found).abs().max())
+    return (made - found).abs().amax(1)
 
 
 @torch.no_grad()
-def tolerated(model: MotionModel, clip: Tensor, apart: float) -> bool:
+def tolerated(model: MotionModel, path: Path, clip: Tensor, apart: float) -> bool:
     """Return whether a difference between torch and ONNX Runtime over a clip (N, 252) is rounding.
 
     Up to TOLERANCE it is. Up to ROUNDING it may be, where a rotation is ill-conditioned, as that of a hip is
     whose swivel is counted about a straight leg from an axis along it (MANIKIN): then torch's own rotations
-    in float32 differ from those in float64 by half as much or more.
+    in float32 differ from those in float64 by half as much or more. However large it is, it may be that
+    rounding chose another code-vector (`begins_at_ties`).
     """
-    if not TOLERANCE < apart <= ROUNDING:
+    if not apart > TOLERANCE:  # NaN is not
         return apart <= TOLERANCE
     model, clip = model.cpu().eval(), clip.cpu()
-    exact = in_torch(copy.deepcopy(model).double(), clip.double())
-    rounding = (in_torch(model, clip) - exact)[:, ROTATION].abs().max()
-    return apart <= 2 * float(rounding)
+    if apart <= ROUNDING:
+        exact = in_torch(copy.deepcopy(model).double(), clip.double())
+        rounding = (in_torch(model, clip) - exact)[:, ROTATION].abs().max()
+        if apart <= 2 * float(rounding):
+            return True
+    return bool(codebooks(model)) and begins_at_ties(model, clip, differences(model, path, clip))
+
+
+@torch.no_grad()
+def begins_at_ties(model: MotionModel, clip: Tensor, apart: Tensor | np.ndarray) -> bool:
+    """Return whether differences (N,) over a clip's inputs (N, 252 or 54) come of ties between code-vectors.
+
+    Where a latent lies as far from one code-vector as from another, rounding chooses. Two programs then part
+    for as long as the frame is in the window, and they agree again. So each frame that differs by more than
+    TOLERANCE has to follow another one, or to be within a window after a tie, and most frames don't differ.
+    """
+    since_tie, explained = float("inf"), False
+    for margin, one in zip(smallest_margins(model, clip), apart.tolist(), strict=True):
+        since_tie = 0 if margin < TIE else since_tie + 1
+        explained = one > TOLERANCE and (explained or since_tie < model.frames)
+        if not (one <= TOLERANCE or explained):
+            return False
+    return int((apart > TOLERANCE).sum()) <= len(apart) // 2
+
+
+def smallest_margins(model: MotionModel, clip: Tensor) -> list[float]:
+    """Return for each frame of inputs (N, 252 or 54) the smallest margin of a latent (`Codebook.margins`)."""
+    found: list[float] = []
+    smallest = []
+
+    def note(book: nn.Module, given: tuple[Tensor], _: object) -> None:
+        found.append(float(cast(Codebook, book).margins(given[0]).min()))
+
+    hooks = [book.register_forward_hook(note) for book in codebooks(model)]
+    try:
+        for _ in motions(model, clip):
+            smallest.append(min(found, default=float("inf")))
+            found.clear()
+    finally:
+        for hook in hooks:
+            hook.remove()
+    return smallest
+
+
+def codebooks(model: MotionModel) -> list[Codebook]:
+    """Return the codebooks that a network looks into."""
+    return [module for module in model.modules() if isinstance(module, Codebook)]
 
 
 @torch.no_grad()
 def in_torch(model: MotionModel, clip: Tensor) -> Tensor:
-    """Return the world motion (N, 198) that the network streams of a clip's inputs (N, 252 or 54).
+    """Return the world motion (N, 198) that the network streams of a clip's inputs (N, 252 or 54)."""
+    return torch.stack(list(motions(model, clip)))
+
+
+def motions(model: MotionModel, clip: Tensor) -> Iterator[Tensor]:
+    """Yield the world motion (198,) that the network streams, for each frame of a clip (N, 252 or 54).
 
     By one thread: a frame is little work, which several do more slowly, by far where the machine is busy.
     """
-    state, made = model.initial_state(1), []
+    state = model.initial_state(1)
     with deterministic(model), one_thread():
         for sparse in progress_bar(clip[:, None, None, :SPARSE_DIM], "check"):
             motion, state = model.advance(sparse, state)
-            made.append(motion[0, -1])
-    return torch.stack(made)
+            yield motion[0, -1]
 
 
 def streamed(stream: OnnxStream, clip: Tensor) -> Tensor:

@@ -44,8 +44,24 @@ class Codebook(nn.Module):
 
     def indices(self, latent: Tensor) -> Tensor:
         """Return the index (...) of the code-vector nearest to each latent (..., width), Euclidean."""
-        distance = self.vectors.square().sum(-1) - 2 * latent @ self.vectors.T
-        return distance.argmin(-1)
+        return self._distances(latent).argmin(-1)
+
+    def margins(self, latent: Tensor) -> Tensor:
+        """Return how far (...) each latent (..., width) is from having another code-vector for its nearest.
+
+        It is the distance to the plane halfway between the two nearest, as a share of the latent's length. By
+        errors of more than that, as rounding makes them, another one may be found the nearest.
+        """
+        if len(self.vectors) < 2:
+            return torch.full_like(latent[..., 0], float("inf"))
+        distances, index = self._distances(latent).topk(2, -1, largest=False)
+        between = (self.vectors[index[..., 1]] - self.vectors[index[..., 0]]).norm(dim=-1)
+        tiny = torch.finfo(latent.dtype).tiny
+        return distances.diff(dim=-1)[..., 0] / (2 * between * latent.norm(dim=-1)).clamp_min(tiny)
+
+    def _distances(self, latent: Tensor) -> Tensor:
+        """Return the squared distances (..., K) of latents (..., width), less the latents' own squares."""
+        return self.vectors.square().sum(-1) - 2 * latent @ self.vectors.T
 
     def forward(self, latent: Tensor) -> tuple[Tensor, Tensor]:
         """Return the code-vectors (..., width) and indices (...) of latents (..., width)."""

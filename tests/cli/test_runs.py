@@ -119,6 +119,11 @@ def test_show_tells_of_changed_artifacts(memmlp: Memmlp, outputs: Path):
     assert re.search(r"changed since +results.json", memmlp("runs", "show", A).out)
 
 
+def test_show_says_why_a_run_failed(memmlp: Memmlp, outputs: Path):
+    Run(outputs / "runs" / A).fail("the loss is infinite")
+    assert re.search(r"status +failed\s+failed with +the loss is infinite", memmlp("runs", "show", A).out)
+
+
 def test_show_an_unfinished_run(memmlp: Memmlp, outputs: Path):
     assert "stopped" in memmlp("runs", "show", C).out
 

@@ -47,6 +47,8 @@ def _summary(run: Run) -> dict[str, Any]:
     """Return what a run is and how it went, in words."""
     one, manifest = recorded(run), run.manifest
     facts = {"run": run.id, "name": one.get("name"), "folder": run.folder, "status": run.status}
+    if why := run.failure:
+        facts["failed with"] = why
     facts |= {key: manifest[key] for key in SUMMARY if key in manifest}
     facts["data"] = " ".join(dict.fromkeys([str(one.get("data", "-")), str(one.get("data_digest", ""))[:8]]))
     if above := manifest.get("upstream"):

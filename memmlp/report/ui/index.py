@@ -81,7 +81,8 @@ class Index:
             if self.store:
                 self.store.put(run_id, signature, known)
             known["status"] = None
-        status = "done" if known["done"] and not _claimed(folder) else _status(folder)
+        complete = known["done"] and not known["failure"]
+        status = "done" if complete and not _claimed(folder) else _status(folder)
         if known.get("status") == status and run_id in self.runs and "generation" in known:
             return False
         self.removed.pop(run_id, None)

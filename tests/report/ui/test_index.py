@@ -89,6 +89,18 @@ def test_a_run_is_not_done_while_it_is_evaluated(outputs: Path):
     assert index.runs[run.id]["status"] == "done"
 
 
+def test_a_trained_run_whose_deployment_failed_is_not_done(outputs: Path):
+    index = Index(outputs)
+    index.refresh()
+    run = run_of(outputs)
+    run.fail("RuntimeError: ONNX Runtime differs from torch")
+    index.refresh()
+    assert (run.status, index.runs[run.id]["status"]) == ("failed", "failed")
+    run.retry()
+    index.refresh()
+    assert index.runs[run.id]["status"] == "done"
+
+
 def test_a_run_that_is_gone_is_told(outputs: Path):
     index = Index(outputs)
     index.refresh()
