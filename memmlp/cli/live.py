@@ -130,12 +130,10 @@ def live(network: str, send: bool, save_avatar: Path | None, **options: Any) -> 
     It is fed a clip in real time, over and over, or tracker poses that arrive as packets. The body goes to
     the page, and to other programs and files where they are asked for (docs/guides/live.md). Ctrl-C ends it.
     """
-    from memmlp.common.ending import termination_interrupts
-
     given = InputOptions(network=network, **{key: options.pop(key) for key in FED})
     shown = ShowOptions(**options)
     check_options(given, shown, send)
-    with contextlib.suppress(KeyboardInterrupt), termination_interrupts():
+    with contextlib.suppress(KeyboardInterrupt):
         if save_avatar is not None:
             write_avatar(given, save_avatar)
         elif send:

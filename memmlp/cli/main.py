@@ -8,12 +8,14 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import NamedTuple, NoReturn
 
 import click
 
 import memmlp
 from memmlp.common import distributed
+from memmlp.common.ending import termination_interrupts
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.common.progress import telling
 from memmlp.common.python_gc import collect_seldom
@@ -106,13 +108,17 @@ def commands() -> None:
 def main(argv: Sequence[str] | None = None) -> None:
     """Run a command line. Exits with 1 for a failed run, 2 for bad input, 130 when interrupted.
 
+    A process of its own takes SIGTERM, a scheduler's request to end, as a Ctrl-C.
+
     With MEMMLP_TRACEBACK=1 in the environment the error is raised, to show where it came from.
     """
-    if argv is None:  # a process of its own
+    own = argv is None
+    if own:
         collect_seldom()
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
-        _run(arguments)
+        with termination_interrupts() if own else nullcontext():
+            _run(arguments)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
         sys.exit(2)

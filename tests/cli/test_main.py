@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -31,6 +32,24 @@ def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
         raise error
 
     monkeypatch.setattr("memmlp.cli.train.run_training", fail)
+
+
+def test_a_request_to_end_is_a_ctrl_c(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """Not so where somebody else's process calls `main`."""
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr("memmlp.cli.train.run_training", lambda cfg: signal.raise_signal(signal.SIGTERM))
+    monkeypatch.setattr(sys, "argv", ["memmlp", "train", "profile=tiny"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 130
+    assert "interrupted; the same command goes on where it was left" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGTERM) == before
+    seen: list[object] = []
+    monkeypatch.setattr(
+        "memmlp.cli.train.run_training", lambda cfg: seen.append(signal.getsignal(signal.SIGTERM))
+    )
+    main(["train", "profile=tiny"])
+    assert seen == [before]
 
 
 QUICK = """
