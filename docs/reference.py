@@ -20,7 +20,7 @@ from omegaconf import MISSING
 
 import memmlp
 from memmlp.cli.main import COMMANDS, commands
-from memmlp.config.packaged import packaged
+from memmlp.config.package_data import packaged
 from memmlp.config.schema import SCHEMAS
 
 ROOT = Path(__file__).parent.parent

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from memmlp.common import fences, files, lease, lease_claims, liveness
+from memmlp.common import files, lease, lease_claims, lease_fences, liveness
 from memmlp.common.liveness import Changes
 
 
@@ -68,7 +68,7 @@ def apart(monkeypatch: pytest.MonkeyPatch) -> Clock:
     monkeypatch.setattr(liveness, "place", lambda: threading.current_thread().name)
     monkeypatch.setattr(lease, "place", lambda: threading.current_thread().name)
     monkeypatch.setattr(lease, "_changes", OwnChanges(clock))
-    monkeypatch.setattr(fences, "_FENCES", OwnFences())
+    monkeypatch.setattr(lease_fences, "_FENCES", OwnFences())
     monkeypatch.setattr(lease, "BEAT", 1e6)
     return clock
 
@@ -115,7 +115,7 @@ class Scheduler:
         calls = {name: self._stepping(getattr(os, name)) for name in self.CALLS}
         plain = {name: getattr(os, name) for name in dir(os) if not name.startswith("_")}
         proxy = SimpleNamespace(**{**plain, **calls, "fsync": lambda handle: None})
-        for module in (lease_claims, lease, fences, files):
+        for module in (lease_claims, lease, lease_fences, files):
             monkeypatch.setattr(module, "os", proxy)
         monkeypatch.setattr(Path, "unlink", self._stepping(Path.unlink))
         monkeypatch.setattr(files, "sync_folder", lambda folder: None)

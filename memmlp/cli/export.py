@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from memmlp.networks.streaming import StreamingGraph
 
 TARGETS = ("onnxruntime", "web", "wasm", "webgpu", "webnn", "unity", "tensorrt", "coreml", "qnn")
-"""Those of memmlp.deploy.targets, without importing ONNX Runtime for the help."""
+"""Those of memmlp.deploy.operator_support, without importing ONNX Runtime for the help."""
 
 FULL_TOLERANCE = 0.1
 """In metres and in entries of rotation matrices: what fp16 changes is far less, what is broken far more."""
@@ -307,7 +307,7 @@ def check(path: Path, targets: tuple[str, ...]) -> None:
     Raises:
         ClickException: where anything does.
     """
-    from memmlp.deploy import targets as published
+    from memmlp.deploy import operator_support as published
 
     model = published.load_graph(path)
     kinds = len({node.op_type for node in model.graph.node})

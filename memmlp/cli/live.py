@@ -266,7 +266,7 @@ def serve(given: InputOptions, shown: ShowOptions) -> None:
     import threading
     import webbrowser
 
-    from memmlp.common.ending import closed_in_peace
+    from memmlp.common.termination import closed_in_peace
     from memmlp.live.player.fitting import Fitting
     from memmlp.live.player.play import greeting, play, with_avatar
     from memmlp.live.player.server import Hub, Server

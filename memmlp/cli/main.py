@@ -15,10 +15,10 @@ import click
 
 import memmlp
 from memmlp.common import distributed
-from memmlp.common.ending import termination_interrupts
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.common.progress import telling
 from memmlp.common.python_gc import collect_seldom
+from memmlp.common.termination import termination_interrupts
 
 
 class Command(NamedTuple):

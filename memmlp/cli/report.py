@@ -42,7 +42,7 @@ def report(
     runs again. All searches below --outputs are in it, too.
     """
     from memmlp.cli.table import write
-    from memmlp.config.packaged import packaged
+    from memmlp.config.package_data import packaged
     from memmlp.report.html import fragment, page, published
     from memmlp.runs.environment import environment
     from memmlp.sweep.parsing import load_sweep

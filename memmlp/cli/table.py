@@ -224,7 +224,7 @@ def table_of_plan(
 
 def chosen(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[Sweep, str]]:
     """Return the sweeps of some names, with the overrides, and the command that runs each."""
-    from memmlp.config.packaged import packaged
+    from memmlp.config.package_data import packaged
     from memmlp.config.plan_sweep import find_sweep
     from memmlp.config.plugins import words
 

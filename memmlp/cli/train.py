@@ -18,7 +18,7 @@ from memmlp.common import distributed
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.config.compose import CONFIG, VERSION_BASE, help_text, parse, preflight
 from memmlp.config.explain import explain
-from memmlp.config.packaged import packaged
+from memmlp.config.package_data import packaged
 from memmlp.config.schema import check, register
 
 if TYPE_CHECKING:

@@ -205,7 +205,7 @@ def search(setup: Setup, study: Study, workers: Workers) -> None:
 
 def leave(setup: Setup, study: Study) -> None:
     """Write what the search found into its folder."""
-    from memmlp.config.packaged import packaged
+    from memmlp.config.package_data import packaged
     from memmlp.sweep.search import results
 
     results.write_trials(study, setup.folder / "trials.csv")

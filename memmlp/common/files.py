@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from memmlp.common.fences import publish, temporary
+from memmlp.common.lease_fences import publish, temporary
 
 
 def now() -> str:
@@ -51,7 +51,7 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
     It is a temporary file, which is synced and renamed at the end.
 
     Raises:
-        LeaseLost: if this process held the file's folder and has lost it (memmlp.common.fences).
+        LeaseLost: if this process held the file's folder and has lost it (memmlp.common.lease_fences).
     """
     unfinished = temporary(path)
     try:

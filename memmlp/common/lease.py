@@ -27,9 +27,9 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from memmlp.common.errors import LeaseLost
-from memmlp.common.fences import fenced, remove_unfinished
 from memmlp.common.files import now
 from memmlp.common.lease_claims import Claim, Claims
+from memmlp.common.lease_fences import fenced, remove_unfinished
 from memmlp.common.liveness import Changes, myself, place
 
 LEASE = 60.0  # seconds without a sign of life, as another process sees it, after which a claim is over

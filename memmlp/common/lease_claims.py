@@ -31,7 +31,7 @@ class Claim(NamedTuple):
         """The process that made the claim; empty for nobody, None where that cannot be read.
 
         An empty file is nobody's. Who writes into it later (see Claims.make) is stopped by the fence
-        (memmlp.common.fences).
+        (memmlp.common.lease_fences).
         """
         try:
             found = json.loads(self.text or "{}")

@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 from memmlp.common.errors import InputError
 from memmlp.config import plugins
 from memmlp.config.explain import explain
-from memmlp.config.packaged import packaged
+from memmlp.config.package_data import packaged
 from memmlp.config.schema import check, register
 
 VERSION_BASE = "1.3"

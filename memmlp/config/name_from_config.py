@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from memmlp.config.compose import VERSION_BASE
-from memmlp.config.packaged import packaged
+from memmlp.config.package_data import packaged
 from memmlp.config.schema import register
 from memmlp.runs.identity import NETWORK, SLOTS, chosen, flatten, trained_by
 from memmlp.runs.shown_name import kind_words

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import digest, read_json, write_json
-from memmlp.config.packaged import packaged
+from memmlp.config.package_data import packaged
 from memmlp.config.plugins import activate, named, texts
 from memmlp.sweep.kept_sweep import keep
 from memmlp.sweep.parsing import load_sweep

@@ -27,7 +27,7 @@ import yaml
 from memmlp.common import plugin as known
 from memmlp.common.errors import InputError
 from memmlp.common.plugin import Plugin
-from memmlp.config.packaged import packaged
+from memmlp.config.package_data import packaged
 from memmlp.evaluation.units import HIGHER, SMALLEST, UNITS
 from memmlp.runs.environment import package_sources
 from memmlp.runs.identity import flatten

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from memmlp.common.progress import progress_bar
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.motion.body import ROTATION, SPARSE_DIM
-from memmlp.motion.threads import one_thread
+from memmlp.motion.torch_threads import one_thread
 from memmlp.networks.memory import Blend
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.vqvae import Codebook

@@ -18,7 +18,7 @@ import onnx
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 from torch import Tensor
 
-from memmlp.common.fences import publish, temporary
+from memmlp.common.lease_fences import publish, temporary
 from memmlp.deploy.onnx_stream import OnnxStream
 from memmlp.motion.body import SPARSE_DIM
 

@@ -23,7 +23,7 @@ from memmlp.motion.geometry import (
     sixd_to_matrix,
 )
 from memmlp.motion.normalizer import Normalizer
-from memmlp.networks.reaching import reached, tracked
+from memmlp.networks.reaching_arms import reached, tracked
 
 Objective = Callable[[Tensor, Tensor], Tensor]
 
@@ -83,7 +83,7 @@ class LBFGS:
 
 
 class Arms:
-    """The arms alone, in closed form: wrists at their trackers (`memmlp.networks.reaching`).
+    """The arms alone, in closed form: wrists at their trackers (`memmlp.networks.reaching_arms`).
 
     It needs no positions, and so goes with every network.
     """

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from memmlp.common.fences import publish, temporary
 from memmlp.common.lease import Lock
+from memmlp.common.lease_fences import publish, temporary
 from memmlp.motion.preparing.cache import ClipFolder, finished_cache, prepare
 from memmlp.motion.preparing.coverage import Coverage
 from memmlp.motion.preparing.find import FoundFiles, clip_name

@@ -14,7 +14,7 @@ from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_m
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import Learned
-from memmlp.networks.reaching import reached, tracked
+from memmlp.networks.reaching_arms import reached, tracked
 from memmlp.networks.recurrent_cells import CELLS, Cell
 from memmlp.networks.windowless_model import WindowlessModel
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from memmlp.common import fences
+from memmlp.common import lease_fences
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, plain
 
@@ -52,13 +52,13 @@ class MetricsLog:
             LeaseLost: if the run has another owner by now.
             OSError: if the disk is full; the log is as it was.
         """
-        fences.check_owner(self.path)
+        lease_fences.check_owner(self.path)
         if not self._whole:
             self.repair()
         entry = {"step": step, "phase": phase, "time": round(time.time(), 3), "values": dict(values)}
         line = json.dumps(plain(entry), allow_nan=False).encode() + b"\n"
         with open(self.path, "ab", buffering=0) as file:
-            fences.check_owner(
+            lease_fences.check_owner(
                 self.path
             )  # who is frozen from here on writes to a file that `repair` replaced
             self._whole = False

@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 
-from memmlp.common import fences
+from memmlp.common import lease_fences
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write, file_digest, now, read_json, sync_folder, write_json
 from memmlp.common.lease import Lease, Lock
@@ -199,7 +199,7 @@ class Run:
         attempts = self.manifest.get("attempts", [])
         if self.failure and attempts:
             self.write_manifest({"forgiven": len(attempts)})
-        fences.check_owner(self.folder)
+        lease_fences.check_owner(self.folder)
         (self.folder / "FAILED").unlink(missing_ok=True)
 
     def begin(
@@ -358,7 +358,7 @@ class Run:
         """Remove the run's own files, the marker first, and nothing else."""
         if not self.folder.exists():
             return
-        fences.check_owner(self.folder)
+        lease_fences.check_owner(self.folder)
         self.marker.unlink(missing_ok=True)
         sync_folder(self.folder)
         self._remove((*self.FILES, self.marker.name))
@@ -368,7 +368,7 @@ class Run:
         self._remove(self.STAGES)
 
     def _remove(self, names: Iterable[str]) -> None:
-        fences.check_owner(self.folder)
+        lease_fences.check_owner(self.folder)
         for name in names:
             temporary = str(Path(name).with_name(f".{Path(name).name}.*.tmp"))
             for path in (*self.folder.glob(name), *self.folder.glob(temporary)):

@@ -19,7 +19,7 @@ import pytest
 from machines import Clock, Machine, Scheduler, apart, taken, without_locks
 from processes import started
 
-from memmlp.common import fences, lease
+from memmlp.common import lease, lease_fences
 from memmlp.common.errors import LeaseLost
 from memmlp.common.files import atomic_write
 from memmlp.common.lease import LEASE, Lease, Lock
@@ -214,7 +214,7 @@ def test_a_freeze_between_check_and_rename_publishes_nothing(tmp_path: Path, clo
         replace(unfinished, path)
 
     one.take()
-    monkeypatch.setattr("memmlp.common.fences.os.replace", frozen)
+    monkeypatch.setattr("memmlp.common.lease_fences.os.replace", frozen)
     with pytest.raises(LeaseLost):
         one(atomic_write, result, "late")
     assert taken_over[0].number == 2
@@ -320,7 +320,7 @@ def test_a_folder_beside_its_lock(tmp_path: Path, clock: Clock):
     one.lock, two.lock = Lock(tmp_path, "data"), Lock(tmp_path, "data")
 
     def begin() -> Path:
-        unfinished = fences.temporary(place)
+        unfinished = lease_fences.temporary(place)
         unfinished.mkdir()
         (unfinished / "half").touch()
         return unfinished
@@ -332,8 +332,8 @@ def test_a_folder_beside_its_lock(tmp_path: Path, clock: Clock):
     assert two.take()
     assert not left.exists()
     with pytest.raises(LeaseLost):
-        one(fences.publish, left, place)
-    two(fences.publish, two(begin), place)
+        one(lease_fences.publish, left, place)
+    two(lease_fences.publish, two(begin), place)
     assert (place / "half").exists()
 
 
@@ -345,14 +345,14 @@ def test_whatever_the_order_nothing_is_published_by_an_earlier_owner(tmp_path, c
     published: list[tuple[int, int]] = []
     result = tmp_path / "result"
     scheduler = Scheduler(monkeypatch, clock, dice, pause=LEASE / 2)
-    replace = fences.os.replace
+    replace = lease_fences.os.replace
 
     def recorded(unfinished: Path, path: Path) -> None:
         replace(unfinished, path)
         if path == result:
-            published.append((fences._FENCES[tmp_path].number, max(begun)))
+            published.append((lease_fences._FENCES[tmp_path].number, max(begun)))
 
-    monkeypatch.setattr(fences.os, "replace", recorded)
+    monkeypatch.setattr(lease_fences.os, "replace", recorded)
 
     def work() -> None:
         for _ in range(12):

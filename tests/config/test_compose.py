@@ -15,7 +15,7 @@ from memmlp.common.errors import InputError
 from memmlp.config import schema
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import VERSION_BASE, _hydra, composed, parse, preflight
-from memmlp.config.packaged import packaged
+from memmlp.config.package_data import packaged
 from memmlp.runs.identity import NEUTRAL, flatten
 
 FOLDERS = packaged("conf").glob("*/")

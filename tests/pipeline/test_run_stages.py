@@ -21,7 +21,7 @@ from PIL import Image
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
-from memmlp.config.packaged import packaged
+from memmlp.config.package_data import packaged
 from memmlp.live.stream import Stream
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline import run_stages

@@ -7,6 +7,6 @@ same name starts from it, so that unknown keys and wrong types are refused when 
 
 from memmlp.config.schema.checks import check, unknown_key
 from memmlp.config.schema.config import SCHEMAS, Config, add_schema, register
-from memmlp.config.schema.restoring import restored
+from memmlp.config.schema.recorded_configs import restored
 
 __all__ = ["SCHEMAS", "Config", "add_schema", "check", "register", "restored", "unknown_key"]

@@ -130,7 +130,7 @@ def npz_frames(path: Path, rest: np.ndarray) -> np.ndarray:
     from memmlp.motion.clip import resample
     from memmlp.motion.features import motion_frames
     from memmlp.motion.formats.npz import read_clip
-    from memmlp.motion.plausible import check_plausible
+    from memmlp.motion.plausibility import check_plausible
 
     recorded = read_clip(path, path.stem)
     check_plausible(path, recorded)

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from memmlp import __version__
 from memmlp.common.errors import InputError
-from memmlp.common.fences import publish, temporary
 from memmlp.common.files import file_digest, now, read_json
+from memmlp.common.lease_fences import publish, temporary
 from memmlp.deploy.latency import yardstick
 from memmlp.live.player.play import TOP
 from memmlp.live.web.clips import SiteClip, write_clips

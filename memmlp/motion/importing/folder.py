@@ -26,7 +26,7 @@ from memmlp.motion.importing.recording import Recording
 from memmlp.motion.importing.rest_pose import STRAIGHTEST
 from memmlp.motion.importing.skeleton import SkeletonMap, find_skeleton, is_number, load_skeleton
 from memmlp.motion.preparing.groups import Grouping
-from memmlp.motion.threads import one_thread
+from memmlp.motion.torch_threads import one_thread
 
 RECORD = "import.json"
 

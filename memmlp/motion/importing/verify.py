@@ -15,7 +15,7 @@ from memmlp.motion.importing.convert import AUTO, convert
 from memmlp.motion.importing.fidelity import Fidelity, compare
 from memmlp.motion.importing.files import find_recordings, read_recording
 from memmlp.motion.importing.skeleton import find_skeleton, load_skeleton
-from memmlp.motion.threads import one_thread
+from memmlp.motion.torch_threads import one_thread
 
 
 @dataclass(frozen=True)

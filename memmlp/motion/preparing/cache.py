@@ -21,19 +21,19 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.common.fences import check_owner, publish, temporary
 from memmlp.common.lease import Lock
+from memmlp.common.lease_fences import check_owner, publish, temporary
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS, FRAME_DIM, load_rest_joints
 from memmlp.motion.clip import Clip, resample
 from memmlp.motion.formats.npz import read_clip
 from memmlp.motion.preparing.duplicates import assign
 from memmlp.motion.preparing.find import clip_name
+from memmlp.motion.preparing.folder_survey import Survey, survey
 from memmlp.motion.preparing.folders import Folders, Root, find_all
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest, write_manifest
 from memmlp.motion.preparing.splits import PARTS, Split
-from memmlp.motion.preparing.survey import Survey, survey
-from memmlp.motion.threads import one_thread
+from memmlp.motion.torch_threads import one_thread
 from memmlp.runs.recipe_numbers import RECIPES
 
 FRAMES_VERSION = (

@@ -15,7 +15,7 @@ from memmlp.common import distributed
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM, TRACKED
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.agrol import TimeEmbedding, WholeWindow
-from memmlp.networks.baselines.ancestral import AncestralDiffusion, Made
+from memmlp.networks.baselines.ancestral_diffusion import AncestralDiffusion, Made
 from memmlp.networks.baselines.encoder import Attention
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import Learned

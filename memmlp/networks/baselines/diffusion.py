@@ -1,7 +1,7 @@
 """Denoising diffusion: schedules of noise, the noising of training signals, and DDIM.
 
-DDIM is for networks that predict the clean signal; memmlp.networks.baselines.ancestral is for those that
-predict the noise.
+DDIM is for networks that predict the clean signal; memmlp.networks.baselines.ancestral_diffusion is for
+those that predict the noise.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM
-from memmlp.networks.baselines.ancestral import Made
+from memmlp.networks.baselines.ancestral_diffusion import Made
 from memmlp.networks.baselines.bodiffusion import NOISY, BoDiffusion, DiTBlock
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming.baselines import AGRoLStream

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from memmlp.report.ui import facts as run_facts
+from memmlp.report.ui import run_facts
 from memmlp.runs.identity import ID
 from memmlp.runs.run import Run
 

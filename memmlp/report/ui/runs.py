@@ -8,8 +8,8 @@ from typing import Any
 
 from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
-from memmlp.report.ui.facts import COSTS, read_config
 from memmlp.report.ui.index import Index
+from memmlp.report.ui.run_facts import COSTS, read_config
 from memmlp.runs.identity import NEUTRAL, flatten, is_data_path
 from memmlp.runs.lookup import is_trained
 from memmlp.runs.run import Run

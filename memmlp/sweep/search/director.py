@@ -14,7 +14,7 @@ from pathlib import Path
 
 from optuna.trial import Trial, TrialState
 
-from memmlp.common import fences
+from memmlp.common import lease_fences
 from memmlp.common.errors import InputError
 from memmlp.runs.identity import inference
 from memmlp.runs.metrics_log import Metrics
@@ -217,7 +217,7 @@ def direct(director: Director, fleet: Fleet, board: SearchBoard, path: Path) -> 
     try:
         with board:
             while plan is None or director.going:
-                fences.check_owner(path)
+                lease_fences.check_owner(path)
                 before, plan = plan, director.look(fleet.size)
                 if plan != before:
                     plan.save(path)

@@ -24,7 +24,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
 
-from memmlp.common import fences
+from memmlp.common import lease_fences
 from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
 from memmlp.sweep.search.spec import Range, Search, Value
@@ -157,7 +157,7 @@ class FencedJournal(JournalFileBackend):
         """Append lines to the journal. Raises LeaseLost if its folder has another owner by now."""
         lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
         with open(self.path, "ab") as file:
-            fences.check_owner(self.path)  # after opening: `mend` gave a later owner another file
+            lease_fences.check_owner(self.path)  # after opening: `mend` gave a later owner another file
             file.write(lines.encode())
             file.flush()
             os.fsync(file.fileno())

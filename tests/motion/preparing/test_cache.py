@@ -18,7 +18,7 @@ from memmlp.motion.dataset import MotionDataset
 from memmlp.motion.features import motion_frames
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.preparing import cache as module
-from memmlp.motion.preparing import survey
+from memmlp.motion.preparing import folder_survey
 from memmlp.motion.preparing.cache import ClipFolder, prepare
 from memmlp.motion.preparing.manifest import Manifest
 from memmlp.motion.preparing.splits import SeededSplit
@@ -85,7 +85,7 @@ def test_unchanged_sources_are_not_read_again(root, tmp_path, monkeypatch):
         raise AssertionError("read a clip")
 
     with monkeypatch.context() as patch:
-        patch.setattr(survey, "read_clip", no_reading)
+        patch.setattr(folder_survey, "read_clip", no_reading)
         assert prepare(source(root), tmp_path / "cache") == first
     write_clip(root / "a" / "3.npz", motion(90, 77))
     assert prepare(source(root), tmp_path / "cache").digest != first.digest

@@ -9,8 +9,8 @@ import pytest
 from memmlp.motion.clip import Clip, resample
 from memmlp.motion.formats.npz import write_clip
 from memmlp.motion.preparing.cache import ClipFolder, prepare
+from memmlp.motion.preparing.folder_survey import survey
 from memmlp.motion.preparing.splits import ListSplit, SeededSplit
-from memmlp.motion.preparing.survey import survey
 from memmlp.motion.synthetic import synthesize_clip
 
 ACTIVITIES = ("walking", "running", "idling", "waving", "jumping", "punching")

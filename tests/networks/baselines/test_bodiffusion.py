@@ -12,8 +12,8 @@ from memmlp.evaluation import modes
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
 from memmlp.motion.body import ROTATION, SPARSE_DIM
-from memmlp.networks.baselines import ancestral
-from memmlp.networks.baselines.ancestral import Made
+from memmlp.networks.baselines import ancestral_diffusion as ancestral
+from memmlp.networks.baselines.ancestral_diffusion import Made
 from memmlp.networks.baselines.bodiffusion import DiTBlock
 from memmlp.networks.streaming import has_stream, streaming
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from report.ui.conftest import begun, run_of
 
-from memmlp.report.ui import facts as run_facts
-from memmlp.report.ui.facts import facts, last_entries, read_config
+from memmlp.report.ui import run_facts
 from memmlp.report.ui.index import Index
+from memmlp.report.ui.run_facts import facts, last_entries, read_config
 
 
 def test_facts_of_a_finished_run(outputs: Path):

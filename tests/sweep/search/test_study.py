@@ -15,7 +15,7 @@ from fake_search import (
 )
 
 from memmlp.common.errors import InputError, LeaseLost
-from memmlp.common.fences import fenced
+from memmlp.common.lease_fences import fenced
 from memmlp.sweep.search.study import Study, journal, mend
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from memmlp.networks.baselines.ancestral import AncestralDiffusion, Made, binned_surprise
+from memmlp.networks.baselines.ancestral_diffusion import AncestralDiffusion, Made, binned_surprise
 from memmlp.networks.baselines.diffusion import linear_schedule
 
 OPEN = torch.tensor(-9.0), torch.tensor(9.0)

@@ -14,7 +14,7 @@ from memmlp.motion.importing.folder import import_folder
 from memmlp.motion.importing.skeleton import load_skeleton
 from memmlp.motion.importing.verify import verify
 from memmlp.motion.synthetic import synthesize_clip
-from memmlp.motion.threads import one_thread
+from memmlp.motion.torch_threads import one_thread
 
 
 @pytest.fixture(autouse=True)

@@ -7,7 +7,7 @@ import signal
 
 import pytest
 
-from memmlp.common.ending import closed_in_peace, termination_interrupts
+from memmlp.common.termination import closed_in_peace, termination_interrupts
 
 
 class Slow:

@@ -13,9 +13,18 @@ from onnx import ModelProto, TensorProto, helper, numpy_helper
 
 from memmlp.cli.export import TARGETS as NAMES
 from memmlp.common.errors import InputError
+from memmlp.deploy.operator_support import (
+    KERNELS,
+    TARGETS,
+    Published,
+    Rule,
+    findings,
+    load_graph,
+    published,
+    remarks,
+)
 from memmlp.deploy.opsets import converted
 from memmlp.deploy.quantization import quantise
-from memmlp.deploy.targets import KERNELS, TARGETS, Published, Rule, findings, load_graph, published, remarks
 from memmlp.networks.streaming import streaming
 
 LISTS = sorted({name for names in TARGETS.values() for name in names} - set(KERNELS))

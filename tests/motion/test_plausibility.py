@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from memmlp.motion.clip import Clip
-from memmlp.motion.plausible import implausible, unusual
+from memmlp.motion.plausibility import implausible, unusual
 from memmlp.motion.synthetic import synthesize_clip
 
 ACTIVITIES = ("walking", "jumping", "sitting", "idling")

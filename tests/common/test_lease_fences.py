@@ -11,8 +11,8 @@ import pytest
 from begun_runs import complete
 
 from memmlp.common.errors import LeaseLost
-from memmlp.common.fences import fenced, publish, remove_unfinished, temporary
 from memmlp.common.files import atomic_write, write_json
+from memmlp.common.lease_fences import fenced, publish, remove_unfinished, temporary
 from memmlp.runs.evaluation_file import write_report
 from memmlp.runs.run import Run
 

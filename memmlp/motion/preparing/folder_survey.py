@@ -14,7 +14,7 @@ from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS
 from memmlp.motion.clip import Clip, Skipped, resample
 from memmlp.motion.formats.npz import NoMotion, read_clip
-from memmlp.motion.plausible import check_plausible, unusual
+from memmlp.motion.plausibility import check_plausible, unusual
 from memmlp.motion.preparing.find import FoundFiles, clip_name
 from memmlp.motion.preparing.folders import Root, find_all
 from memmlp.motion.preparing.manifest import STILL, ClipRecord

@@ -9,9 +9,9 @@ import pytest
 
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.preparing.cache import ClipFolder, prepare
+from memmlp.motion.preparing.folder_survey import survey
 from memmlp.motion.preparing.manifest import Manifest
 from memmlp.motion.preparing.splits import ListSplit, SeededSplit
-from memmlp.motion.preparing.survey import survey
 from memmlp.motion.synthetic import synthesize_clip
 
 
