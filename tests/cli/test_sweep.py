@@ -231,7 +231,8 @@ def test_a_look_at_other_seeds_or_without_the_data_leaves_a_sweep_as_it_was(
 
 
 @pytest.mark.slow
-def test_an_interrupted_sweep_ends_its_workers_and_goes_on_later(tmp_path: Path):
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_sweep_ends_its_workers_and_goes_on_later(tmp_path: Path, ending: int):
     write(tmp_path, {"none": ["memory=none"]})
     line = [*MAIN, "sweep", "trial.yaml", *TINY, "optim.steps=100000"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
@@ -240,10 +241,11 @@ def test_an_interrupted_sweep_ends_its_workers_and_goes_on_later(tmp_path: Path)
         until(begun, "the run's first steps", process)
         run = list_runs(tmp_path / "outputs")[0]
         assert run.doing
-        process.send_signal(signal.SIGINT)
+        process.send_signal(ending)
         said, _ = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130, said
     assert "interrupted" in said
+    assert "Traceback" not in said
     until(lambda: run.status in ("stopped", "lost"), "its worker ends")
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import submitit
+from submitit.core.utils import JobPaths
 from submitit.local import local
 
 from memmlp.sweep.executors.executor import Work
@@ -26,7 +28,11 @@ class LocalExecutor(submitit.LocalExecutor):
 
     def _submit_command(self, command: str) -> local.LocalJob:
         visible = ",".join(self.gpus)
-        process = local.start_controller(self.folder, command, cuda_devices=visible, timeout_min=UNLIMITED)
+        logs = JobPaths.get_first_id_independent_folder(self.folder)
+        with _stderr_to(logs / "controllers.err"):  # they die of Ctrl-C with a traceback
+            process = local.start_controller(
+                self.folder, command, cuda_devices=visible, timeout_min=UNLIMITED
+            )
         return local.LocalJob(self.folder, str(process.pid), process=process)
 
 
@@ -71,6 +77,19 @@ def _interruptible() -> Iterator[None]:
     finally:
         if before is signal.SIG_IGN:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@contextlib.contextmanager
+def _stderr_to(path: Path) -> Iterator[None]:
+    """Processes started herein write to a file, at its end, what they would write to stderr."""
+    before = os.dup(2)
+    try:
+        with path.open("ab") as file:
+            os.dup2(file.fileno(), 2)
+        yield
+    finally:
+        os.dup2(before, 2)
+        os.close(before)
 
 
 class Debug:
