@@ -29,6 +29,9 @@ WORDS = {
 }  # fmt: skip
 
 
+ARM_WIDTH = 20  # columns that an arm's name has at least, or as many as it needs
+
+
 class Screen:
     """Shows something that changes: in place on a terminal, elsewhere with a line for every change."""
 
@@ -105,10 +108,11 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
     tasks = {task.key: task for task in plan.tasks}
     seeds = sorted({entry.seed for entry in plan.entries})
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=f"sweep {plan.name}", title_justify="left")
-    table.add_column("arm", overflow="fold")
+    labels = list(dict.fromkeys(entry.label for entry in plan.entries))
+    table.add_column("arm", overflow="fold", min_width=min(ARM_WIDTH, max(map(len, labels), default=0)))
     for seed in seeds:
-        table.add_column(f"seed {seed}", no_wrap=True)
-    for label in dict.fromkeys(entry.label for entry in plan.entries):
+        table.add_column(f"seed {seed}")
+    for label in labels:
         cells = {
             e.seed: state_text(plan, tasks[e.key], states[e.key]) for e in plan.entries if e.label == label
         }
@@ -117,7 +121,7 @@ def render(plan: Plan, states: Mapping[str, str]) -> Group:
     running = [plan.run_of(task) for task in plan.tasks if states[task.key] == "running"]
     below += [Text(_counts(states)), *map(Text, devices(running))]
     if any(states[task.key] == "done" and result(plan.run_of(task)) for task in plan.tasks):
-        below.append(Text("cm: MPJPE in stream mode of the rotation branch; a table may show another"))
+        below.append(Text("cm: done; MPJPE in stream mode of the rotation branch, a table may show another"))
     below += [
         Text(f"{name(plan, task)}: {plan.run_of(task).failure}", style="red")
         for task in plan.tasks
@@ -132,7 +136,7 @@ def state_text(plan: Plan, task: RunTask, state: str) -> Text:
     if state == "running":
         return Text(progress_text(run, total_steps(task)), style=COLOURS[state])
     if state == "done":
-        return Text(f"done {result(run)}".rstrip(), style=COLOURS[state])
+        return Text(result(run) or state, style=COLOURS[state])
     return Text(WORDS.get(state, state), style=COLOURS.get(state, ""))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -42,8 +43,8 @@ def test_what_a_finished_cell_shows_is_said_below(
     monkeypatch.setattr(Run, "results", {"stream": {"rotation": {"MPJPE": 4.321}}})
     Console(width=200).print(render(plan, states))
     said = capsys.readouterr().out
-    assert "done 4.32 cm" in said
-    assert "cm: MPJPE in stream mode of the rotation branch" in said
+    assert "4.32 cm" in said
+    assert "cm: done; MPJPE in stream mode of the rotation branch" in said
 
 
 def test_a_run_whose_training_is_over_shows_its_stage(plan: Plan):
@@ -57,3 +58,16 @@ def test_a_run_whose_training_is_over_shows_its_stage(plan: Plan):
 def test_names(plan: Plan):
     assert [device_name(plan.run_of(task)) for task in plan.tasks[1:3]] == ["GPU 1 (A card)", "cpu"]
     assert device_name(plan.run_of(RunTask("f" * 16, "memmlp", {}))) == ""
+
+
+def test_a_name_is_not_broken_into_letters_where_there_are_many_seeds(
+    plan: Plan, capsys: pytest.CaptureFixture
+):
+    """Seen with five seeds at 80 columns: an arm's name had three letters a line."""
+    only = plan.entries[0]
+    wide = replace(
+        plan, entries=tuple(replace(only, label="AvatarPoser + refiner", seed=n) for n in range(5))
+    )
+    states = dict.fromkeys([task.key for task in plan.tasks], "trained")
+    Console(width=80).print(render(wide, states))
+    assert "AvatarPoser +" in capsys.readouterr().out
