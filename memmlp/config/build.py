@@ -134,7 +134,8 @@ def build_training(cfg: DictConfig, metrics: dict[str, OwnMetric]) -> NetworkTra
     common = {"seed": cfg.seed, "optim": built(cfg.optim), "weighting": cfg.data.weighting}
     common |= {"shares": shares(cfg.data), "mirror": cfg.data.mirror, "metrics": metrics}
     if cfg.refiner is not None:
-        return RefinerTraining(refiner=built(cfg.refiner), **common)
+        refiner = built(cfg.refiner)
+        return RefinerTraining(refiner=refiner, **common | {"optim": common["optim"].at(refiner.lr)})
     return NetworkTraining(loss=build_loss(cfg), rollout=built(cfg.rollout), **common)
 
 

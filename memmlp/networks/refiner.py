@@ -29,12 +29,14 @@ class SAGERefiner:
         depth: how many there are.
         frames: frames of a training piece, through which the network streams from a fresh start.
         pieces: how many pieces are drawn from the training clips.
+        lr: learning rate at the start; None for the network's.
     """
 
     width: int
     depth: int
     frames: int
     pieces: int
+    lr: float | None = None
 
     def around(self, network: MotionModel) -> Refined:
         """Return a network with a refiner of fresh weights behind it."""

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from typing import Self
 
 import torch
 from torch import nn
@@ -68,6 +69,10 @@ class Optim:
     checkpoint_every: int = 500
     validate_every: int = 1000
     log_every: int = 50
+
+    def at(self, lr: float | None) -> Self:
+        """Return the same at another first learning rate, the last one in proportion; None for the same."""
+        return self if lr is None else replace(self, lr=lr, final_lr=self.final_lr * lr / self.lr)
 
     def factor(self, step: int) -> float:
         """Return the learning rate at a step as a fraction of the first one."""

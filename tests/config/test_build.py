@@ -349,3 +349,11 @@ def test_a_joint_vqvae_is_part_of_the_runs_identity_and_its_own_stage_is_not():
     assert all(identity(change) != base for change in ("vqvae.codes=32", "vqvae.encoder_depth=2"))
     assert all(identity(change) == base for change in ("vqvae.steps=7", "vqvae.lr=0.5", "tracking=none"))
     assert experiment_of().upstream_identities("data") == []
+
+
+def test_a_refiner_has_a_rate_of_its_own_and_its_network_keeps_its():
+    words = [*TINY, "refiner=sage", "optim.lr=4e-3", "optim.final_lr=4e-4"]
+    plain, own = (build_experiment(composed([*words, *more])) for more in ([], ["refiner.lr=1e-3"]))
+    assert plain.training.optim.lr == 4e-3
+    assert (own.training.optim.lr, own.training.optim.final_lr) == (1e-3, pytest.approx(1e-4))
+    assert own.unrefined.training.optim.lr == 4e-3

@@ -122,6 +122,14 @@ def test_the_warm_up_grows_in_equal_parts_and_then_the_schedule_is_what_it_was()
     assert [replace(OPTIMS["schedule_free"], warmup=2).factor(step) for step in range(4)] == [0.5, 1, 1, 1]
 
 
+def test_at_another_rate_the_course_is_the_same():
+    plain = Optim(steps=10, batch=1, lr=4.0, final_lr=0.4, schedule="cosine", warmup=2)
+    other = plain.at(1.0)
+    assert (other.lr, other.final_lr) == (1.0, pytest.approx(0.1))
+    assert [other.factor(step) for step in range(10)] == pytest.approx([plain.factor(n) for n in range(10)])
+    assert plain.at(None) == plain
+
+
 def test_a_library_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(__import__("sys").modules, "schedulefree", None)
     with pytest.raises(InputError, match=r"optim=schedule_free: .* pip install 'memmlp\[schedulefree\]'"):

@@ -18,6 +18,7 @@ from memmlp.config.schema.rules import (
     fraction,
     key,
     one_of,
+    optional,
     positive,
     standing,
     target,
@@ -293,6 +294,7 @@ class SAGERefinerConfig(RefinerConfig):
     depth: int = at_least(1)
     frames: int = at_least(4)
     pieces: int = at_least(1)
+    lr: Optional[float] = optional(Within(0, strict=True))
 
 
 @dataclass
