@@ -83,9 +83,14 @@ def save_command(
     found: Mapping[str, RunsBySeed] = finished_runs(known.sweep, finder(known.plan, functools.cache(load)))
     path = out / f"{stem or sweep.name}.json"
     files: tuple[str, ...] = ()
+    its_own = 0
     if also_kept:
         from memmlp.config.shared_results import with_kept
 
+        # What the file itself has stands before the same runs of other files, whose costs were measured then.
+        before = _count(found)
+        found = with_kept(found, known.plan, [path] if path.exists() else []).runs
+        its_own = _count(found) - before
         found, files, flags, skipped = with_kept(found, known.plan, sorted(set(out.glob("*.json")) - {path}))
         known = known._replace(flags=(*known.flags, *flags))
         for line in skipped:
@@ -109,7 +114,7 @@ def save_command(
     merged = _merged(path, load_kept(path), kept, ids) if path.exists() else kept
     save(path, merged)
     here = f"from here{''.join(f' and {origin}' for origin in files)}"
-    click.echo(f"{path}: {merged.count} runs, {kept.count} of them {here}")
+    click.echo(f"{path}: {merged.count} runs, {kept.count - its_own} of them {here}")
 
 
 @results.command("docs")
@@ -228,6 +233,10 @@ def _outdated(kept: Kept) -> list[str]:
 
     found = sorted({words for run in kept.every for words in outdated(run.origin.recipes)})
     return [f"made by an earlier recipe: {', '.join(found)}"] if found else []
+
+
+def _count(runs: Mapping[str, RunsBySeed]) -> int:
+    return sum(map(len, runs.values()))
 
 
 def _merged(path: Path, before: Kept, kept: Kept, ids: Mapping[tuple[str, int], str]) -> Kept:

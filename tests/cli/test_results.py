@@ -10,6 +10,7 @@ import pytest
 from conftest import Memmlp, one_line
 from fake_runs import fake_sweep
 
+from memmlp.config import plan_sweep
 from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.plan import Entry, Plan
 from memmlp.sweep.spec import Sweep
@@ -65,6 +66,29 @@ def test_results_of_an_earlier_default_do_not_stand_beside_todays(
     assert path.read_text() == json.dumps(content)
     memmlp("results", "save", "14")
     assert json.loads(path.read_text())["cells"]["2"]["1"] == earlier
+
+
+def test_what_a_file_has_stands_before_the_same_runs_of_other_files(
+    memmlp: Memmlp, planned: None, monkeypatch: pytest.MonkeyPatch
+):
+    """Their costs were measured at another time."""
+    monkeypatch.setattr("memmlp.config.shared_results.outdated", lambda recipes: [])
+    monkeypatch.setattr("memmlp.config.shared_results.plan_anew", plan_sweep.make_plan)
+    memmlp("results", "save", "14")
+    path = Path("docs/results/data/table14.json")
+    own = path.read_text()
+    other = json.loads(own)
+    for run in other["runs"].values():
+        run["costs"]["ms"] = 1e6
+    del other["digest"]
+    path.with_name("earlier.json").write_text(json.dumps(other))
+    monkeypatch.setattr("memmlp.tables.build_table.finished_runs", lambda *given: {})
+    assert memmlp("results", "save", "14", "--kept").out.endswith("12 runs, 0 of them from here\n")
+    assert path.read_text() == own
+    path.unlink()
+    assert memmlp("results", "save", "14", "--kept").out.endswith(
+        "12 runs, 12 of them from here and earlier\n"
+    )
 
 
 @pytest.mark.slow
