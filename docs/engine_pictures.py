@@ -18,8 +18,8 @@ from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES, Space
 from memmlp.motion.body import JOINTS, PARENTS, TRACKED, builtin_rest_joints
 from memmlp.motion.limb_shapes import RADII
+from memmlp.render.canvas import FAINT, INK, Sheet, png
 from memmlp.render.raster import Camera, draw
-from memmlp.render.sheet import FAINT, INK, Sheet, png
 from memmlp.render.skeleton_map import LEFT, MIDDLE, RIGHT
 
 IMAGES = Path(__file__).parent / "images"

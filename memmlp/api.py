@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from memmlp.live.spaces import SpaceName
     from memmlp.live.stream import RotationFormat
     from memmlp.networks.motion_model import MotionModel
-    from memmlp.render.take import Take
+    from memmlp.render.clip_piece import Take
 
 StrPath = str | os.PathLike[str]
 Mode = Literal["stream", "window"]
@@ -307,8 +307,8 @@ class Prediction:
             InputError: for another kind of file, a folder that is not there, another branch, a piece without
                 frames, a number of poses out of range, or where MP4 is asked for and PyAV is not installed.
         """
-        from memmlp.render.picture import check_picture, write_picture
-        from memmlp.render.take import span
+        from memmlp.render.clip_piece import span
+        from memmlp.render.figure_or_film import check_picture, write_picture
 
         file = Path(path)
         check_picture(file)
@@ -346,7 +346,7 @@ class Prediction:
 
     def _take(self, branch: Branch, first: int = 0, last: int | None = None) -> Take:
         """The frames of a branch from one up to another, to be drawn."""
-        from memmlp.render.take import Take
+        from memmlp.render.clip_piece import Take
 
         _check("branch", branch, [name for name, joints in self._joints.items() if joints is not None])
         joints = self._joints[branch]

@@ -78,10 +78,11 @@ LONGEST = (
     "kills/test_search", "pipeline/test_experiment", "live/test_full_graph", "pipeline/test_baselines",
     "test_example_package", "networks/test_streaming", "training/test_loop", "config/test_baselines",
     "kills/test_rounds", "config/test_compose", "cli/test_main", "live/test_stream",
-    "kills/test_sweep", "tables/test_rounds", "networks/baselines/test_baselines", "deploy/test_export",
+    "kills/test_sweep", "tables/test_seed_rounds", "networks/baselines/test_baselines", "deploy/test_export",
     "cli/test_tune", "live/web/test_page", "report/ui/test_page", "kills/test_command", "kills/test_training",
-    "cli/test_train_distributed", "tracking/test_mlflow_server", "tracking/test_mlflow_tracker",
-    "live/player/test_live_page", "common/test_distributed", "cli/test_look",
+    "cli/test_train_distributed", "experiment_tracking/test_mlflow_server",
+    "experiment_tracking/test_mlflow_tracker", "live/player/test_live_page", "common/test_distributed",
+    "cli/test_look",
 )  # fmt: skip
 
 SLOW_TIMEOUT = 3600  # seconds: ends what hangs, but not what is slow on a machine with much other work

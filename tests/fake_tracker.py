@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from memmlp.experiment_tracking.logged_values import CurvePoint, RunFacts, SweepFacts
 from memmlp.runs.run import Run
-from memmlp.tracking.view import Facts, Point, SweepFacts
 
 
 @dataclass
@@ -43,7 +43,7 @@ class FakeTracker:
         self.server.ask()
         return run_id in self.server.status
 
-    def begin(self, facts: Facts, points: Sequence[Point]) -> FakeShown:
+    def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> FakeShown:
         """Show it anew."""
         self.server.ask()
         self.server.begun += 1
@@ -65,7 +65,7 @@ class FakeShown:
     def __init__(self, server: Server, run_id: str):
         self.server, self.run_id = server, run_id
 
-    def log(self, points: Sequence[Point]) -> None:
+    def log(self, points: Sequence[CurvePoint]) -> None:
         """Add to what the server has."""
         self.server.ask()
         self.server.values[self.run_id] += [(p.key, p.step, p.value) for p in points]
@@ -73,7 +73,7 @@ class FakeShown:
             self.server.drops = False
             raise ConnectionError("connection reset")
 
-    def end(self, facts: Facts, results: Sequence[Point]) -> None:
+    def end(self, facts: RunFacts, results: Sequence[CurvePoint]) -> None:
         """Note how it ended."""
         self.server.ask()
         self.server.status[facts.id] = facts.status
@@ -101,7 +101,7 @@ class FileTracker:
         """Whether the file speaks of the run."""
         return self.path.exists() and run_id in self.path.read_text()
 
-    def begin(self, facts: Facts, points: Sequence[Point]) -> FileTracker:
+    def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> FileTracker:
         """Write that it begins."""
         if self.hangs:
             threading.Event().wait()
@@ -109,13 +109,13 @@ class FileTracker:
         self.log(points)
         return self
 
-    def log(self, points: Sequence[Point]) -> None:
+    def log(self, points: Sequence[CurvePoint]) -> None:
         """Write values, those of training."""
         for point in points:
             if point.key.startswith("train"):
                 self._write(f"{point.key} {point.step} {point.value:g}")
 
-    def end(self, facts: Facts, results: Sequence[Point]) -> None:
+    def end(self, facts: RunFacts, results: Sequence[CurvePoint]) -> None:
         """Write how it ended."""
         self._write(f"end {facts.id} {facts.status}")
 

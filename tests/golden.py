@@ -1,7 +1,7 @@
 """The numbers that every component makes of fixed inputs, for tests/test_golden.py.
 
 `make golden` writes that file anew. It refuses where a component's numbers changed and its number in
-memmlp/runs/recipe_numbers.py did not: raise that first, in the same commit.
+memmlp/runs/recipe_versions.py did not: raise that first, in the same commit.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from memmlp.networks.memory import (
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.predictor import RotationOnly, RotationOnlyMemory, TwoBranch, TwoBranchMemory
 from memmlp.networks.recurrent_cells import CELLS
-from memmlp.runs.recipe_numbers import RECIPES
+from memmlp.runs.recipe_versions import RECIPES
 from memmlp.training.loop import seed_step
 from memmlp.training.losses import (
     AGRoLLoss,
@@ -302,7 +302,7 @@ def numbers(case: str) -> Numbers:
 
 
 def stored() -> dict[str, dict[str, Any]]:
-    """What golden.json holds: a recipe number and numbers by component."""
+    """What golden.json holds: a recipe version and numbers by component."""
     return json.loads(PATH.read_text()) if PATH.exists() else {}
 
 
@@ -317,7 +317,7 @@ def record() -> None:
     }
     wrong = [case for case, old in known.items() if old.keys() & changed(now[case], old, tolerance(case))]
     if wrong:
-        sys.exit(f"raise the number of {', '.join(wrong)} in memmlp/runs/recipe_numbers.py: they changed")
+        sys.exit(f"raise the number of {', '.join(wrong)} in memmlp/runs/recipe_versions.py: they changed")
     kept = {case: {"recipe": RECIPES[case], "numbers": now[case] | known.get(case, {})} for case in CASES}
     PATH.write_text(json.dumps(kept, indent=1) + "\n")
 

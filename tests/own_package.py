@@ -14,7 +14,7 @@ from memmlp.common.plugin import METRICS
 from memmlp.config import plugins
 from memmlp.config.schema import SCHEMAS
 from memmlp.evaluation.units import HIGHER, SMALLEST, UNITS
-from memmlp.runs.recipe_numbers import RECIPES
+from memmlp.runs.recipe_versions import RECIPES
 
 EXAMPLE = Path(__file__).parent.parent / "docs/examples/feet"
 PACKAGE = "memmlp_feet"

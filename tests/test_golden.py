@@ -1,4 +1,4 @@
-"""What components compute is what their recipe numbers stand for (memmlp/runs/recipe_numbers.py)."""
+"""What components compute is what their recipe versions stand for (memmlp/runs/recipe_versions.py)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import golden
 import pytest
 from golden_numbers import changed, tolerance
 
-from memmlp.runs.recipe_numbers import RECIPES
+from memmlp.runs.recipe_versions import RECIPES
 
 
 @pytest.mark.slow
@@ -18,7 +18,7 @@ def test_a_component_computes_what_its_recipe_number_stands_for(case: str):
     now = golden.numbers(case)
     wrong = changed(now, known["numbers"], tolerance(case))
     assert not wrong, (
-        f"raise the number of {case} in memmlp/runs/recipe_numbers.py: it differs in {wrong[:4]}"
+        f"raise the number of {case} in memmlp/runs/recipe_versions.py: it differs in {wrong[:4]}"
     )
 
 

@@ -23,7 +23,7 @@ from memmlp.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from memmlp.live.calibration import Calibration
+    from memmlp.live.calibration_file import Calibration
     from memmlp.live.outputs.output import Output, Outputs
     from memmlp.live.player.server import File
     from memmlp.live.player.sources import ClipSource, TrackedClip, TrackerSource
@@ -267,9 +267,9 @@ def serve(given: InputOptions, shown: ShowOptions) -> None:
     import webbrowser
 
     from memmlp.common.termination import closed_in_peace
-    from memmlp.live.player.fitting import Fitting
     from memmlp.live.player.play import greeting, play, with_avatar
-    from memmlp.live.player.server import Hub, Server
+    from memmlp.live.player.server import Hub, LiveServer
+    from memmlp.live.player.wearer_fitting import Fitting
 
     with contextlib.closing(source_of(given)) as source:
         stream, name = open_stream(given, source.space, shown)
@@ -279,7 +279,10 @@ def serve(given: InputOptions, shown: ShowOptions) -> None:
         hub = Hub(with_avatar(words, stream.rest) if shown.avatar else words)
         fitting = Fitting(stream, source.space, shown.calibration, hub.tell) if source.worn else None
         ask = fitting.ask if fitting else None
-        with closed_in_peace(outputs), Server(hub, shown.port, shown.host, shown.token, files, ask) as server:
+        with (
+            closed_in_peace(outputs),
+            LiveServer(hub, shown.port, shown.host, shown.token, files, ask) as server,
+        ):
             click.echo(f"{server.url}  {source.name}; Ctrl-C ends")
             for output in outputs.outputs:
                 click.echo(f"  to {output.name}")
@@ -314,7 +317,7 @@ def network_file(given: InputOptions) -> tuple[Path, str]:
 
 def known_of(shown: ShowOptions, space: SpaceName, stream: Stream) -> Calibration:
     """Return what is known of the wearer: by the file of --calibration, and by the options before it."""
-    from memmlp.live.calibration import Calibration, read_calibration
+    from memmlp.live.calibration_file import Calibration, read_calibration
     from memmlp.live.wearer import stature
 
     body = stature(stream.network.skeleton)
@@ -350,7 +353,7 @@ def page_files(avatar: str | None, stream: Stream) -> Mapping[str, File]:
 
     if avatar is None:
         return FILES
-    from memmlp.live.player.avatar import avatar_files, mannequin_vrm, read_vrm
+    from memmlp.live.player.avatar_files import avatar_files, mannequin_vrm, read_vrm
 
     return avatar_files(mannequin_vrm(stream.rest) if avatar == OWN else read_vrm(Path(avatar)))
 

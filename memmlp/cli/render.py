@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from memmlp.config.open_run import OpenedRun
-    from memmlp.render.take import Take
+    from memmlp.render.clip_piece import Take
 
 POSITIONS = {"rotation": "predicted_positions", "position": "predicted_positions_of_position_branch"}
 
@@ -80,7 +80,7 @@ def render(
     a second. One colour scale holds for all.
     """
     from memmlp.config.open_run import open_run
-    from memmlp.render.picture import check_picture, write_picture
+    from memmlp.render.figure_or_film import check_picture, write_picture
 
     check_picture(out, "--out")
     check_labels(runs, labels)
@@ -123,7 +123,7 @@ def taken(
 
     from memmlp.common.errors import InputError
     from memmlp.config.open_run import clip_of
-    from memmlp.render.take import Take, span
+    from memmlp.render.clip_piece import Take, span
 
     names = labels or tuple(run.run.id[:8] for run in runs)
     if len(set(names)) < len(names):

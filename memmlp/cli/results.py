@@ -69,14 +69,14 @@ def save_command(
     They are the per-clip results of its finished runs. SWEEP and OVERRIDES are those of `memmlp sweep`.
     Results that the file already has of other arms and seeds stay.
     """
-    from memmlp.cli.rounds import sweep_to_show
+    from memmlp.cli.seed_rounds import sweep_to_show
     from memmlp.common.files import plain
     from memmlp.config.plan_sweep import find_sweep, is_path
     from memmlp.report.kept_results import Kept, load_kept, overrides_of, save, without_paths
     from memmlp.tables.build_table import finished_runs
     from memmlp.tables.measured_run import load
-    from memmlp.tables.rounds import as_json
     from memmlp.tables.runs_of_plan import finder
+    from memmlp.tables.seed_rounds import as_json
 
     sweep = find_sweep(name, overrides)
     known = sweep_to_show(sweep, overrides, outputs.absolute())
@@ -85,7 +85,7 @@ def save_command(
     files: tuple[str, ...] = ()
     its_own = 0
     if also_kept:
-        from memmlp.config.shared_results import with_kept
+        from memmlp.config.runs_kept_elsewhere import with_kept
 
         # What the file itself has stands before the same runs of other files, whose costs were measured then.
         before = _count(found)
@@ -107,7 +107,7 @@ def save_command(
     if not kept.every:
         raise InputError(f"sweep {name}: no finished run to keep; make them with: {kept.command}")
     if sweep.scale:
-        from memmlp.config.count_flops import predicted_flops, with_flops
+        from memmlp.config.flops_of_training import predicted_flops, with_flops
 
         kept = replace(kept, runs=with_flops(found), predicted=predicted_flops(sweep))
     ids = {(entry.label, entry.seed): entry.id for entry in known.plan.entries}
@@ -204,10 +204,10 @@ def _table(kept: Kept, source: str | None = None) -> Table:
 
     With a source's name it is that of the source's test clips alone.
     """
-    from memmlp.cli.rounds import of_another
+    from memmlp.cli.seed_rounds import of_another
     from memmlp.config.plan_sweep import find_sweep
     from memmlp.tables.build_table import make_table, on_source
-    from memmlp.tables.rounds import of_json
+    from memmlp.tables.seed_rounds import of_json
 
     words = tuple(word for word in kept.overrides if not word.startswith("seed="))
     sweep = replace(find_sweep(kept.sweep), command_line=words)  # tables say where it is on other data
@@ -228,8 +228,8 @@ def _table(kept: Kept, source: str | None = None) -> Table:
 
 
 def _outdated(kept: Kept) -> list[str]:
-    """Return a flag that names the components whose recipe numbers have changed since, if any."""
-    from memmlp.runs.recipe_numbers import outdated
+    """Return a flag that names the components whose recipe versions have changed since, if any."""
+    from memmlp.runs.recipe_versions import outdated
 
     found = sorted({words for run in kept.every for words in outdated(run.origin.recipes)})
     return [f"made by an earlier recipe: {', '.join(found)}"] if found else []

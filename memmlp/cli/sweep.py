@@ -16,7 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.runs.identity import NETWORK
 
 if TYPE_CHECKING:
-    from memmlp.cli.rounds import SweepToShow
+    from memmlp.cli.seed_rounds import SweepToShow
     from memmlp.sweep.plan import Plan
     from memmlp.sweep.spec import Sweep
 
@@ -68,21 +68,21 @@ def sweep(
     With --until-decided all arms get three seeds first. Then only those with open verdicts, and their
     controls, get more, up to --max-seeds.
     """
-    from memmlp.cli import rounds
+    from memmlp.cli import seed_rounds
     from memmlp.config.plan_sweep import find_sweep, make_plan, sweep_folder
 
-    rounds.check(overrides, until_decided, max_seeds)
+    seed_rounds.check(overrides, until_decided, max_seeds)
     if again and (until_decided or status or dry_run):
         raise InputError("--again: allowed is without --until-decided, --status and --dry-run")
     chosen = find_sweep(name, overrides)
     outputs = outputs.absolute()
-    known = rounds.current_rounds(chosen, outputs, max_seeds) if until_decided else None
+    known = seed_rounds.current_rounds(chosen, outputs, max_seeds) if until_decided else None
     spent = known.spent(chosen) if known else chosen
     plan = make_plan(spent, outputs, prepare=not (status or dry_run))
     if status or dry_run:
         show(spent, plan)
         if known:
-            click.echo("\n".join([rounds.schedule(known), *rounds.told(known, chosen)]))
+            click.echo("\n".join([seed_rounds.schedule(known), *seed_rounds.told(known, chosen)]))
         if dry_run:
             show_forecast(spent, plan, workers.number(workers.shares(devices(plan))))
             click.echo(workers.script(sweep_folder(chosen, outputs)) or "", nl=False)
@@ -94,14 +94,14 @@ def sweep(
         reset(plan)
     work = partial(run_workers, workers=workers)
     if known:
-        known, plan = rounds.run_until_decided(chosen, outputs, known, work, fail_fast)
-        show_outcome(rounds.SweepToShow(known.spent(chosen), plan, known), [name, *overrides], chosen)
+        known, plan = seed_rounds.run_until_decided(chosen, outputs, known, work, fail_fast)
+        show_outcome(seed_rounds.SweepToShow(known.spent(chosen), plan, known), [name, *overrides], chosen)
         return
     plan = replace(plan, fail_fast=fail_fast)
     if plan.left():
         work(chosen, plan)
     show_outcome(
-        rounds.SweepToShow(chosen, plan, None, rounds.spent_before(chosen, outputs)),
+        seed_rounds.SweepToShow(chosen, plan, None, seed_rounds.spent_before(chosen, outputs)),
         [name, *overrides],
         chosen,
     )
@@ -117,8 +117,8 @@ def reset(plan: Plan) -> None:
 def run_workers(chosen: Sweep, plan: Plan, workers: Workers) -> None:
     """Start workers, and wait until they have done the plan's runs."""
     from memmlp.config.plan_sweep import sweep_folder
-    from memmlp.sweep.board import Board
     from memmlp.sweep.controller import oversee
+    from memmlp.sweep.progress_table import Board
 
     _, fleet = hire(sweep_folder(chosen, plan.outputs), plan, workers, devices(plan))
     oversee(plan, fleet, Board())
@@ -134,7 +134,7 @@ def show(chosen: Sweep, plan: Plan) -> None:
     from rich.console import Console
 
     from memmlp.config.plan_sweep import orphans
-    from memmlp.sweep.board import render
+    from memmlp.sweep.progress_table import render
 
     if plan.entries:
         Console(highlight=False).print(render(plan, plan.states()))
@@ -173,7 +173,7 @@ def show_outcome(shown: SweepToShow, words: Sequence[str], chosen: Sweep) -> Non
 
     Exits with 1 where something failed.
     """
-    from memmlp.cli.rounds import closing
+    from memmlp.cli.seed_rounds import closing
     from memmlp.cli.table import SHOWN_MODES, on_screen, table_of_plan
     from memmlp.cli.track import show_in_trackers
     from memmlp.config import plugins

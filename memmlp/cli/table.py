@@ -17,7 +17,7 @@ from memmlp.common.errors import InputError
 from memmlp.sweep.spec import BRANCHES
 
 if TYPE_CHECKING:
-    from memmlp.cli.rounds import SweepToShow
+    from memmlp.cli.seed_rounds import SweepToShow
     from memmlp.sweep.spec import Sweep
     from memmlp.tables.effects import RunsBySeed
     from memmlp.tables.runs_of_plan import Read
@@ -94,12 +94,12 @@ def table(
 
     OVERRIDES are those that the sweep was run with; they find its runs again.
     """
-    from memmlp.tables import browser_rows
+    from memmlp.tables import rows_measured_in_browsers
     from memmlp.tables.measured_run import load
 
     if seeds_needed and (form or out or add):
         raise InputError("--seeds-needed: goes to the screen alone, without --format, --out and --add")
-    measured = [browser_rows.read(path) for path in add]
+    measured = [rows_measured_in_browsers.read(path) for path in add]
     with _uncollected():
         found = gathered(
             [name], overrides, outputs, SHOWN_MODES[mode], functools.cache(load), branch, source, untrained
@@ -107,7 +107,7 @@ def table(
     if seeds_needed:
         seeds_on_screen(found, SHOWN_MODES[mode])
         return
-    tables = [functools.reduce(browser_rows.with_rows, measured, one.table) for one in found]
+    tables = [functools.reduce(rows_measured_in_browsers.with_rows, measured, one.table) for one in found]
     if form is None and out is None:
         on_screen(tables)
         return
@@ -167,7 +167,7 @@ def gathered(
     Raises:
         InputError: where none of them can be composed with the command line's overrides.
     """
-    from memmlp.cli.rounds import sweep_to_show
+    from memmlp.cli.seed_rounds import sweep_to_show
     from memmlp.tables.build_table import without_runs
 
     found, failures = [], []

@@ -15,9 +15,9 @@ from memmlp.cli.options import outputs_option
 from memmlp.common.errors import InputError
 
 if TYPE_CHECKING:
+    from memmlp.experiment_tracking.tracker import Tracker
     from memmlp.sweep.plan import Plan
     from memmlp.tables.table import Table
-    from memmlp.tracking.tracker import Tracker
 
 TRACKERS = ("mlflow", "tensorboard", "wandb")
 
@@ -50,9 +50,9 @@ def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outp
     are left to the process that shows them. It may be repeated at any time.
     """
     from memmlp.common.progress import progress_bar
+    from memmlp.experiment_tracking.sync import sync as fill_in
+    from memmlp.experiment_tracking.sync import sync_sweeps
     from memmlp.runs.lookup import list_runs
-    from memmlp.tracking.sync import sync as fill_in
-    from memmlp.tracking.sync import sync_sweeps
 
     begun = [run for run in list_runs(outputs) if run.manifest]
     sweeps = sorted(path.parent for path in outputs.glob("sweeps/*/summary.json"))
@@ -71,9 +71,9 @@ def sync(names: tuple[str, ...], uri: str | None, project: str, full: bool, outp
 
 def _trackers(names: Sequence[str], uri: str | None, project: str, outputs: Path) -> list[Tracker]:
     """Return the trackers of these names. Raises InputError where a package is missing."""
-    from memmlp.tracking.mlflow_tracker import MLflow
-    from memmlp.tracking.tensorboard_tracker import TensorBoard
-    from memmlp.tracking.wandb_tracker import WandB
+    from memmlp.experiment_tracking.mlflow_tracker import MLflow
+    from memmlp.experiment_tracking.tensorboard_tracker import TensorBoard
+    from memmlp.experiment_tracking.wandb_tracker import WandB
 
     every: dict[str, Tracker] = {
         "mlflow": MLflow(uri, outputs),
@@ -88,7 +88,7 @@ def show_in_trackers(plan: Plan, folder: Path, table: Table) -> None:
     from omegaconf import OmegaConf
 
     from memmlp.config.build import build_tracking
-    from memmlp.tables.summary import write_summary
+    from memmlp.tables.sweep_folder_files import write_summary
 
     write_summary(plan, table, folder)
     if plan.tasks:
@@ -109,7 +109,7 @@ def whole() -> bool:
 @outputs_option
 def mlflow(port: int, outputs: Path) -> None:
     """Open MLflow's page on the tracked runs (needs pip install 'memmlp[mlflow]')."""
-    from memmlp.tracking.mlflow_tracker import MLflow
+    from memmlp.experiment_tracking.mlflow_tracker import MLflow
 
     store = MLflow(None, outputs).place
     program = shutil.which("mlflow")

@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from memmlp.common import distributed
 from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.config.compose import CONFIG, VERSION_BASE, help_text, parse, preflight
-from memmlp.config.explain import explain
+from memmlp.config.config_errors import explain
 from memmlp.config.package_data import packaged
 from memmlp.config.schema import check, register
 

@@ -100,10 +100,10 @@ def said(outcome: Outcome) -> str:
 
 
 def older_code(run: Run, changed: Sequence[str]) -> str:
-    """Return the warning that code changed since the run was made, though no recipe number was raised."""
+    """Return the warning that code changed since the run was made, though no recipe version was raised."""
     names = ", ".join(changed[:5]) + (f" and {len(changed) - 5} more" if len(changed) > 5 else "")
     return (
-        f"run {run.id} was made before the code of {names} changed, under the same recipe numbers: "
+        f"run {run.id} was made before the code of {names} changed, under the same recipe versions: "
         "force=true makes it again"
     )
 

@@ -184,7 +184,7 @@ def show(setup: Setup) -> None:
     """Print how far the search is."""
     from rich.console import Console
 
-    from memmlp.sweep.search.board import render
+    from memmlp.sweep.search.progress_table import render
     from memmlp.sweep.search.study import Study
 
     study = Study.view(setup.search, setup.folder.name, setup.folder)
@@ -194,8 +194,8 @@ def show(setup: Setup) -> None:
 def search(setup: Setup, study: Study, workers: Workers) -> None:
     """Bring the study to as many trials as are wanted."""
     from memmlp.sweep.plan import Plan
-    from memmlp.sweep.search.board import SearchBoard
     from memmlp.sweep.search.director import Director, direct
+    from memmlp.sweep.search.progress_table import SearchBoard
 
     plan = Plan(setup.folder.name, setup.outputs, (), (), open=True)
     director = Director(study, partial(_tasks, setup), plan)
@@ -225,7 +225,7 @@ def summary(setup: Setup, study: Study) -> None:
     from rich.text import Text
 
     from memmlp.pipeline.run_stages import partial_words
-    from memmlp.sweep.search.board import counts, figures, row, trials_table
+    from memmlp.sweep.search.progress_table import counts, figures, row, trials_table
     from memmlp.sweep.search.results import at_an_end, importances
 
     console = Console(highlight=False)

@@ -33,11 +33,11 @@ def ui(port: int, host: str, token: str | None, no_browser: bool, outputs: Path)
 
     from memmlp.common.page_access import check_token
     from memmlp.report.ui.answers import Answers
-    from memmlp.report.ui.server import Server
+    from memmlp.report.ui.server import RunsServer
 
     check_token(host, token)
     with (
-        Server(Answers(outputs, predict), port, host, token) as server,
+        RunsServer(Answers(outputs, predict), port, host, token) as server,
         contextlib.suppress(KeyboardInterrupt),
     ):
         click.echo(f"{server.url}  runs in {outputs / 'runs'}; Ctrl-C ends")

@@ -234,7 +234,7 @@ def hire(folder: Path, plan: Plan, workers: Workers, devices: Iterable[str]) -> 
     Raises:
         InputError: where workers can't have the GPUs that are asked for.
     """
-    from memmlp.config.perform_task import start_lone_worker, start_worker
+    from memmlp.config.worker_process import start_lone_worker, start_worker
     from memmlp.sweep.controller import Fleet
     from memmlp.sweep.worker import Presence
 

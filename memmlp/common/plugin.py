@@ -1,4 +1,4 @@
-"""What a package of one's own tells of its components: options of slots, metrics, recipe numbers."""
+"""What a package of one's own tells of its components: options of slots, metrics, recipe versions."""
 
 from __future__ import annotations
 

@@ -26,7 +26,8 @@ from memmlp.config.schema import check, restored
 from memmlp.deploy.deployment import Deployment
 from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import IK, LBFGS, Arms, NoIK
-from memmlp.evaluation.metrics import OwnMetric
+from memmlp.evaluation.metrics import UserMetric
+from memmlp.experiment_tracking.feed import Tracking
 from memmlp.motion.body import builtin_rest_joints
 from memmlp.motion.coordinates import Coordinates, Heading, HeadRelative, World
 from memmlp.motion.normalizer import Normalizer
@@ -45,7 +46,6 @@ from memmlp.pipeline.devices import device
 from memmlp.pipeline.experiment import Experiment, UpstreamTraining
 from memmlp.runs.lookup import check_trained
 from memmlp.runs.run import Run
-from memmlp.tracking.feed import Tracking
 from memmlp.training.losses import Loss, MotionLoss, Term
 from memmlp.training.optim import Optim, vqvae_optim
 from memmlp.training.train_network import NetworkTraining
@@ -129,7 +129,7 @@ def build_upstream(cfg: DictConfig, config: dict[str, Any]) -> tuple[UpstreamTra
     return (VQVAETraining(codes, seed=cfg.vqvae.seed, optim=optim, mirror=cfg.data.mirror),)
 
 
-def build_training(cfg: DictConfig, metrics: dict[str, OwnMetric]) -> NetworkTraining | RefinerTraining:
+def build_training(cfg: DictConfig, metrics: dict[str, UserMetric]) -> NetworkTraining | RefinerTraining:
     """Build how a checked config's network is trained, or the refiner behind it."""
     common = {"seed": cfg.seed, "optim": built(cfg.optim), "weighting": cfg.data.weighting}
     common |= {"shares": shares(cfg.data), "mirror": cfg.data.mirror, "metrics": metrics}
@@ -195,11 +195,12 @@ def build_coordinates(name: str) -> Coordinates:
     return found()
 
 
-def build_metrics(names: Iterable[str]) -> dict[str, OwnMetric]:
+def build_metrics(names: Iterable[str]) -> dict[str, UserMetric]:
     """Return the metrics of one's own with these names."""
     own = {name: METRICS[name] for name in names}
     return {
-        name: OwnMetric(located(metric.function, f"metric {name}"), metric.of) for name, metric in own.items()
+        name: UserMetric(located(metric.function, f"metric {name}"), metric.of)
+        for name, metric in own.items()
     }
 
 

@@ -26,7 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from memmlp.common.errors import InputError
 from memmlp.config import plugins
-from memmlp.config.explain import explain
+from memmlp.config.config_errors import explain
 from memmlp.config.package_data import packaged
 from memmlp.config.schema import check, register
 
@@ -46,11 +46,11 @@ def parse(argv: Sequence[str]) -> tuple[argparse.Namespace, argparse.ArgumentPar
     if args.experimental_rerun:
         raise InputError("--experimental-rerun: unpickles a file; allowed are overrides")
     plugins.activate(plugins.named(args.overrides))
-    Plugins.instance().register(OwnConfigs)
+    Plugins.instance().register(UserConfigs)
     return args, parser
 
 
-class OwnConfigs(SearchPathPlugin):
+class UserConfigs(SearchPathPlugin):
     """Tells Hydra, wherever it composes, of the folders of configs that are searched beside memmlp's."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:

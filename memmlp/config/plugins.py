@@ -31,7 +31,7 @@ from memmlp.config.package_data import packaged
 from memmlp.evaluation.units import HIGHER, SMALLEST, UNITS
 from memmlp.runs.environment import package_sources
 from memmlp.runs.identity import flatten
-from memmlp.runs.recipe_numbers import RECIPES
+from memmlp.runs.recipe_versions import RECIPES
 
 GROUP = "memmlp.plugins"
 VARIABLE = "MEMMLP_PLUGINS"

@@ -25,7 +25,7 @@ from memmlp.motion.body import SPARSE_DIM
 CALIBRATION_CLIPS, CALIBRATION_FRAMES, CALIBRATION_EVERY = 40, 400, 20
 
 
-class Calibration(CalibrationDataReader):
+class ActivationSamples(CalibrationDataReader):
     """Calibration samples, inputs and states: every twentieth frame of streams of clips (N, 252).
 
     Of each clip the middle 400 frames are streamed.
@@ -65,7 +65,7 @@ def quantise(source: Path, path: Path, kept: Sequence[str], clips: Sequence[Tens
         quantize_static(
             source,
             unfinished,
-            Calibration(source, clips),
+            ActivationSamples(source, clips),
             quant_format=QuantFormat.QDQ,
             nodes_to_quantize=inner_layers(onnx.load(source), kept),
             op_types_to_quantize=["Gemm", "MatMul"],

@@ -12,7 +12,7 @@ import torch
 from memmlp.common.errors import InputError
 from memmlp.evaluation import modes
 from memmlp.evaluation.ik import IK
-from memmlp.evaluation.metrics import OwnMetrics
+from memmlp.evaluation.metrics import UserMetrics
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset
 from memmlp.networks.motion_model import MotionModel
@@ -37,7 +37,7 @@ class Evaluation:
     batch: int
     ik: IK
     seed: int
-    metrics: OwnMetrics = field(default_factory=dict)
+    metrics: UserMetrics = field(default_factory=dict)
 
     def report(self, model: MotionModel, test: MotionDataset, mode: str) -> dict[str, Any]:
         """Compute the metrics in a mode.

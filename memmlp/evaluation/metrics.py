@@ -72,7 +72,7 @@ def rotations_report(predicted: Tensor, truth: Tensor) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
-class OwnMetric:
+class UserMetric:
     """A metric of one's own.
 
     Attributes:
@@ -84,10 +84,10 @@ class OwnMetric:
     of: str
 
 
-OwnMetrics = Mapping[str, OwnMetric]
+UserMetrics = Mapping[str, UserMetric]
 
 
-def own_report(own: OwnMetrics, of: str, predicted: Tensor, truth: Tensor) -> dict[str, float]:
+def own_report(own: UserMetrics, of: str, predicted: Tensor, truth: Tensor) -> dict[str, float]:
     """Return the metrics of one's own that are given positions, or those given rotations, of one clip.
 
     Raises:
@@ -96,7 +96,7 @@ def own_report(own: OwnMetrics, of: str, predicted: Tensor, truth: Tensor) -> di
     return {name: _number(name, one, predicted, truth) for name, one in own.items() if one.of == of}
 
 
-def _number(name: str, metric: OwnMetric, predicted: Tensor, truth: Tensor) -> float:
+def _number(name: str, metric: UserMetric, predicted: Tensor, truth: Tensor) -> float:
     value = metric.function(predicted, truth)
     try:
         return float(value)

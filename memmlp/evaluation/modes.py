@@ -147,7 +147,7 @@ def evaluate(
     modes: Sequence[str],
     batch: int,
     ik: IK | None = None,
-    own: metrics.OwnMetrics | None = None,
+    own: metrics.UserMetrics | None = None,
 ) -> dict[str, Any]:
     """Compute the metrics of a dataset: `{"mean": {mode: {branch: {metric: value}}}, "clips": [...]}`.
 
@@ -188,7 +188,7 @@ def clip_report(
     motion: Tensor,
     truth: Tensor,
     ik: IK | None = None,
-    own: metrics.OwnMetrics | None = None,
+    own: metrics.UserMetrics | None = None,
 ) -> dict[str, dict[str, float]]:
     """Return the metrics of both branches and of `ik`'s result, for motion (N, 198) and truth (N, 252)."""
     sparse, target = truth[:, :SPARSE_DIM], truth[:, SPARSE_DIM:]
@@ -200,7 +200,7 @@ def clip_report(
 
 
 def rotations_report(
-    normalizer: Normalizer, motion: Tensor, truth: Tensor, own: metrics.OwnMetrics | None = None
+    normalizer: Normalizer, motion: Tensor, truth: Tensor, own: metrics.UserMetrics | None = None
 ) -> dict[str, float]:
     """Return the metrics of the rotations of motion (N, 198) against the truth (N, 252).
 
@@ -235,7 +235,7 @@ def chunks(dataset: MotionDataset, length: int, least: int) -> list[Tensor]:
 
 @torch.no_grad()
 def quick_stream(
-    network: Evaluable, pieces: Sequence[Tensor], own: metrics.OwnMetrics | None = None
+    network: Evaluable, pieces: Sequence[Tensor], own: metrics.UserMetrics | None = None
 ) -> dict[str, float]:
     """Return the stream-mode metrics, means over pieces of clips, for validation during training."""
     motions = stream(network, pieces)

@@ -9,7 +9,7 @@ head on its tracker; `joints` (1, 22, 3), metres, the network's own positions; a
 same names with the suffix `.next`.
 
 All are in the frame of reference that was chosen (memmlp.live.spaces). Lost trackers, other rates and gaps
-(memmlp.live.trackers) are left to the caller: NaN in is NaN out.
+(memmlp.live.tracker_frames) are left to the caller: NaN in is NaN out.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from memmlp.common.errors import InputError
 from memmlp.live.exported import ExportedNetwork
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
 from memmlp.live.spaces import SpaceName, space_of
-from memmlp.live.trackers import TRACKERS, UPRIGHT, Features, Lost, TrackerFrames, heading_of, t_pose
+from memmlp.live.tracker_frames import TRACKERS, UPRIGHT, Features, Lost, TrackerFrames, heading_of, t_pose
 from memmlp.live.wearer import wearer
 from memmlp.runs.run import Run
 
@@ -90,8 +90,8 @@ class Stream:
 
     A tracker's rotation is that of SMPL's joint (head, wrists): the turn from a T-pose, see
     `memmlp.live.spaces`. Devices that sit otherwise on the body differ from the joints by constant offsets,
-    which `calibrate` finds or `offsets` gives. `memmlp.live.trackers` says what happens at other rates than
-    60 Hz, to lost trackers and after gaps.
+    which `calibrate` finds or `offsets` gives. `memmlp.live.tracker_frames` says what happens at other rates
+    than 60 Hz, to lost trackers and after gaps.
 
     Args:
         source: a finished run or its folder, or an ONNX file as `memmlp export` writes it (--scope step).

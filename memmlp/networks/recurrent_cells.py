@@ -13,7 +13,7 @@ SHORTEST, LONGEST = 0.9, 0.999
 """The least share of its state that a fresh LRU's first and last unit keep from frame to frame."""
 
 
-class Cell(nn.Module):
+class RecurrentCell(nn.Module):
     """A recurrent layer of d inputs and d outputs; the interface of all of them.
 
     `forward` takes in a whole sequence, as in training, and `step` one frame, as live; they compute the same.
@@ -68,7 +68,7 @@ def gru_step(weights: Sequence[Tensor], x: Tensor, state: Tensor) -> Tensor:
     return new + keep * (state - new)
 
 
-class GRUCell(Cell):
+class GRUCell(RecurrentCell):
     """A gated recurrent unit (Cho et al. 2014)."""
 
     def __init__(self, width: int):
@@ -86,7 +86,7 @@ class GRUCell(Cell):
         return state, state
 
 
-class LSTMCell(Cell):
+class LSTMCell(RecurrentCell):
     """A long short-term memory (Hochreiter & Schmidhuber 1997); its state: hidden, then cell."""
 
     carried = 2
@@ -133,7 +133,7 @@ def scan(keep: Tensor, new: Tensor, state: Tensor) -> Tensor:
     return h[:, 1:]
 
 
-class LinearCell(Cell):
+class LinearCell(RecurrentCell):
     """The base of cells whose units are linear in their own state, so that all frames are made at once."""
 
     def gates(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -183,5 +183,5 @@ class LRU(LinearCell):
         return keep, room * torch.sigmoid(enter) * new
 
 
-CELLS: dict[str, type[Cell]] = {"gru": GRUCell, "lstm": LSTMCell, "mingru": MinGRU, "lru": LRU}
+CELLS: dict[str, type[RecurrentCell]] = {"gru": GRUCell, "lstm": LSTMCell, "mingru": MinGRU, "lru": LRU}
 """The cells by the names that the config knows."""

@@ -8,14 +8,14 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from memmlp.common.mixed_precision import in_float32
+from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM
 from memmlp.motion.geometry import forward_kinematics, matrix_to_sixd, sixd_to_matrix
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import Learned
 from memmlp.networks.reaching_arms import reached, tracked
-from memmlp.networks.recurrent_cells import CELLS, Cell
+from memmlp.networks.recurrent_cells import CELLS, RecurrentCell
 from memmlp.networks.windowless_model import WindowlessModel
 
 
@@ -28,7 +28,7 @@ class RecurrentBlock(nn.Module):
         expansion: the MLP's hidden width, in d.
     """
 
-    def __init__(self, cell: Cell, width: int, expansion: int):
+    def __init__(self, cell: RecurrentCell, width: int, expansion: int):
         super().__init__()
         self.cell_norm, self.cell = nn.LayerNorm(width), cell
         self.norm = nn.LayerNorm(width)
@@ -143,7 +143,7 @@ class Member(nn.Module):
         expansion: the hidden width of the blocks' MLPs, in d.
     """
 
-    def __init__(self, cells: Callable[[int], Cell], width: int, depth: int, expansion: int):
+    def __init__(self, cells: Callable[[int], RecurrentCell], width: int, depth: int, expansion: int):
         super().__init__()
         self.stem = nn.Linear(SPARSE_DIM, width)
         self.blocks = nn.ModuleDict(

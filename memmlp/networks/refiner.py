@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from memmlp.common.mixed_precision import in_float32
+from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import POSITION, ROTATION
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.memory import State

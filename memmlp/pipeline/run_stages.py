@@ -21,6 +21,7 @@ from memmlp.common.files import write_json
 from memmlp.common.progress import tell
 from memmlp.evaluation.evaluation import picture
 from memmlp.evaluation.predictions import save_predictions
+from memmlp.experiment_tracking.feed import Tracking
 from memmlp.live.latency import measure_pose
 from memmlp.motion.motion_source import Prepared
 from memmlp.motion.preparing.amass import divided_subjects
@@ -38,7 +39,6 @@ from memmlp.runs.identity import (
     evaluation_settings,
 )
 from memmlp.runs.run import Run
-from memmlp.tracking.feed import Tracking
 from memmlp.training.loop import Watch, unwatched
 
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from memmlp.common.files import atomic_write
 from memmlp.common.progress import progress_bar
+from memmlp.render.canvas import FAINT, Sheet, png
+from memmlp.render.clip_piece import Take
 from memmlp.render.raster import draw
-from memmlp.render.sheet import FAINT, Sheet, png
-from memmlp.render.take import Take
 
 POSES = 6
 WIDTH, HEIGHT = 230, 330  # size of a panel, pixels

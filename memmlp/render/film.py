@@ -14,9 +14,9 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import atomic_write
 from memmlp.common.progress import progress_bar
 from memmlp.motion.body import FPS
+from memmlp.render.canvas import FAINT, Sheet, indexed
+from memmlp.render.clip_piece import Take
 from memmlp.render.raster import draw
-from memmlp.render.sheet import FAINT, Sheet, indexed
-from memmlp.render.take import Take
 
 RATE = 30  # pictures a second
 EVERY = FPS // RATE

@@ -14,8 +14,8 @@ from memmlp.motion.importing.file_stance import FileStance
 from memmlp.motion.importing.names import without_namespace
 from memmlp.motion.importing.skeleton import Z_UP
 from memmlp.motion.limb_shapes import RADII
+from memmlp.render.canvas import DPI, FAINT, INK, Sheet, png
 from memmlp.render.raster import Camera, draw
-from memmlp.render.sheet import DPI, FAINT, INK, Sheet, png
 
 HEIGHT, TOP, BOTTOM = 700, 90, 50  # pixels
 NAMES, FRONT, SIDE = 250, 480, 230  # widths of a column of names, of a front view, of a side view

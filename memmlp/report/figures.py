@@ -39,7 +39,7 @@ PANELS = 4  # the largest number of panels side by side
 NAMED = 12  # the largest number of our points that are named in a figure
 
 
-class Point(NamedTuple):
+class SpeedAndError(NamedTuple):
     """A system's frames a second and its error."""
 
     label: str
@@ -111,7 +111,7 @@ def profiles(name: str, found: Mapping[str, Sequence[Distribution]]) -> str:
 
 
 @mpl.rc_context(STYLE)
-def accuracy(ours: Mapping[str, Sequence[Point]], paper: Sequence[Point], error: str) -> str:
+def accuracy(ours: Mapping[str, Sequence[SpeedAndError]], paper: Sequence[SpeedAndError], error: str) -> str:
     """Draw errors against frames a second (Fig. 1).
 
     Args:
@@ -143,7 +143,7 @@ def accuracy(ours: Mapping[str, Sequence[Point]], paper: Sequence[Point], error:
     return _svg(figure, "accuracy", f"{error} against frames a second")
 
 
-def _names(axis: Axes, points: Iterable[Point]) -> None:
+def _names(axis: Axes, points: Iterable[SpeedAndError]) -> None:
     """Write the points' names, alternately above and below, so that neighbours don't overlap."""
     for number, point in enumerate(sorted(points, key=lambda point: (point.fps, point.error))):
         place = (6, -11 if number % 2 else 5)

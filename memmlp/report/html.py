@@ -11,7 +11,7 @@ from importlib import resources
 from typing import Any
 
 from memmlp.report import figures
-from memmlp.report.figures import Curve, Point
+from memmlp.report.figures import Curve, SpeedAndError
 from memmlp.runs.identity import trained_by
 from memmlp.runs.metrics_log import Metrics
 from memmlp.sweep.spec import COSTS, Sweep
@@ -53,7 +53,7 @@ class ReportedRun:
         return trained_by(self.measured.run.config) if self.measured.run else {}
 
 
-def page(chapters: Sequence[Chapter], published: Sequence[Point], generated: str, commit: str) -> str:
+def page(chapters: Sequence[Chapter], published: Sequence[SpeedAndError], generated: str, commit: str) -> str:
     """Return the HTML of the page.
 
     Args:
@@ -75,7 +75,9 @@ def page(chapters: Sequence[Chapter], published: Sequence[Point], generated: str
     return template
 
 
-def fragment(chapters: Sequence[Chapter], published: Sequence[Point], generated: str, commit: str) -> str:
+def fragment(
+    chapters: Sequence[Chapter], published: Sequence[SpeedAndError], generated: str, commit: str
+) -> str:
     """Return the report as part of a page that has a head and a style of its own."""
     about = f"{generated}, code {commit}, {_counted(_entries(chapters))}"
     sections = _sections(chapters, published)
@@ -85,7 +87,7 @@ def fragment(chapters: Sequence[Chapter], published: Sequence[Point], generated:
 
 
 def _sections(
-    chapters: Sequence[Chapter], published: Sequence[Point]
+    chapters: Sequence[Chapter], published: Sequence[SpeedAndError]
 ) -> list[tuple[str, str, Sequence[str]]]:
     """Return the names, titles and parts of the page's sections."""
     entries = _entries(chapters)
@@ -100,7 +102,7 @@ def _sections(
     ]
 
 
-def published(accuracies: Sweep, latencies: Sweep) -> list[Point]:
+def published(accuracies: Sweep, latencies: Sweep) -> list[SpeedAndError]:
     """Return the systems for which the paper gives both an error and frames a second.
 
     The two stand in different tables, whose names for a system agree in their beginnings alone.
@@ -111,7 +113,7 @@ def published(accuracies: Sweep, latencies: Sweep) -> list[Point]:
         fps = (arm.paper or {}).get("FPS")
         error = next((e for label, e in errors.items() if label.startswith(arm.label.casefold())), None)
         if fps is not None and error is not None:
-            points.append(Point(arm.label, fps, error))
+            points.append(SpeedAndError(arm.label, fps, error))
     return points
 
 
@@ -205,7 +207,7 @@ def _robust_words(one: Distribution) -> tuple[str, str]:
     return ("-" if one.middle is None else f"{one.middle:.2f}"), better
 
 
-def _accuracy(chapters: Iterable[Chapter], paper: Sequence[Point]) -> list[str]:
+def _accuracy(chapters: Iterable[Chapter], paper: Sequence[SpeedAndError]) -> list[str]:
     """Return the paper's Fig. 1 with what was measured."""
     ours = {chapter.title: _points(chapter) for chapter in chapters}
     ours = {title: points for title, points in ours.items() if points}
@@ -221,7 +223,7 @@ def _accuracy(chapters: Iterable[Chapter], paper: Sequence[Point]) -> list[str]:
     return [_figure(f"{ERROR} against frames a second", svg, note)]
 
 
-def _points(chapter: Chapter) -> list[Point]:
+def _points(chapter: Chapter) -> list[SpeedAndError]:
     """Return each arm's mean frames a second and mean error."""
     points = []
     for label, runs in chapter.runs.items():
@@ -229,7 +231,7 @@ def _points(chapter: Chapter) -> list[Point]:
         known = [(fps, error) for fps, error in values if fps is not None and error is not None]
         if known:
             fps, error = (sum(column) / len(known) for column in zip(*known, strict=True))
-            points.append(Point(label, fps, error))
+            points.append(SpeedAndError(label, fps, error))
     return points
 
 

@@ -68,7 +68,7 @@ def pages(sources: Mapping[str, KeptTable], templates: Mapping[str, str]) -> dic
         raise InputError(
             f"{twice[0]}: a template and a table's page at once; allowed is another name for one"
         )
-    words = Words(sources)
+    words = Placeholders(sources)
     return made | {name: _filled(name, text, words) for name, text in sorted(templates.items())}
 
 
@@ -81,7 +81,7 @@ def check_claims(name: str, text: str) -> None:
         )
 
 
-def _filled(name: str, text: str, words: Words) -> str:
+def _filled(name: str, text: str, words: Placeholders) -> str:
     """Return a page: its template with the placeholders filled in. Raises InputError, naming the template."""
     check_claims(name, text)
     environment = Environment(undefined=StrictUndefined, keep_trailing_newline=True, trim_blocks=True)
@@ -125,12 +125,12 @@ def _listed(words: Sequence[str]) -> str:
 
 
 def _recipes(runs: Iterable[Measured]) -> str:
-    """Return the recipe numbers of the components."""
+    """Return the recipe versions of the components."""
     found = sorted({(name, number) for run in runs for name, number in run.origin.recipes.items()})
     return ", ".join(f"{escaped(name)} {number}" for name, number in found)
 
 
-class Words:
+class Placeholders:
     """The placeholders of templates. For a wrong name each raises InputError, which says what is allowed."""
 
     def __init__(self, sources: Mapping[str, KeptTable]):

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from memmlp.common.files import digest
 from memmlp.sweep.spec import COMPUTE
-from memmlp.tables.effects_along_axes import Point, Trend, Trends
+from memmlp.tables.effects_along_axes import EffectOfCell, Trend, Trends
 from memmlp.tables.table_text import with_unit
 
 INK, LINE, FAINT, AHEAD = "#1f2328", "#0969da", "#d0d7de", "#bc4c00"
@@ -146,7 +146,7 @@ def _limits(trend: Trend, name: str, ahead: float | None) -> tuple[float, float]
     return low - margin, high + margin
 
 
-def _point(axis: Axes, point: Point, name: str, trend: Trend) -> None:
+def _point(axis: Axes, point: EffectOfCell, name: str, trend: Trend) -> None:
     """Draw a cell's effect with its own interval."""
     if name not in point.values:
         return

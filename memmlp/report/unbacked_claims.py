@@ -47,7 +47,7 @@ PLACEHOLDER = re.compile(r"\{\{.*?\}\}", re.DOTALL)
 SENTENCE = re.compile(r"(?<=[.!?;])\s+|\n\s*\n|\n(?=\s*([-*]|\d+\.|#+|>)\s)|(?<!\\)\||\n(?=\s*\|)")
 
 
-class Claim(NamedTuple):
+class UnbackedClaim(NamedTuple):
     """A sentence that claims what it must not: its line, its words, and what is wrong with them."""
 
     line: int
@@ -55,7 +55,7 @@ class Claim(NamedTuple):
     reason: str
 
 
-def claims(text: str) -> list[Claim]:
+def claims(text: str) -> list[UnbackedClaim]:
     """Return the claims of a Markdown text or template."""
     bare = OUTSIDE.sub(_blank, PLACEHOLDER.sub(lambda found: f"0{_blank(found)[1:]}", text))
     found = []
@@ -63,7 +63,7 @@ def claims(text: str) -> list[Claim]:
         reason = _reason(sentence)
         if reason:
             line = bare.count("\n", 0, start + len(sentence) - len(sentence.lstrip())) + 1
-            found.append(Claim(line, " ".join(sentence.split()), reason))
+            found.append(UnbackedClaim(line, " ".join(sentence.split()), reason))
     return found
 
 

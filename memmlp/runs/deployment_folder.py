@@ -9,7 +9,7 @@ from typing import Any
 
 from memmlp.common.files import file_digest, now, read_json, write_json
 from memmlp.runs.environment import environment
-from memmlp.runs.identity import belongs, deployment_name, deployment_recipes
+from memmlp.runs.identity import belongs, deployment_id_of, deployment_recipes
 
 ONNX_FILES = {
     "fp32": "step.onnx",
@@ -56,11 +56,11 @@ class DeploymentFolder:
     @property
     def current(self) -> bool:
         """Whether the deployment was made by the present recipes."""
-        return self.folder.name == deployment_name(self.settings)
+        return self.folder.name == deployment_id_of(self.settings)
 
     @property
     def recipes(self) -> dict[str, int]:
-        """The recipe numbers that it was made by; empty where these are not the present ones."""
+        """The recipe versions that it was made by; empty where these are not the present ones."""
         return deployment_recipes(self.settings) if self.current else {}
 
     def finish(self, record: Mapping[str, Any]) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 from memmlp.common.errors import InputError
 from memmlp.common.files import now, plain, read_json, write_json
 from memmlp.runs.environment import environment
-from memmlp.runs.identity import belongs, evaluation_name
+from memmlp.runs.identity import belongs, evaluation_id_of
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:
@@ -40,7 +40,7 @@ def intact(path: Path) -> bool:
 def current(path: Path, report: Mapping[str, Any]) -> bool:
     """Return whether an evaluation was made by the present recipes."""
     settings = report.get("settings") or {}
-    return {"mode", "ik"} <= settings.keys() and path.stem == evaluation_name(settings)
+    return {"mode", "ik"} <= settings.keys() and path.stem == evaluation_id_of(settings)
 
 
 def _content_digest(content: Mapping[str, Any]) -> str:

@@ -1,7 +1,7 @@
 """Identities: a digest of all that can change a result, for each of the stages that results come from.
 
 A **run** is a training (of a VQ-VAE or of a network): its identity is its config, its data, the run that it
-builds upon, and the recipe numbers of the components it uses. An **evaluation** of it (one mode, with or
+builds upon, and the recipe versions of the components it uses. An **evaluation** of it (one mode, with or
 without inverse kinematics) and a **deployment** (ONNX, int8, latency) have identities of their own, made only
 of what can change their own result. So a new mode, inverse kinematics or precision on a finished run takes
 that stage's work and no training. A component is known by its name in the config, never by where its class
@@ -20,7 +20,7 @@ from typing import Any
 
 from memmlp.common.files import plain
 from memmlp.common.plugin import METRICS
-from memmlp.runs.recipe_numbers import recipes
+from memmlp.runs.recipe_versions import recipes
 
 NEUTRAL = (
     "data",  # its digest stands for it: frames, clips, split and rest pose; but see `_draws`
@@ -87,7 +87,7 @@ class Identity:
 
     @property
     def recipes(self) -> dict[str, int]:
-        """The recipe numbers of the components that the training uses."""
+        """The recipe versions of the components that the training uses."""
         return recipes(list(trained_components(self.kind, self.config)))
 
     @property
@@ -98,7 +98,7 @@ class Identity:
 
     @property
     def what(self) -> str:
-        """A digest of all that `id` is one of but the recipe numbers.
+        """A digest of all that `id` is one of but the recipe versions.
 
         It is equal in runs that differ by the age of their code alone.
         """
@@ -122,10 +122,10 @@ def run_id(kind: str, config: Mapping[str, Any], *, data: str, upstream: str | N
 
 def evaluation_id(config: Mapping[str, Any], mode: str, groups_digest: str | None = None) -> str:
     """Return the identity of a run's evaluation in a mode: a word and 16 hex digits."""
-    return evaluation_name(evaluation_settings(config, mode, groups_digest))
+    return evaluation_id_of(evaluation_settings(config, mode, groups_digest))
 
 
-def evaluation_name(settings: Mapping[str, Any]) -> str:
+def evaluation_id_of(settings: Mapping[str, Any]) -> str:
     """Return the identity that an evaluation with these settings has by the present recipes."""
     mode, ik = settings["mode"], settings["ik"]
     name = mode if ik == "off" else f"{mode}-{ik}"
@@ -133,7 +133,7 @@ def evaluation_name(settings: Mapping[str, Any]) -> str:
 
 
 def evaluation_recipes(settings: Mapping[str, Any]) -> dict[str, int]:
-    """Return the recipe numbers of the components that an evaluation uses."""
+    """Return the recipe versions of the components that an evaluation uses."""
     solver = [f"ik.{settings['ik']}"] if settings["ik"] != "off" else []
     own = [f"metric.{name}" for name in settings.get("metrics", ())]
     return recipes(["metrics", f"mode.{settings['mode']}", *solver, *own])
@@ -170,17 +170,17 @@ def _groups(data: Mapping[str, Any]) -> dict[str, Any]:
 
 def deployment_id(config: Mapping[str, Any]) -> str:
     """Return the identity of a run's deployment: a word and 16 hex digits."""
-    return deployment_name(deployment_settings(config))
+    return deployment_id_of(deployment_settings(config))
 
 
-def deployment_name(settings: Mapping[str, Any]) -> str:
+def deployment_id_of(settings: Mapping[str, Any]) -> str:
     """Return the identity that a deployment with these settings has by the present recipes."""
     name = settings.get("precision", "fp32")
     return f"{name}-{_digest({'settings': settings, 'recipes': deployment_recipes(settings)})}"
 
 
 def deployment_recipes(settings: Mapping[str, Any]) -> dict[str, int]:
-    """Return the recipe numbers of the components that a deployment with these settings uses."""
+    """Return the recipe versions of the components that a deployment with these settings uses."""
     graph, name = settings.get("graph", "auto"), settings.get("precision", "fp32")
     graphs = [f"graph.{one}" for one in ("streaming", "naive") if graph in (one, "auto")]
     return recipes(["export", "latency", *graphs, *([name] if name != "fp32" else [])])

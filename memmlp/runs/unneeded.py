@@ -12,7 +12,7 @@ from memmlp.common.liveness import lives
 from memmlp.runs.identity import NETWORK
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.notes import read_notes
-from memmlp.runs.recipe_numbers import outdated
+from memmlp.runs.recipe_versions import outdated
 from memmlp.runs.run import Run
 from memmlp.runs.shown_name import kind_words
 

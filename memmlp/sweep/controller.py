@@ -7,9 +7,9 @@ import time
 from pathlib import Path
 
 from memmlp.common.errors import InputError
-from memmlp.sweep.board import Board
 from memmlp.sweep.executors.executor import Executor, Handle, Work
 from memmlp.sweep.plan import Plan
+from memmlp.sweep.progress_table import Board
 from memmlp.sweep.worker import Presence
 
 LOOK = 0.5  # seconds between looks at the run folders

@@ -28,7 +28,7 @@ class RunTask:
         config: the resolved config of an experiment that needs the run.
         upstream: the id of the run that must be done before; None for none.
         stages: identities of the evaluations and the deployment that are wanted of the run.
-        what: what the run has in common with runs of other recipe numbers (`Identity.what`).
+        what: what the run has in common with runs of other recipe versions (`Identity.what`).
     """
 
     id: str

@@ -14,7 +14,7 @@ from memmlp.tables.measured_run import Measured
 from memmlp.tables.table import Cell, Effect, Key, Row, Table
 
 if TYPE_CHECKING:
-    from memmlp.tables.rounds import Rounds
+    from memmlp.tables.seed_rounds import Rounds
 
 Find = Callable[[Arm, int], Measured | None]
 

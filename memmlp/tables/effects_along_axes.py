@@ -13,7 +13,7 @@ import numpy as np
 from memmlp.sweep.spec import COMPUTE, COSTS, Arm, Sweep
 from memmlp.tables.effects import Paired, RunsBySeed, control_arm, paired
 from memmlp.tables.statistics import holm, paired_effects
-from memmlp.tables.statistics.effect_regression import Estimate, Line, fit
+from memmlp.tables.statistics.effect_regression import Estimate, FittedLine, fit
 from memmlp.tables.statistics.paired_differences import LEVEL
 from memmlp.tables.table import Key
 
@@ -49,7 +49,7 @@ class Bounds:
 
 
 @dataclass(frozen=True)
-class Point:
+class EffectOfCell:
     """The effect in one cell.
 
     Attributes:
@@ -116,11 +116,11 @@ class Trend:
     series: str
     control: str
     metric: str
-    points: tuple[Point, ...]
+    points: tuple[EffectOfCell, ...]
     clips: int
     lost: int
     varied: tuple[str, ...]
-    line: Line | None
+    line: FittedLine | None
     slopes: Mapping[str, Slope]
     reason: str = ""
     predicted: EffectPrediction | None = None
@@ -135,7 +135,7 @@ class Trend:
 
         Args:
             values: the values.
-            another: whether the interval is for one more cell there (see `Line.at`).
+            another: whether the interval is for one more cell there (see `FittedLine.at`).
         """
         return _bounds(self.curve([values or {}], another))[0]
 
@@ -281,7 +281,7 @@ def _cells(
     return list(found.values())
 
 
-def _slopes(line: Line, varied: Sequence[str]) -> dict[str, Slope]:
+def _slopes(line: FittedLine, varied: Sequence[str]) -> dict[str, Slope]:
     """Return a line's slopes by name, with p-values of their own."""
     estimates = {name: line.slope(number) for number, name in enumerate(varied, 1)}
     return {name: Slope(_bounds(one)[0], float(one.p[0]), None) for name, one in estimates.items()}
@@ -316,10 +316,10 @@ def _reason(
     return "" if against[0] in varied else f"all cells have the same {against[0]}"
 
 
-def _point(cell: _Cell) -> Point:
+def _point(cell: _Cell) -> EffectOfCell:
     found = paired_effects(cell.pair.matrix[None], cell.pair.groups)
     effect = Bounds(float(found.mean[0]), float(found.low[0]), float(found.high[0]))
-    return Point(cell.arm.cell, cell.values, effect, len(cell.pair.matrix))
+    return EffectOfCell(cell.arm.cell, cell.values, effect, len(cell.pair.matrix))
 
 
 def _shared(pairs: Sequence[Paired]) -> tuple[np.ndarray, np.ndarray, int]:

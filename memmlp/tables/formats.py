@@ -16,7 +16,7 @@ from rich.console import Console
 from memmlp.common.files import plain
 from memmlp.tables.statistics import Verdict
 from memmlp.tables.table import Table
-from memmlp.tables.table_text import MINUS, Grid, Line, caption, grids, legend
+from memmlp.tables.table_text import MINUS, ArmLine, Grid, caption, grids, legend
 
 GAP = "  "  # stands between columns on a terminal
 LABEL = 18  # the largest width of the arms' column on a terminal, characters
@@ -97,7 +97,7 @@ FORMATS: dict[str, Callable[[Table], str]] = {
 }  # fmt: skip
 
 
-def _all(grid: Grid) -> Iterator[Line]:
+def _all(grid: Grid) -> Iterator[ArmLine]:
     return (line for group in grid.groups for line in group)
 
 
@@ -110,7 +110,7 @@ def _tex(text: str) -> str:
     return "".join(TEX.get(letter, letter) for letter in text)
 
 
-def _tex_line(line: Line) -> str:
+def _tex_line(line: ArmLine) -> str:
     words = [*line.head, *map(" ".join, line.cells)]
     return " & ".join(map(_tex, words)) + r" \\"
 
@@ -125,7 +125,7 @@ def _html_head(name: str) -> str:
     return "<br>".join([metric, *(f"<small>{word}</small>" for word in unit)])
 
 
-def _html_group(group: Sequence[Line]) -> str:
+def _html_group(group: Sequence[ArmLine]) -> str:
     """Return the HTML of an arm's rows, headed by its label."""
     label = f'<th scope="rowgroup" rowspan="{len(group)}">{_html(group[0].head[0])}</th>'
     heads = [label, *[""] * (len(group) - 1)]
@@ -136,7 +136,7 @@ def _html_group(group: Sequence[Line]) -> str:
     return f"<tbody>{''.join(rows)}</tbody>"
 
 
-def _html_line(line: Line) -> str:
+def _html_line(line: ArmLine) -> str:
     cells = "".join(f"<td>{'<br>'.join(map(_html_mark, cell))}</td>" for cell in line.cells)
     return f'<td class="seeds">{_html(line.head[1])}</td>{cells}'
 
@@ -198,7 +198,7 @@ def _blocks(grid: Grid) -> list[list[Sequence[str]]]:
     return [[*map(_header, grid.header)], *map(_block, grid.groups)]
 
 
-def _block(group: Sequence[Line]) -> list[Sequence[str]]:
+def _block(group: Sequence[ArmLine]) -> list[Sequence[str]]:
     """Return an arm's columns as lines, with its label folded beside them."""
     columns: list[list[str]] = [[] for _ in (0, *group[0].cells)]
     for line in group:

@@ -38,7 +38,7 @@ class Origin:
         torch: torch's version.
         precision: the precision of training.
         body: whose rest joints the motion is on: "builtin" or the file of a body model.
-        recipes: the recipe number of each component.
+        recipes: the recipe version of each component.
         upstream: the id of the run upstream: a VQ-VAE's, a part's, or that of the network before a refiner;
             None where there is none.
         partial: which part of its protocol's list the data is, in words; None where it is all of it.

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from memmlp.runs.lookup import list_runs
-from memmlp.runs.recipe_numbers import outdated
+from memmlp.runs.recipe_versions import outdated
 from memmlp.runs.run import Run
 from memmlp.sweep.plan import Plan
 from memmlp.sweep.spec import Arm
@@ -50,7 +50,7 @@ def states(plan: Plan) -> Say:
 
 
 def older(plan: Plan) -> Say:
-    """Return a function that names a finished run that differs from a planned one in recipe numbers alone."""
+    """Return a function that names a finished run that only recipe versions tell from a planned one."""
     whats = {task.key: task.what for task in plan.tasks}
     entries = {(entry.label, entry.seed): entry for entry in plan.entries}
 

@@ -28,7 +28,7 @@ ARROWS = {"lower": "↓", "higher": "↑"}
 
 
 @dataclass(frozen=True)
-class Line:
+class ArmLine:
     """A line of an arm.
 
     Attributes:
@@ -48,7 +48,7 @@ class Grid:
 
     mode: str | None
     header: tuple[str, ...]
-    groups: tuple[tuple[Line, ...], ...]
+    groups: tuple[tuple[ArmLine, ...], ...]
 
 
 def grids(table: Table) -> list[Grid]:
@@ -206,7 +206,7 @@ def _agreement(table: Table) -> str:
     return f"paper: value (difference; ✓ it holds here, ✗ the opposite does{signs}){said}"
 
 
-def _lines(table: Table, row: Row, mode: str) -> Iterable[Line]:
+def _lines(table: Table, row: Row, mode: str) -> Iterable[ArmLine]:
     """Yield an arm's lines: what was measured, its difference from the control, and the paper's values.
 
     A row that is the paper's alone has only the last one.
@@ -214,15 +214,17 @@ def _lines(table: Table, row: Row, mode: str) -> Iterable[Line]:
     cells = [(row.cells[mode][metric], metric) for metric in table.metrics]
     paper = tuple((paper_words(cell, metric),) for cell, metric in cells)
     if row.paper_only:
-        yield Line("paper", (row.label, "paper"), paper)
+        yield ArmLine("paper", (row.label, "paper"), paper)
         return
     seeds = f"{len(row.found)}/{len(row.wanted)}"
-    yield Line("measured", (row.label, seeds), tuple((value_words(cell, metric),) for cell, metric in cells))
+    yield ArmLine(
+        "measured", (row.label, seeds), tuple((value_words(cell, metric),) for cell, metric in cells)
+    )
     if any(cell.effect for cell, _ in cells):
         effects = tuple(effect_words(cell, metric) for cell, metric in cells)
-        yield Line("difference", ("", "diff."), effects)
+        yield ArmLine("difference", ("", "diff."), effects)
     if any(cell.paper is not None for cell, _ in cells):
-        yield Line("paper", ("", "paper"), paper)
+        yield ArmLine("paper", ("", "paper"), paper)
 
 
 def value_words(cell: Cell, metric: str) -> str:

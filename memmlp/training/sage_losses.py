@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.common import distributed
-from memmlp.common.mixed_precision import in_float32
+from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import HANDS, HEAD, N_JOINTS, ROOT, ROTATION, SPARSE_DIM, SPARSE_POSITION
 from memmlp.networks.baselines.sage import HIDDEN, HalfVQVAE
 from memmlp.networks.baselines.sage_net import SAGENet

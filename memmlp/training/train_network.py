@@ -12,7 +12,7 @@ from torch.profiler import record_function
 
 from memmlp.common import distributed
 from memmlp.evaluation import modes
-from memmlp.evaluation.metrics import OwnMetrics
+from memmlp.evaluation.metrics import UserMetrics
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.mirror import MirroredDataset
@@ -51,7 +51,7 @@ class NetworkTraining:
     optim: Optim
     weighting: str
     shares: Mapping[str, float] | None = None
-    metrics: OwnMetrics = field(default_factory=dict)
+    metrics: UserMetrics = field(default_factory=dict)
     mirror: bool = False
 
     def train(

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.evaluation import modes
-from memmlp.evaluation.metrics import OwnMetrics
+from memmlp.evaluation.metrics import UserMetrics
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.dataset import MotionDataset, WindowSampler
 from memmlp.motion.mirror import MirroredDataset
@@ -62,7 +62,7 @@ class RefinerTraining:
     weighting: str
     shares: Mapping[str, float] | None = None
     mirror: bool = False
-    metrics: OwnMetrics = field(default_factory=dict)
+    metrics: UserMetrics = field(default_factory=dict)
 
     def train(
         self,

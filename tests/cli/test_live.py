@@ -19,7 +19,7 @@ from glb import Glb
 from processes import PATIENCE, hearing_interrupts, started
 
 from memmlp.cli.live import InputOptions, ShowOptions, known_of, load_clip
-from memmlp.live.calibration import Calibration, save_calibration
+from memmlp.live.calibration_file import Calibration, save_calibration
 from memmlp.live.stream import Offsets, Stream
 from memmlp.motion.body import PARENTS
 from memmlp.motion.formats.npz import read_clip, write_clip

@@ -144,7 +144,7 @@ def test_diff_cuts_no_number(memmlp: Memmlp, outputs: Path, monkeypatch: pytest.
     """Half a number is another number: keys get narrow first."""
     numbers = ["1.7190123e+05", "3.9876543e+05", "+2.2686e+05", "10^2 m/s^3"]
     rows = [("deployment.onnx.parameters_with_vq_and_more", *numbers)]
-    monkeypatch.setattr("memmlp.cli.runs.compare.result_rows", lambda first, second: rows)
+    monkeypatch.setattr("memmlp.cli.runs.diff.result_rows", lambda first, second: rows)
     said = memmlp("runs", "diff", A, B).out
     assert all(number in said for number in [*numbers, A[:8], B[:8]])
     assert "".join(word for word in said.split() if word in rows[0][0]) == rows[0][0]

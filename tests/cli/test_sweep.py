@@ -20,13 +20,13 @@ from processes import PATIENCE, ignoring_interrupts, started, until
 
 from memmlp.cli.workers import split_executor
 from memmlp.common.errors import InputError
-from memmlp.config.perform_task import perform
 from memmlp.config.plan_sweep import find_sweep, make_plan, orphans, plan_anew
+from memmlp.config.worker_process import perform
 from memmlp.runs.lookup import list_runs
-from memmlp.runs.recipe_numbers import RECIPES
+from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run
-from memmlp.sweep.board import name
 from memmlp.sweep.plan import Plan
+from memmlp.sweep.progress_table import name
 
 TINY = [*SMALLEST, "export.graph=off"]
 ARMS = {"full": [], "none": ["memory=none"], "wild": ["optim.lr=1e30"]}

@@ -10,7 +10,7 @@ import torch
 from memmlp.cli import workers as workers_module
 from memmlp.cli.workers import Workers, check_devices, hire, split_executor
 from memmlp.common.errors import InputError
-from memmlp.config import perform_task
+from memmlp.config import worker_process
 from memmlp.pipeline import devices
 from memmlp.sweep.plan import Plan
 
@@ -99,6 +99,6 @@ def test_workers_know_whether_they_are_to_have_a_gpu(
     path, fleet = hire(tmp_path, Plan("s", tmp_path, (), ()), Workers(executor, count=1), wanted)
     assert fleet.work.args[-1] is gpu
     monkeypatch.setattr(devices, "missing_gpu", lambda: "none is there")
-    monkeypatch.setattr(perform_task, "work_off", lambda *_: None)
+    monkeypatch.setattr(worker_process, "work_off", lambda *_: None)
     assert fleet.work() == ("none is there" if gpu else None)
     assert path.exists()

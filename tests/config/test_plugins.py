@@ -156,20 +156,20 @@ def test_metrics_of_ones_own_are_those_of_sweeps_and_searches(on_path: Path):
 def test_a_metric_is_measured_in_both_branches(on_path: Path):
     from tiny import frames, model
 
-    from memmlp.evaluation.metrics import OwnMetric
+    from memmlp.evaluation.metrics import UserMetric
     from memmlp.evaluation.modes import evaluate, quick_stream
 
     def mean(predicted: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
         return predicted.mean()
 
-    own = {"Mean": OwnMetric(mean, "positions"), "Turn": OwnMetric(mean, "rotations")}
+    own = {"Mean": UserMetric(mean, "positions"), "Turn": UserMetric(mean, "rotations")}
     report = evaluate(model(), frames(), ["stream"], 4, own=own)["mean"]["stream"]
     assert {"Mean", "Turn"} <= report["rotation"].keys()
     assert "Mean" in report["position"]
     assert "Turn" not in report["position"]
     assert {"rotation Mean", "position Mean"} <= quick_stream(model(), frames().clips(), own).keys()
     with pytest.raises(InputError, match=r"metric Mean: returned no number"):
-        evaluate(model(), frames(), ["stream"], 4, own={"Mean": OwnMetric(lambda p, t: p, "positions")})
+        evaluate(model(), frames(), ["stream"], 4, own={"Mean": UserMetric(lambda p, t: p, "positions")})
 
 
 @pytest.mark.parametrize(

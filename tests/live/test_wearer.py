@@ -13,7 +13,7 @@ from memmlp.common.errors import InputError
 from memmlp.live.rotations import BodyTree
 from memmlp.live.spaces import SPACES
 from memmlp.live.stream import Stream
-from memmlp.live.trackers import t_pose
+from memmlp.live.tracker_frames import t_pose
 from memmlp.live.wearer import stature, wearer
 from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
 

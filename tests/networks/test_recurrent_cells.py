@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from memmlp.networks.recurrent_cells import CELLS, Cell, scan
+from memmlp.networks.recurrent_cells import CELLS, RecurrentCell, scan
 
 X = torch.randn(2, 9, 4, generator=torch.Generator().manual_seed(1)).double()
 
 
-def cell(name: str) -> tuple[Cell, torch.Tensor]:
+def cell(name: str) -> tuple[RecurrentCell, torch.Tensor]:
     """A cell of width 4 with random weights, and a random state."""
     torch.manual_seed(2)
     made = CELLS[name](4).double()

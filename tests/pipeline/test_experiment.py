@@ -19,12 +19,12 @@ from memmlp.config.compose import composed
 from memmlp.config.schema import restored
 from memmlp.deploy.deployment import GRAPHS
 from memmlp.evaluation import modes as evaluation
+from memmlp.experiment_tracking.feed import Tracking
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline.experiment import Experiment
 from memmlp.pipeline.run_stages import upstream_run
 from memmlp.runs.identity import NEUTRAL, Identity, deployment_id, evaluation_id, flatten
 from memmlp.runs.run import Run
-from memmlp.tracking.feed import Tracking
 
 BASE = [
     "profile=tiny", "data=mocap", "data.root=clips", "data.split.groups=[]", "memory.shift=frame",

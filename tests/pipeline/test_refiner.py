@@ -10,8 +10,8 @@ from memmlp.common import distributed
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment, config_of
 from memmlp.config.compose import composed
-from memmlp.config.perform_task import check_identity
 from memmlp.config.plan_sweep import tasks_of
+from memmlp.config.worker_process import check_identity
 from memmlp.networks.refiner import Refined
 from memmlp.pipeline.run_distributed import run_distributed
 from memmlp.runs.lookup import list_runs

@@ -22,16 +22,16 @@ from memmlp.common.errors import InputError, LeaseLost, TrainingDiverged
 from memmlp.config.build import build_experiment
 from memmlp.config.compose import composed
 from memmlp.config.package_data import packaged
+from memmlp.experiment_tracking.feed import Tracking
 from memmlp.live.stream import Stream
 from memmlp.motion.dataset import MotionDataset
 from memmlp.pipeline import run_stages
 from memmlp.pipeline.run_stages import recording_outcome, upstream_run
 from memmlp.runs.lookup import list_runs
-from memmlp.runs.recipe_numbers import RECIPES
+from memmlp.runs.recipe_versions import RECIPES
 from memmlp.runs.run import Run
 from memmlp.sweep.worker import Cancelled
 from memmlp.tables.measured_run import load
-from memmlp.tracking.feed import Tracking
 
 
 def motion_run(folder: Path) -> Run:

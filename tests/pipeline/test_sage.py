@@ -11,8 +11,8 @@ from omegaconf import OmegaConf
 from memmlp.common.errors import InputError
 from memmlp.config.build import build_experiment, config_of
 from memmlp.config.compose import composed
-from memmlp.config.perform_task import check_identity
 from memmlp.config.plan_sweep import tasks_of
+from memmlp.config.worker_process import check_identity
 from memmlp.networks import checkpoint
 from memmlp.networks.baselines.sage_net import SAGENet
 from memmlp.pipeline.run_stages import upstream_run

@@ -17,9 +17,9 @@ from memmlp.evaluation.modes import joint_positions
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.motion.limb_shapes import LIMBS, ends
 from memmlp.render import figure, film
+from memmlp.render.clip_piece import Take
 from memmlp.render.error_colours import HEAT, heat, scale
 from memmlp.render.raster import Camera, draw
-from memmlp.render.take import Take
 
 TRUTH = joint_positions(tiny.clip(31)[:, SPARSE_DIM:]).numpy().astype(np.float64)
 OFF = np.array([0.0, 0.0, 0.08])

@@ -73,8 +73,10 @@ def test_page_needs_nothing_else(text: str):
 @pytest.mark.parametrize("count", [2, 12, 13])
 def test_points_of_ours_are_named_where_they_are_few(count: int):
     """A point that two tables share is named once."""
-    points = [figures.Point(f"arm {number};", 100.0 + number, 4.0) for number in range(count)]
-    svg = figures.accuracy({"one": points, "other": points[:1]}, [figures.Point("theirs", 72, 3)], "MPJRE")
+    points = [figures.SpeedAndError(f"arm {number};", 100.0 + number, 4.0) for number in range(count)]
+    svg = figures.accuracy(
+        {"one": points, "other": points[:1]}, [figures.SpeedAndError("theirs", 72, 3)], "MPJRE"
+    )
     assert svg.count("theirs") == 1
     assert [svg.count(point.label) for point in points] == [int(count <= 12)] * count
 

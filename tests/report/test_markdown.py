@@ -16,7 +16,7 @@ from report.conftest import GROUPS
 from memmlp.cli.results import sources
 from memmlp.common.errors import InputError
 from memmlp.report.kept_results import Kept, dumps, overrides_of
-from memmlp.report.markdown import KeptTable, Words, origin_words, pages
+from memmlp.report.markdown import KeptTable, Placeholders, origin_words, pages
 from memmlp.sweep.spec import Sweep
 from memmlp.tables.build_table import make_table
 from memmlp.tables.statistics import Verdict, holm, paired_effects
@@ -168,7 +168,9 @@ def test_the_way_from_the_first_arm_to_the_last_is_the_sum_of_its_steps(sweep: S
     arms = tuple(replace(arm, against=against.get(arm.label)) for arm in sweep.arms)
     chained = replace(sweep, arms=arms, control=labels[0])
     find = fake_sweep(tmp_path, chained, {labels[1]: 1.1, labels[2]: 1.3}, groups=GROUPS)
-    words = Words({"t": source(chained, Kept("table14", (), runs_of(chained, find), overrides_of(chained)))})
+    words = Placeholders(
+        {"t": source(chained, Kept("table14", (), runs_of(chained, find), overrides_of(chained)))}
+    )
     rows = [line.split(" | ") for line in words.way("t").splitlines()[2:]]
     assert [row[0].strip("| ") for row in rows] == [
         labels[1], labels[0], f"**the whole way, from {labels[2]}**"
@@ -178,7 +180,7 @@ def test_the_way_from_the_first_arm_to_the_last_is_the_sum_of_its_steps(sweep: S
     assert float(parts[0][0]) + float(parts[1][0]) == pytest.approx(float(parts[2][0]), abs=0.011)
     assert [part[1] for part in parts[:2]] == ["67 %", "33 %"]  # 1.3 to 1.1 to 1
     assert parts[2][1].split("; paper ")[0] == str(words.verdict("t", labels[2], "stream", "MPJPE"))
-    plain = Words({"t": source(sweep, Kept("table14", (), runs_of(sweep, find), overrides_of(sweep)))})
+    plain = Placeholders({"t": source(sweep, Kept("table14", (), runs_of(sweep, find), overrides_of(sweep)))})
     assert plain.way("t") == ""
 
 

@@ -12,7 +12,7 @@ from fake_cells import STEP, cells
 from PIL import Image
 
 from memmlp.report.kept_results import Kept, dumps, load_kept, overrides_of, save
-from memmlp.report.markdown import KeptTable, Words, pages
+from memmlp.report.markdown import KeptTable, Placeholders, pages
 from memmlp.report.scaling_figure import figure_is_of, scaling_figure
 from memmlp.report.scaling_section import bounds_words, power, scaling_section
 from memmlp.tables.build_table import make_table
@@ -80,7 +80,7 @@ def test_a_sweep_with_a_scale_has_the_section_before_its_table(kept: Kept, found
     text = pages({"cells": KeptTable(kept, table, (), found)}, {})["cells.md"]
     assert text.index("### Effects against compute") < text.index("### Memory with more steps")
     assert text.count("of 'none' from 'full' in the same cell") == 1
-    summary = Words({"cells": KeptTable(kept, table, (), found)}).summary("cells")
+    summary = Placeholders({"cells": KeptTable(kept, table, (), found)}).summary("cells")
     assert [line[:12] for line in summary.splitlines()] == ["- `profile=p", "- the predic", "- **none**: "]
 
 

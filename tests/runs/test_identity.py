@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from begun_runs import CONFIG, identity
 
-import memmlp.runs.recipe_numbers
+import memmlp.runs.recipe_versions
 from memmlp.runs.identity import (
     NEUTRAL,
     Identity,
@@ -37,7 +37,7 @@ def test_what_changes_the_result_changes_the_identity(other: dict):
 def test_a_components_recipe_moves_the_runs_that_use_it_and_no_others(monkeypatch: pytest.MonkeyPatch):
     gru, lstm = ({**CONFIG, "memory": {"name": name}} for name in ("gru", "lstm"))
     before = identity(gru), identity(lstm)
-    monkeypatch.setitem(memmlp.runs.recipe_numbers.RECIPES, "memory.gru", 2)
+    monkeypatch.setitem(memmlp.runs.recipe_versions.RECIPES, "memory.gru", 2)
     assert identity(gru) != before[0]
     assert identity(lstm) == before[1]
 
@@ -47,7 +47,7 @@ def test_what_a_run_is_does_not_move_with_recipes(monkeypatch: pytest.MonkeyPatc
     codes = Identity("vqvae", {"vqvae": {"codebook": "ema"}}, "d")
     own = Identity("memmlp", config, "d", codes)
     what, before = own.what, own.id
-    monkeypatch.setitem(memmlp.runs.recipe_numbers.RECIPES, "vqvae", 2)
+    monkeypatch.setitem(memmlp.runs.recipe_versions.RECIPES, "vqvae", 2)
     assert own.id != before  # by its VQ-VAE's
     assert own.what == what
     assert Identity("memmlp", config, "e", codes).what != what
@@ -115,7 +115,7 @@ def test_keys_that_older_runs_lack_count_only_where_they_change_something():
 
     def of(**changes: dict) -> str:
         config = {**terms, **{group: {**terms[group], **keys} for group, keys in changes.items()}}
-        return Identity("memmlp", config, "d").what  # recipe numbers, which move as well, do not count
+        return Identity("memmlp", config, "d").what  # recipe versions, which move as well, do not count
 
     assert of(loss={"weighting": "fixed", "lr": 0.01}, data={"mirror": False}) == of()
     names = {"name": "adamw", "_target_": "memmlp.training.optim.Optim"}

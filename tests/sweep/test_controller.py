@@ -8,9 +8,9 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.sweep import controller
-from memmlp.sweep.board import Board
 from memmlp.sweep.controller import PATIENCE, Fleet
 from memmlp.sweep.plan import Plan, RunTask
+from memmlp.sweep.progress_table import Board
 
 
 class Dead:

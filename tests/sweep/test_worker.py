@@ -21,7 +21,7 @@ from memmlp.common import lease
 from memmlp.common.errors import InputError, TrainingDiverged
 from memmlp.common.lease import Lock
 from memmlp.common.liveness import Changes
-from memmlp.config.perform_task import check_wanted
+from memmlp.config.worker_process import check_wanted
 from memmlp.runs.run import Run
 from memmlp.sweep import worker
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique

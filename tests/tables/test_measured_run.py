@@ -15,8 +15,8 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import read_json
 from memmlp.report.kept_results import Kept, dumps, load_kept
 from memmlp.runs.evaluation_file import write_report
-from memmlp.runs.identity import deployment_name
-from memmlp.runs.recipe_numbers import RECIPES, outdated
+from memmlp.runs.identity import deployment_id_of
+from memmlp.runs.recipe_versions import RECIPES, outdated
 from memmlp.sweep.spec import Sweep
 from memmlp.tables.measured_run import Measured, load
 
@@ -51,7 +51,7 @@ def test_costs_of_an_earlier_recipe_are_known_as_such(tmp_path: Path, monkeypatc
     before = load(run.folder).origin.recipes
     path = run.deployment("fp32-0").latency
     path.write_text(json.dumps(json.loads(path.read_text()) | {"settings": settings}))
-    path.parent.rename(path.parent.with_name(deployment_name(settings)))
+    path.parent.rename(path.parent.with_name(deployment_id_of(settings)))
     after = load(run.folder).origin.recipes
     made_by = {name: number for name, number in after.items() if name not in before}
     assert made_by.keys() == {"export", "latency", "graph.naive", "int8"}

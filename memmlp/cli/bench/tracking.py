@@ -31,8 +31,8 @@ def tracking(blocks: int, steps: int, uri: str | None, overrides: tuple[str, ...
 
     from memmlp.config.build import build_experiment
     from memmlp.config.compose import composed
+    from memmlp.experiment_tracking.feed import feed_of
     from memmlp.pipeline.run_stages import train_run
-    from memmlp.tracking.feed import feed_of
 
     address = [f"tracking.mlflow.uri={uri}"] if uri else []
     length = [f"optim.steps={(blocks + 3) * steps}", f"optim.log_every={steps}"]  # two pieces warm up

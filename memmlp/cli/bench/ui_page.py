@@ -61,10 +61,10 @@ def first_answer(outputs: Path) -> float:
     from urllib.request import urlopen
 
     from memmlp.report.ui.answers import Answers
-    from memmlp.report.ui.server import Server
+    from memmlp.report.ui.server import RunsServer
 
     began = time.perf_counter()
-    with Server(Answers(outputs), 0) as server, urlopen(f"{server.url}api/runs") as answer:
+    with RunsServer(Answers(outputs), 0) as server, urlopen(f"{server.url}api/runs") as answer:
         found = json.loads(answer.read())
         spent = time.perf_counter() - began
     assert len(found["rows"]) == len(list((outputs / "runs").iterdir()))
@@ -74,12 +74,12 @@ def first_answer(outputs: Path) -> float:
 def in_browser(outputs: Path, browser: str) -> tuple[float, float]:
     """Return the seconds until a browser shows the table, and those of a filter that few runs pass."""
     from memmlp.report.ui.answers import Answers
-    from memmlp.report.ui.server import Server
+    from memmlp.report.ui.server import RunsServer
 
     told: dict[str, float] = {}
     heard = threading.Event()
     answers: Any = Timed(Answers(outputs), told, heard)
-    with Server(answers, 0) as server, tempfile.TemporaryDirectory() as profile:
+    with RunsServer(answers, 0) as server, tempfile.TemporaryDirectory() as profile:
         command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0"]
         address = f"{server.url}#/runs?filter=memory%3Dgru+stream.MPJPE%3C6.8&time=yes"
         program = subprocess.Popen(

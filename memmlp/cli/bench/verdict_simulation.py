@@ -10,8 +10,16 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from memmlp.tables.statistics.calibration import EFFECT, MARGIN, TABLE, broken, extreme, grid, simulate
 from memmlp.tables.statistics.paired_differences import LEVEL
+from memmlp.tables.statistics.verdict_error_rates import (
+    EFFECT,
+    MARGIN,
+    TABLE,
+    broken,
+    extreme,
+    grid,
+    simulate,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -23,7 +23,7 @@ def export(source: Path, out: Path, format_: str | None, body: str, fps: float |
     SOURCE is an npz file or a folder of such. BVH is in centimetres, glTF in metres, both with Y up; npz
     (AMASS' layout, hands at rest) is for another frame rate.
     """
-    from memmlp.motion.exporting.folder import export as run
-    from memmlp.motion.exporting.folder import plan_export
+    from memmlp.motion.exporting.export_folder import export as run
+    from memmlp.motion.exporting.export_folder import plan_export
 
     show_exported(run(plan_export(source, out, format_), body=body, fps=fps, strict=strict), out)

@@ -52,7 +52,7 @@ def import_(
     SOURCE is a folder or one file. The clips are brought to the 22-joint tree, and each is compared with its
     file; what looks wrong is said.
     """
-    from memmlp.motion.importing.folder import ImportSettings, import_folder
+    from memmlp.motion.importing.import_folder import ImportSettings, import_folder
 
     rates = dict(map(_rate, fps))
     how = ImportSettings(skeleton, rates, body, _height(floor), take, strict, sound, up)

@@ -21,9 +21,9 @@ def show(source: Path, out: Path, clips: int, body: str) -> None:
     The clips are spread evenly over the folder's files in the order of their names.
     """
     from memmlp.common.files import atomic_write
-    from memmlp.render.clips import clip_sheet, some_clips
-    from memmlp.render.picture import check_picture
-    from memmlp.render.sheet import png
+    from memmlp.render.canvas import png
+    from memmlp.render.clip_sheet import clip_sheet, some_clips
+    from memmlp.render.figure_or_film import check_picture
 
     check_picture(out, "--out", (".png",))
     shown, skipped, total = some_clips(source, clips, body)

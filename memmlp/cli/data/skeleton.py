@@ -24,9 +24,9 @@ def guess(file: Path, out: Path | None) -> None:
     Prints the map with comments that say what is guessed and what is in doubt, imports the file with it, and
     says what is wrong then. Exits with 1 where the file can't be imported so.
     """
-    from memmlp.motion.importing.files import read_recording
     from memmlp.motion.importing.guess import as_yaml, check, write_map
     from memmlp.motion.importing.guess import guess as propose
+    from memmlp.motion.importing.importable_files import read_recording
 
     recording = read_recording(file)
     proposed = propose(recording, file.stem)
@@ -55,9 +55,9 @@ def show(file: Path, which: str | None, out: Path) -> None:
     """
     from memmlp.motion.body import load_rest_joints
     from memmlp.motion.importing.file_stance import find_stance
-    from memmlp.motion.importing.files import read_recording
+    from memmlp.motion.importing.importable_files import read_recording
     from memmlp.motion.importing.skeleton import find_skeleton, load_skeleton
-    from memmlp.render.picture import check_picture
+    from memmlp.render.figure_or_film import check_picture
     from memmlp.render.skeleton_map import skeleton_png
 
     check_picture(out, "--out", (".png",))

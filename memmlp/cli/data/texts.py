@@ -18,7 +18,7 @@ from memmlp.motion.preparing.groups import unfitting
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from memmlp.motion.exporting.folder import ExportReport
+    from memmlp.motion.exporting.export_folder import ExportReport
     from memmlp.motion.preparing.manifest import ClipRecord, Manifest
 
 MOST_NAMED = 8  # skipped files that are named on the screen; the manifest lists all

@@ -67,7 +67,7 @@ def _attempts(manifest: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def _origin(run: Run) -> dict[str, Any]:
-    """Return of what code and on which machine a run was made, the numbers of recipes last."""
+    """Return of what code and on which machine a run was made, the versions of recipes last."""
     from memmlp.runs.identity import flatten
 
     facts = {key: value for key, value in run.manifest.items() if key not in LEFT_OUT}

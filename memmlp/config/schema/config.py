@@ -223,20 +223,20 @@ class TrackerConfig:
 @dataclass
 class MLflowConfig(TrackerConfig):
     name: str = called("mlflow")
-    _target_: str = target("memmlp.tracking.mlflow_tracker.MLflow")
+    _target_: str = target("memmlp.experiment_tracking.mlflow_tracker.MLflow")
     uri: Optional[str] = key()
 
 
 @dataclass
 class TensorBoardConfig(TrackerConfig):
     name: str = called("tensorboard")
-    _target_: str = target("memmlp.tracking.tensorboard_tracker.TensorBoard")
+    _target_: str = target("memmlp.experiment_tracking.tensorboard_tracker.TensorBoard")
 
 
 @dataclass
 class WandBConfig(TrackerConfig):
     name: str = called("wandb")
-    _target_: str = target("memmlp.tracking.wandb_tracker.WandB")
+    _target_: str = target("memmlp.experiment_tracking.wandb_tracker.WandB")
     project: str = key(Text())
 
 

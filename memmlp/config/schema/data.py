@@ -8,7 +8,7 @@ from typing import Any, Optional
 from memmlp.config.schema.rules import (
     EachOf,
     Existing,
-    Folders,
+    FolderPaths,
     Text,
     Within,
     at_least,
@@ -104,7 +104,7 @@ class SourceConfig:
 
 @dataclass
 class SeededDataConfig(DataConfig):
-    root: Any = key(Folders())
+    root: Any = key(FolderPaths())
     sources: dict[str, SourceConfig] = field(default_factory=dict)
     synth: Optional[SynthConfig] = None
     split: SeededSplitConfig = field(default_factory=SeededSplitConfig)

@@ -131,7 +131,7 @@ class Matching:
 
 
 @dataclass(frozen=True)
-class Folders:
+class FolderPaths:
     """The rule that a value is the path of an existing folder, or a list of several."""
 
     def allows(self, value: Any) -> bool:

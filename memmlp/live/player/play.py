@@ -11,12 +11,12 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.live.outputs.output import Outputs
-from memmlp.live.player.fitting import Fitting, hips_height
 from memmlp.live.player.sources import SourceSample, TrackerSource
+from memmlp.live.player.wearer_fitting import Fitting, hips_height
 from memmlp.live.rotations import matrix_to_quaternion
 from memmlp.live.spaces import SPACES, Space
 from memmlp.live.stream import Pose, Stream
-from memmlp.live.trackers import GAP
+from memmlp.live.tracker_frames import GAP
 from memmlp.motion.body import FPS, JOINTS, PARENTS
 from memmlp.motion.formats.humanoid_bones import VRM
 from memmlp.motion.limb_shapes import LIMBS

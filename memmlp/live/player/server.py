@@ -127,10 +127,10 @@ def event(name: str, value: Mapping[str, Any]) -> bytes:
     return f"event: {name}\ndata: {json.dumps(value, separators=(',', ':'))}\n\n".encode()
 
 
-class Handler(BaseHTTPRequestHandler):
+class LiveHandler(BaseHTTPRequestHandler):
     """Answers one request of a page."""
 
-    server: Server
+    server: LiveServer
 
     def do_GET(self) -> None:
         """Send a file of the page, or the events until the end."""
@@ -203,7 +203,7 @@ class Handler(BaseHTTPRequestHandler):
         """Log nothing, for requests are no news."""
 
 
-class Server(ThreadingHTTPServer):
+class LiveServer(ThreadingHTTPServer):
     """Serves the page, from threads of its own, inside a `with` block.
 
     Args:
@@ -234,7 +234,7 @@ class Server(ThreadingHTTPServer):
         self.hub, self.files, self.ask = hub, files, ask
         self.access = Access(host, token)
         try:
-            super().__init__((host, port), Handler)
+            super().__init__((host, port), LiveHandler)
         except (OSError, OverflowError) as error:
             taken = getattr(error, "errno", None) == errno.EADDRINUSE
             reason = "taken" if taken else getattr(error, "strerror", None) or error
@@ -257,7 +257,7 @@ class Server(ThreadingHTTPServer):
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore the error, for what one page breaks off does not concern the others."""
 
-    def __enter__(self) -> Server:
+    def __enter__(self) -> LiveServer:
         self.thread = threading.Thread(target=self.serve_forever, args=(0.05,), daemon=True)
         self.thread.start()
         return self

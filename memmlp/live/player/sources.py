@@ -17,7 +17,7 @@ from memmlp.common.errors import InputError
 from memmlp.live.player.packets import Packet, Parse, TrackerPoses
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
 from memmlp.live.spaces import Space, SpaceName
-from memmlp.live.trackers import TrackerSample, between
+from memmlp.live.tracker_frames import TrackerSample, between
 from memmlp.motion.body import (
     FPS,
     MOTION_DIM,

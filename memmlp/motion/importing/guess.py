@@ -20,8 +20,8 @@ from memmlp.motion.importing.anatomy import CHAINS, unit
 from memmlp.motion.importing.axes import settle
 from memmlp.motion.importing.convert import convert
 from memmlp.motion.importing.limbs_by_shape import Limbs, Pair, Tree, find_limbs, middle, read_tree
-from memmlp.motion.importing.names import Words, without_namespace, words
-from memmlp.motion.importing.recording import Recording
+from memmlp.motion.importing.names import NodeWords, without_namespace, words
+from memmlp.motion.importing.recording_protocol import Recording
 from memmlp.motion.importing.skeleton import SkeletonMap
 
 Found = dict[str, int | None]  # joint -> node; None where no node stands for it
@@ -104,13 +104,13 @@ def _chosen(tree: Tree, named: int | None, shaped: int | None) -> tuple[int | No
 # Names
 
 
-def _head_by_name(tree: Tree, said: Sequence[Words]) -> int | None:
+def _head_by_name(tree: Tree, said: Sequence[NodeWords]) -> int | None:
     return next(
         (node for node, word in enumerate(said) if word.word == "head" and not tree.is_end(node)), None
     )
 
 
-def _by_name(tree: Tree, said: Sequence[Words], limbs: Limbs) -> Found:
+def _by_name(tree: Tree, said: Sequence[NodeWords], limbs: Limbs) -> Found:
     """Return what the names tell: `0.knee` and `1.knee` for the knees of both chains."""
     found: Found = {}
     for side in (0, 1):
@@ -129,7 +129,7 @@ def _by_name(tree: Tree, said: Sequence[Words], limbs: Limbs) -> Found:
 
 
 def _spelt(
-    tree: Tree, said: Sequence[Words], chain: Sequence[int], parts: dict[str, tuple[str, ...]]
+    tree: Tree, said: Sequence[NodeWords], chain: Sequence[int], parts: dict[str, tuple[str, ...]]
 ) -> dict[str, int]:
     """Return the joints of a chain whose nodes have their names, each below the one before it."""
     found: dict[str, int] = {}
@@ -187,7 +187,7 @@ def _neck_and_head(tree: Tree, limbs: Limbs) -> tuple[int | None, int]:
 
 
 def _sides(
-    tree: Tree, said: Sequence[Words], limbs: Limbs, shape: Found
+    tree: Tree, said: Sequence[NodeWords], limbs: Limbs, shape: Found
 ) -> tuple[dict[tuple[str, bool], int], list[str]]:
     """Return which chain is (side, of a leg), and the doubts about it."""
     result: dict[tuple[str, bool], int] = {}
@@ -211,7 +211,7 @@ def _sides(
     return result, doubts
 
 
-def _left_by_name(said: Sequence[Words], pair: Pair) -> int | None:
+def _left_by_name(said: Sequence[NodeWords], pair: Pair) -> int | None:
     """Return which chain is the left one, by the side words of most of its nodes."""
     votes = [
         sum((said[n].side == "left") - (said[n].side == "right") for n in chain) for chain in pair.chains

@@ -16,7 +16,7 @@ TOKENS = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 GLUED = re.compile(r"(left|right|l|r)(.+)")  # leftupleg, lfemur
 
 
-class Words(NamedTuple):
+class NodeWords(NamedTuple):
     """What a node's name says.
 
     Attributes:
@@ -74,7 +74,7 @@ def find_nodes(nodes: Sequence[str], wanted: Sequence[str]) -> dict[str, str] | 
     return {name: str(node) for name, node in found.items()}
 
 
-def words(name: str, known: frozenset[str]) -> Words:
+def words(name: str, known: frozenset[str]) -> NodeWords:
     """Return the side and the word of a name without namespace.
 
     Args:
@@ -84,9 +84,9 @@ def words(name: str, known: frozenset[str]) -> Words:
     tokens = [token.lower() for token in TOKENS.findall(name.removesuffix(END))]
     sides = {SIDES[token] for token in tokens if token in SIDES}
     if len(sides) == 1:
-        return Words(sides.pop(), "".join(token for token in tokens if token not in SIDES))
+        return NodeWords(sides.pop(), "".join(token for token in tokens if token not in SIDES))
     word = "".join(tokens)
     glued = GLUED.fullmatch(word)
     if glued and glued[2] in known:
-        return Words(SIDES[glued[1]], glued[2])
-    return Words("", word)
+        return NodeWords(SIDES[glued[1]], glued[2])
+    return NodeWords("", word)

@@ -34,7 +34,7 @@ from memmlp.motion.preparing.folders import Folders, Root, find_all
 from memmlp.motion.preparing.manifest import FORMAT, MANIFEST, ClipRecord, Manifest, write_manifest
 from memmlp.motion.preparing.splits import PARTS, Split
 from memmlp.motion.torch_threads import one_thread
-from memmlp.runs.recipe_numbers import RECIPES
+from memmlp.runs.recipe_versions import RECIPES
 
 FRAMES_VERSION = (
     1  # number of a frame's content; a new one changes every digest, and so makes every run again

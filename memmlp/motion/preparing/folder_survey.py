@@ -18,7 +18,7 @@ from memmlp.motion.plausibility import check_plausible, unusual
 from memmlp.motion.preparing.find import FoundFiles, clip_name
 from memmlp.motion.preparing.folders import Root, find_all
 from memmlp.motion.preparing.manifest import STILL, ClipRecord
-from memmlp.motion.preparing.resampled_copies import copies_alike, first_frame
+from memmlp.motion.preparing.resampled_duplicates import copies_alike, first_frame
 
 
 @dataclass(frozen=True)

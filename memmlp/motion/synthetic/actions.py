@@ -11,7 +11,9 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from memmlp.motion.synthetic.curves import Array, arc, ease, pulse, wander
-from memmlp.motion.synthetic.footwork import (
+from memmlp.motion.synthetic.gait import GRAVITY
+from memmlp.motion.synthetic.puppet import Puppet
+from memmlp.motion.synthetic.standing import (
     LEFT_RIGHT,
     FootPlacement,
     Footwork,
@@ -22,8 +24,6 @@ from memmlp.motion.synthetic.footwork import (
     occasions,
     stand,
 )
-from memmlp.motion.synthetic.gait import GRAVITY
-from memmlp.motion.synthetic.puppet import Puppet
 
 ARM = 0.53  # metres, shoulder to wrist
 # Where the hands are from the shoulders (outward, up, forward, metres): ahead, before the chest, hanging.

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from memmlp.motion.synthetic.curves import Array, ease, pulse, smooth, wander
-from memmlp.motion.synthetic.footwork import FootPlacement, Style, direction, move_hand, occasions, stand
 from memmlp.motion.synthetic.puppet import Puppet
+from memmlp.motion.synthetic.standing import FootPlacement, Style, direction, move_hand, occasions, stand
 from memmlp.motion.synthetic.steps import Feet, FootStep, tread
 
 GRAVITY = 9.81

@@ -18,7 +18,7 @@ QUIET = 50  # so many last steps of a sample take the mean
 BIN = 2 / 255  # the width of the bins of the first step's likelihood: a pixel's, as BoDiffusion's code has it
 
 
-class Made(NamedTuple):
+class Denoised(NamedTuple):
     """What a network makes of noisy signals (B, ...).
 
     Attributes:
@@ -78,7 +78,7 @@ class AncestralDiffusion(Noising):
         return (noisy - (1 - signal).sqrt() * noise) / signal.sqrt()
 
     def losses(
-        self, clean: Tensor, noise: Tensor, time: Tensor, made: Made, limits: tuple[Tensor, Tensor]
+        self, clean: Tensor, noise: Tensor, time: Tensor, made: Denoised, limits: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor]:
         """Return the hybrid loss' two terms, means over components (Nichol & Dhariwal 2021, Eq. 16).
 
@@ -105,7 +105,7 @@ class AncestralDiffusion(Noising):
         return (noise - made.noise).square().mean(), bound.mean() / math.log(2)
 
     def step(
-        self, noisy: Tensor, made: Made, index: int, limits: tuple[Tensor, Tensor]
+        self, noisy: Tensor, made: Denoised, index: int, limits: tuple[Tensor, Tensor]
     ) -> tuple[Tensor, Tensor]:
         """Return the mean and the variance (B, ...) of the signal after a sampling step.
 

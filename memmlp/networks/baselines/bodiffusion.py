@@ -15,7 +15,7 @@ from memmlp.common import distributed
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM, TRACKED
 from memmlp.motion.normalizer import Normalizer
 from memmlp.networks.baselines.agrol import TimeEmbedding, WholeWindow
-from memmlp.networks.baselines.ancestral_diffusion import AncestralDiffusion, Made
+from memmlp.networks.baselines.ancestral_diffusion import AncestralDiffusion, Denoised
 from memmlp.networks.baselines.encoder import Attention
 from memmlp.networks.memory import State
 from memmlp.networks.motion_model import Learned
@@ -141,7 +141,7 @@ class BoDiffusion(WholeWindow):
         thirds = encoded.unflatten(-1, (len(TRACKED), CHANNELS))
         return self.spread(thirds.transpose(-1, -2)).transpose(-1, -2)
 
-    def denoise(self, noisy: Tensor, time: Tensor, encoded: Tensor) -> Made:
+    def denoise(self, noisy: Tensor, time: Tensor, encoded: Tensor) -> Denoised:
         """Predict the noise in rotations (B, T, 132), and the share of a step's variance.
 
         Args:
@@ -154,7 +154,7 @@ class BoDiffusion(WholeWindow):
         for block in self.blocks:
             h = block(h, embedding)
         made = self.joint_head(self.head(h).unflatten(-1, (N_JOINTS, -1)))
-        return Made(*(part.flatten(-2).to(noisy) for part in made.chunk(2, -1)))
+        return Denoised(*(part.flatten(-2).to(noisy) for part in made.chunk(2, -1)))
 
     def step(self, noisy: Tensor, encoded: Tensor, index: int) -> tuple[Tensor, Tensor]:
         """Return mean and variance (B, T, 132) after a sampling step of rotations given inputs (B, T, 54)."""

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from memmlp.common.mixed_precision import in_float32
+from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import (
     ROTATION,
     SPARSE_ANGULAR_VELOCITY,
@@ -124,7 +124,7 @@ class NormedLSTM(nn.Module):
         return made, after[0][0], after[1][0]
 
 
-class Block(nn.Module):
+class TimeAndTokenBlock(nn.Module):
     """An LSTM over time for each token, then encoder layers over the tokens of each frame.
 
     Args:
@@ -194,7 +194,9 @@ class HMDPoser(WindowlessModel):
         unseen = (6, 6, 3), (turns, turns, width - 2 * turns)
         self.others = nn.ModuleList(TokenEmbedding(*unseen) for _ in range(OTHERS))
         self.norm = nn.LayerNorm(width, eps=1e-6)
-        self.blocks = nn.ModuleList(Block(width, layers, heads, feedforward, dropout) for _ in range(depth))
+        self.blocks = nn.ModuleList(
+            TimeAndTokenBlock(width, layers, heads, feedforward, dropout) for _ in range(depth)
+        )
         self.pose = self._head(ROTATION.stop)
         self.shape = self._head(SHAPE) if shape else None
 

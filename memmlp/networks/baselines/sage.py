@@ -48,7 +48,7 @@ class Mixture(nn.Module):
         return self.spread(tracker_features(encoded).transpose(-1, -2)).transpose(-1, -2)
 
 
-class Block(nn.Module):
+class AttentionBlock(nn.Module):
     """Attention and an MLP of four times the width, each of normalised features and added to them (pre-norm).
 
     Args:
@@ -88,7 +88,7 @@ class Stack(nn.Module):
 
     def __init__(self, width: int, depth: int, heads: int, dropout: float):
         super().__init__()
-        self.blocks = nn.Sequential(*(Block(width, heads, dropout) for _ in range(depth)))
+        self.blocks = nn.Sequential(*(AttentionBlock(width, heads, dropout) for _ in range(depth)))
         self.norm, self.head = nn.LayerNorm(width), nn.Linear(width, width, bias=False)
 
     def before(self, h: Tensor) -> Tensor:
@@ -142,7 +142,7 @@ class Lengthened(Stack):
         h = h + at
         for one in earlier:
             h = one(h)
-        newest = cast(Block, block).newest(h, 1)
+        newest = cast(AttentionBlock, block).newest(h, 1)
         newest = F.linear(newest, self.convolution.weight[..., -1].T, self.convolution.bias)
         return self.head(self.norm(newest))
 

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.flop_counter import register_flop_formula
 
-from memmlp.common.mixed_precision import in_float32
+from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import SPARSE_DIM
 from memmlp.networks.memory.memory_block import Past, Recurred, RecurredFeature, State
 from memmlp.networks.memory.slot import FeatureMemory

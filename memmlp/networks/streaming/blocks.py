@@ -26,7 +26,7 @@ def whole(window: Tensor) -> Tensor:
     return window
 
 
-class Block(nn.Module):
+class StreamingBlock(nn.Module):
     """An MLP block of a streaming graph.
 
     Args:
@@ -55,7 +55,7 @@ class Block(nn.Module):
         return h + F.silu(self.linear(self.norm(h)))
 
 
-class SharedBlock(Block):
+class SharedBlock(StreamingBlock):
     """A memory block whose memory feature was multiplied by its part of the linear layer beforehand.
 
     The feature's contribution: [h; z] W = h W_h + z W_z, and z W_z is known when a frame enters.
@@ -142,7 +142,7 @@ class FrameGRU(nn.Module):
 class StreamedBranch(nn.Module):
     """A predictor's branch whose last block and linear layer compute the newest frame alone."""
 
-    def __init__(self, blocks: Sequence[Block], linear: nn.Linear):
+    def __init__(self, blocks: Sequence[StreamingBlock], linear: nn.Linear):
         super().__init__()
         self.blocks, self.linear = nn.ModuleList(blocks), linear
 
@@ -166,14 +166,14 @@ class Converter:
         self.features: list[nn.Module] = []
         self.shared: list[SharedBlock] = []
 
-    def block(self, source: nn.Module) -> Block:
+    def block(self, source: nn.Module) -> StreamingBlock:
         """Make the streaming block of an MLPBlock or a MemoryBlock."""
         if isinstance(source, MemoryBlock):
             return self._memory_block(source)
         assert isinstance(source, MLPBlock)
-        return Block(source)
+        return StreamingBlock(source)
 
-    def _memory_block(self, source: MemoryBlock) -> Block:
+    def _memory_block(self, source: MemoryBlock) -> StreamingBlock:
         kinds: dict[type[MLPBlock], type[SharedBlock]] = {
             ResidualFusion: ResidualBlock,
             PlainFusion: PlainBlock,

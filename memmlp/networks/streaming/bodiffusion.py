@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from memmlp.motion.body import N_JOINTS, ROTATION, SPARSE_DIM
-from memmlp.networks.baselines.ancestral_diffusion import Made
+from memmlp.networks.baselines.ancestral_diffusion import Denoised
 from memmlp.networks.baselines.bodiffusion import NOISY, BoDiffusion, DiTBlock
 from memmlp.networks.motion_model import MotionModel
 from memmlp.networks.streaming.baselines import AGRoLStream
@@ -64,14 +64,14 @@ class BoDiffusionStream(AGRoLStream):
 
         return diffusion.sample(step, self.model.noises)
 
-    def _made(self, noisy: Tensor, window: Tensor, index: int, count: int) -> Made:
+    def _made(self, noisy: Tensor, window: Tensor, index: int, count: int) -> Denoised:
         """Predict the newest `count` frames' noise and variance at sampling step `index` of (T, 132)."""
         h = window + self.motion(noisy) + self.model.places
         *earlier, last = zip(self.blocks, self.modulations[index], strict=True)
         for block, modulation in earlier:
             h = block.newest(h, modulation.chunk(6), self.frames)
         block, modulation = last
-        return Made(*self.made(block.newest(h, modulation.chunk(6), count)).split(ROTATION.stop, -1))
+        return Denoised(*self.made(block.newest(h, modulation.chunk(6), count)).split(ROTATION.stop, -1))
 
 
 def linear(weight: Tensor, bias: Tensor | None = None) -> nn.Linear:

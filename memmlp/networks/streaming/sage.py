@@ -33,7 +33,9 @@ class SAGENetStream(StreamingGraph):
         """Make the graph's parts from a copy of the network."""
         assert isinstance(model, SAGENet)
         self.diffusion, self.noises, self.decoder = model.diffusion, model.noises, model.decoder
-        self.upper, self.lower = (Sampler(part, model.diffusion.times) for part in (model.upper, model.lower))
+        self.upper, self.lower = (
+            DenoiserAtSamplingTimes(part, model.diffusion.times) for part in (model.upper, model.lower)
+        )
         self.beside = model.lower.beside
         conditions = model.upper.condition, model.lower.condition, model.decoder.condition
         self.widths = [one.linear.out_features for one in conditions]
@@ -72,7 +74,11 @@ class SAGENetStream(StreamingGraph):
         return torch.cat([head(newest) for head in self.decoder.heads], -1)
 
     def sampled(
-        self, sampler: Sampler, seen: Tensor, noise: Tensor, joined: Callable[[Tensor], Tensor]
+        self,
+        sampler: DenoiserAtSamplingTimes,
+        seen: Tensor,
+        noise: Tensor,
+        joined: Callable[[Tensor], Tensor],
     ) -> Tensor:
         """Sample latents (T // 2, 384) from noise, given what is seen of the window (T, d)."""
         condition, noisy = sampler.condition(seen), noise
@@ -83,7 +89,7 @@ class SAGENetStream(StreamingGraph):
         return clean
 
 
-class Sampler(nn.Module):
+class DenoiserAtSamplingTimes(nn.Module):
     """A denoiser at the times of sampling alone.
 
     Args:

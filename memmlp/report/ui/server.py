@@ -60,10 +60,10 @@ class Watch:
             self.condition.notify_all()
 
 
-class Handler(BaseHTTPRequestHandler):
+class RunsHandler(BaseHTTPRequestHandler):
     """Answers one request."""
 
-    server: Server
+    server: RunsServer
     protocol_version = "HTTP/1.1"
     timeout = 60
 
@@ -172,7 +172,7 @@ class Handler(BaseHTTPRequestHandler):
         """Log nothing, for requests are no news."""
 
 
-class Server(ThreadingHTTPServer):
+class RunsServer(ThreadingHTTPServer):
     """Serves the page, from threads of its own, inside a `with` block.
 
     Args:
@@ -197,7 +197,7 @@ class Server(ThreadingHTTPServer):
         self.access = Access(host, token)
         self.watch = Watch(answers.look, every)
         try:
-            super().__init__((host, port), Handler)
+            super().__init__((host, port), RunsHandler)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             allowed = "allowed are this machine's addresses and free ports (0: any that is free)"
@@ -217,7 +217,7 @@ class Server(ThreadingHTTPServer):
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore the error, for what one page breaks off does not concern the others."""
 
-    def __enter__(self) -> Server:
+    def __enter__(self) -> RunsServer:
         self.threads = [threading.Thread(target=work, daemon=True) for work in (self._serve, self.watch.loop)]
         for thread in self.threads:
             thread.start()

@@ -18,19 +18,19 @@ from memmlp.evaluation.units import UNITS
 from memmlp.report.ui.index import Index
 from memmlp.runs.identity import NETWORK, training_settings
 from memmlp.runs.run import STAGE_WORDS
-from memmlp.sweep.board import name as task_name
 from memmlp.sweep.kept_sweep import NAME as SWEEP_FILE
 from memmlp.sweep.kept_sweep import kept
 from memmlp.sweep.parsing import parse_sweep
 from memmlp.sweep.plan import Entry, Plan, RunTask
+from memmlp.sweep.progress_table import name as task_name
 from memmlp.sweep.spec import Arm, Sweep
 from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import Measured, load
-from memmlp.tables.rounds import Rounds, standings, subject
-from memmlp.tables.rounds_file import NAME as ROUNDS_FILE
-from memmlp.tables.rounds_file import read as read_rounds
-from memmlp.tables.rounds_file import same_runs
+from memmlp.tables.seed_rounds import Rounds, standings, subject
+from memmlp.tables.seed_rounds_file import NAME as ROUNDS_FILE
+from memmlp.tables.seed_rounds_file import read as read_rounds
+from memmlp.tables.seed_rounds_file import same_runs
 from memmlp.tables.statistics import Verdict
 from memmlp.tables.table_text import better, caption, heading, legend
 
@@ -39,7 +39,7 @@ OTHERS = "seeds were spent in rounds, but not of these runs: these verdicts do n
 NOT_KEPT = "this sweep's file was not kept with it, so its first arm is the control; memmlp table has its own"
 
 
-class Made(NamedTuple):
+class TableAndRounds(NamedTuple):
     """What was made of a sweep's runs: its table, and its rounds where seeds were spent in rounds."""
 
     table: dict[str, Any]
@@ -53,7 +53,7 @@ class Sweeps:
         self.index = index
         self.lock = threading.Lock()
         self.plans: dict[Path, tuple[int, Plan]] = {}
-        self.tables: dict[str, tuple[Any, Made]] = {}
+        self.tables: dict[str, tuple[Any, TableAndRounds]] = {}
         self.bad: dict[str, str] = {}
 
     def known(self) -> list[Plan]:
@@ -181,7 +181,7 @@ class Sweeps:
         )
         return left * statistics.median(paces) / len(running) if left else None
 
-    def made(self, plan: Plan) -> Made:
+    def made(self, plan: Plan) -> TableAndRounds:
         """Return what was made of a sweep's runs.
 
         It is made again when one of them, the sweep, its plan or its rounds changed.
@@ -197,7 +197,7 @@ class Sweeps:
             self.tables[plan.name] = (stamp, made)
             return made
 
-    def _make(self, plan: Plan) -> Made:
+    def _make(self, plan: Plan) -> TableAndRounds:
         flags: list[str] = []
         sweep = self._kept(plan.name)
         if sweep is None:
@@ -219,7 +219,7 @@ class Sweeps:
 
         made = make_table(sweep, finished_runs(sweep, find), rounds=rounds)
         table = table_words(replace(made, flags=(*made.flags, *flags)))
-        return Made(table, rounds_words(rounds, sweep) if rounds else None)
+        return TableAndRounds(table, rounds_words(rounds, sweep) if rounds else None)
 
     def _rounds_path(self, plan: Plan) -> Path:
         return self.index.outputs / "sweeps" / plan.name / ROUNDS_FILE

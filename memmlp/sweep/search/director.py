@@ -19,10 +19,10 @@ from memmlp.common.errors import InputError
 from memmlp.runs.identity import inference
 from memmlp.runs.metrics_log import Metrics
 from memmlp.runs.run import Run
-from memmlp.sweep.board import total_steps
 from memmlp.sweep.controller import LOOK, Fleet
 from memmlp.sweep.plan import Entry, Plan, RunTask, unique
-from memmlp.sweep.search.board import SearchBoard
+from memmlp.sweep.progress_table import total_steps
+from memmlp.sweep.search.progress_table import SearchBoard
 from memmlp.sweep.search.spec import Objective, Value
 from memmlp.sweep.search.study import Study, values
 

@@ -49,7 +49,7 @@ class Estimate(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Line:
+class FittedLine:
     """Least squares through the effects of K cells.
 
     Attributes:
@@ -153,7 +153,7 @@ def _solver(x: np.ndarray, spread: np.ndarray) -> np.ndarray:
     return np.linalg.pinv(x * root[:, None]) * root
 
 
-def fit(differences: np.ndarray, x: np.ndarray, groups: Groups = None) -> Line | None:
+def fit(differences: np.ndarray, x: np.ndarray, groups: Groups = None) -> FittedLine | None:
     """Fit a line to the differences (K, C) of K cells on the same clips, each the mean over its seeds.
 
     Args:
@@ -168,4 +168,4 @@ def fit(differences: np.ndarray, x: np.ndarray, groups: Groups = None) -> Line |
     if cells - coefficients < LEAST or np.linalg.matrix_rank(x) < coefficients:
         return None
     means, weights = by_group(differences[:, None], groups)
-    return Line(means[:, 0], weights, x)
+    return FittedLine(means[:, 0], weights, x)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from memmlp.common.errors import InputError
-from memmlp.common.mixed_precision import in_float32
+from memmlp.common.float32_regions import in_float32
 from memmlp.motion.body import N_JOINTS, POSITION
 from memmlp.motion.normalizer import Normalizer
 

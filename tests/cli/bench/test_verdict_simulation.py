@@ -19,7 +19,7 @@ def test_the_command(memmlp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (row,) = read_json(file)["cells"]
     assert (row["seeds"], row["clips"], row["size"], row["groups"]) == (3, 10, 2, 5)
     assert f"| 3 x 10 / 2 | {100 * min(s['coverage'] for s in row['shares'].values()):.1f}-" in ran.out
-    monkeypatch.setattr("memmlp.tables.statistics.calibration.MOST", 0.8)
+    monkeypatch.setattr("memmlp.tables.statistics.verdict_error_rates.MOST", 0.8)
     ran = memmlp("bench", "calibration", "--quick", "--tables", "30")
     assert ran.code == 1
     assert "broken at 3 seeds x 10 clips, 2 a group: coverage" in ran.out

@@ -11,10 +11,10 @@ import pytest
 from chromium import Browser
 from processes import PATIENCE, until
 
-from memmlp.live.player.fitting import Fitting
 from memmlp.live.player.play import greeting, play
-from memmlp.live.player.server import Hub, Server
+from memmlp.live.player.server import Hub, LiveServer
 from memmlp.live.player.sources import ClipSource, TrackedClip
+from memmlp.live.player.wearer_fitting import Fitting
 from memmlp.live.stream import Stream
 
 pytestmark = pytest.mark.slow
@@ -27,7 +27,7 @@ NEWEST = "Number(document.querySelector('#scrub').max)"
 def url(network: Path, clip: TrackedClip) -> Iterator[str]:
     """Serve a page on which a clip plays, and yield its address."""
     stopped, source = threading.Event(), ClipSource(clip, 60)
-    with Server(Hub(greeting(source, "tiny")), 0) as server:
+    with LiveServer(Hub(greeting(source, "tiny")), 0) as server:
         parts = (Stream(network), source, server.hub.publish, stopped)
         loop = threading.Thread(target=play, args=parts, daemon=True)
         loop.start()
@@ -80,7 +80,7 @@ def test_it_plays_pauses_and_goes_back(browser: Browser, url: str):
 
 
 def test_it_says_what_it_waits_for_and_when_the_command_has_ended(browser: Browser, clip: TrackedClip):
-    with Server(Hub(greeting(ClipSource(clip, 60), "tiny")), 0) as server:
+    with LiveServer(Hub(greeting(ClipSource(clip, 60), "tiny")), 0) as server:
         browser.open(server.url)
         browser.wait("document.querySelector('#status').textContent == 'waiting for trackers'")
         assert browser.value("document.querySelector('#error').hidden")  # of no frame there is no error
@@ -99,11 +99,11 @@ class Worn(ClipSource):
 def test_the_wearer_fits_the_stream_from_the_page(
     browser: Browser, network: Path, clip: TrackedClip, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("memmlp.live.player.fitting.FAR", 0.0)  # nobody stands so well in a T-pose
+    monkeypatch.setattr("memmlp.live.player.wearer_fitting.FAR", 0.0)  # nobody stands so well in a T-pose
     stopped, source, stream = threading.Event(), Worn(clip, 60), Stream(network)
     hub = Hub(greeting(source, "tiny"))
     fitting = Fitting(stream, "amass", None, hub.tell, clock=lambda: 0.0)  # a countdown ends when cancelled
-    with Server(hub, 0, ask=fitting.ask) as server:
+    with LiveServer(hub, 0, ask=fitting.ask) as server:
         parts = (stream, source, hub.publish, stopped, None, fitting)
         loop = threading.Thread(target=play, args=parts, daemon=True)
         loop.start()
@@ -133,7 +133,7 @@ def test_the_printed_address_opens_the_page_for_others(browser: Browser, clip: T
     """Scripts, frames and orders go by the cookie, and the token stands in the address no more."""
     asked: list[object] = []
     hub = Hub(greeting(Worn(clip, 60), "tiny"))
-    with Server(hub, 0, "0.0.0.0", ask=asked.append) as server:
+    with LiveServer(hub, 0, "0.0.0.0", ask=asked.append) as server:
         address = f"http://127.0.0.1:{server.server_port}/"
         browser.call("Page.navigate", url=f"{address}?{server.url.partition('?')[2]}")
         browser.wait(f"location.href == '{address}' && document.readyState == 'complete'")

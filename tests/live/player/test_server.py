@@ -15,7 +15,7 @@ from processes import PATIENCE
 from memmlp.common.errors import InputError
 from memmlp.live.player import server as module
 from memmlp.live.player.play import JUMPS, Jumps, greeting, play
-from memmlp.live.player.server import FILES, Hub, Server
+from memmlp.live.player.server import FILES, Hub, LiveServer
 from memmlp.live.player.sources import ClipSource, SourceSample, TrackedClip
 from memmlp.live.stream import Stream
 
@@ -117,12 +117,12 @@ def test_pauses_are_no_other_unit():
 
 
 @pytest.fixture
-def server(clip: TrackedClip) -> Iterator[Server]:
-    with Server(Hub(greeting(ClipSource(clip, 60), "tiny")), 0) as server:
+def server(clip: TrackedClip) -> Iterator[LiveServer]:
+    with LiveServer(Hub(greeting(ClipSource(clip, 60), "tiny")), 0) as server:
         yield server
 
 
-def get(server: Server, path: str) -> http.client.HTTPResponse:
+def get(server: LiveServer, path: str) -> http.client.HTTPResponse:
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=PATIENCE)
     connection.request("GET", path)
     return connection.getresponse()
@@ -139,7 +139,7 @@ def events(response: http.client.HTTPResponse) -> Iterator[tuple[str, dict]]:
             yield name, json.loads(value)
 
 
-def test_two_watchers_get_all_frames(server: Server):
+def test_two_watchers_get_all_frames(server: LiveServer):
     streams = [events(get(server, "/events")) for _ in range(2)]
     for stream in streams:
         name, words = next(stream)
@@ -165,14 +165,14 @@ def test_a_slow_watcher_loses_the_oldest_frames(monkeypatch):
     assert hub.watchers == set()
 
 
-def test_the_pages_files_are_there(server: Server):
+def test_the_pages_files_are_there(server: LiveServer):
     for name, file in FILES.items():
         response = get(server, f"/{name}")
         assert (response.status, response.headers["Content-Type"]) == (200, file.kind), name
         assert len(response.read()) > 200
 
 
-def test_the_page_needs_no_network(server: Server):
+def test_the_page_needs_no_network(server: LiveServer):
     """The page loads nothing from elsewhere."""
     for name in FILES:
         if not name.startswith("three/"):
@@ -184,27 +184,27 @@ def test_the_licence_of_three_is_there():
 
 
 @pytest.mark.parametrize("path", ["/../server.py", "/three/LICENSE/..", "/%2e%2e/server.py", "/main"])
-def test_nothing_else_is_served(server: Server, path: str):
+def test_nothing_else_is_served(server: LiveServer, path: str):
     assert get(server, path).status == 404
 
 
-def test_only_this_machine_is_served(server: Server):
+def test_only_this_machine_is_served(server: LiveServer):
     assert server.socket.getsockname()[0] == "127.0.0.1"
 
 
-def test_a_page_of_another_site_gets_nothing(server: Server):
+def test_a_page_of_another_site_gets_nothing(server: LiveServer):
     """Whose name was made to mean this machine."""
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=PATIENCE)
     connection.request("GET", "/events", headers={"Host": f"elsewhere.example:{server.server_port}"})
     assert connection.getresponse().status == 403
 
 
-def test_a_taken_port_is_one_line(server: Server):
+def test_a_taken_port_is_one_line(server: LiveServer):
     with pytest.raises(InputError, match=f"--port {server.server_port}: .*; allowed are"):
-        Server(Hub({}), server.server_port)
+        LiveServer(Hub({}), server.server_port)
 
 
-def post(server: Server, content: bytes, path: str = "/wearer", **headers: str) -> tuple[int, str]:
+def post(server: LiveServer, content: bytes, path: str = "/wearer", **headers: str) -> tuple[int, str]:
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=PATIENCE)
     connection.request(
         "POST", path, content, {name.replace("_", "-"): value for name, value in headers.items()}
@@ -219,7 +219,7 @@ def asked() -> list[object]:
 
 
 @pytest.fixture
-def fitted(asked: list[object]) -> Iterator[Server]:
+def fitted(asked: list[object]) -> Iterator[LiveServer]:
     """A server that takes orders, of which "no" is refused."""
 
     def ask(fields: object) -> None:
@@ -227,11 +227,11 @@ def fitted(asked: list[object]) -> Iterator[Server]:
             raise InputError("no: not allowed")
         asked.append(fields)
 
-    with Server(Hub({}), 0, ask=ask) as server:
+    with LiveServer(Hub({}), 0, ask=ask) as server:
         yield server
 
 
-def test_orders_of_the_page_arrive(fitted: Server, asked: list[object]):
+def test_orders_of_the_page_arrive(fitted: LiveServer, asked: list[object]):
     own = f"http://127.0.0.1:{fitted.server_port}"
     assert post(fitted, b'{"action": "forget"}', Origin=own) == (200, "")
     assert asked == [{"action": "forget"}]
@@ -246,18 +246,20 @@ def test_orders_of_the_page_arrive(fitted: Server, asked: list[object]):
     "headers",
     [{"Origin": "http://elsewhere.example"}, {"Host": "elsewhere.example"}, {"Sec_Fetch_Site": "cross-site"}],
 )
-def test_orders_of_another_site_s_page_do_not(fitted: Server, asked: list[object], headers: dict[str, str]):
+def test_orders_of_another_site_s_page_do_not(
+    fitted: LiveServer, asked: list[object], headers: dict[str, str]
+):
     assert post(fitted, b'{"action": "forget"}', **headers)[0] == 403
     assert asked == []
 
 
-def test_nobody_to_fit_takes_no_orders(server: Server):
+def test_nobody_to_fit_takes_no_orders(server: LiveServer):
     assert post(server, b"{}")[0] == 404
 
 
 def test_at_another_address_everything_needs_the_token(clip: TrackedClip):
     token = "a token of many letters"
-    with Server(Hub({}), 0, "0.0.0.0", token, ask=pytest.fail) as server:
+    with LiveServer(Hub({}), 0, "0.0.0.0", token, ask=pytest.fail) as server:
         for path in ("/", "/events", "/main.js", "/?token=wrong", "/events?token="):
             assert get(server, path).status == 403, path
         assert post(server, b"{}")[0] == 403
@@ -283,10 +285,10 @@ def test_a_later_watcher_gets_the_newest_state():
 
 def test_the_end_leaves_the_port_and_no_thread(clip: TrackedClip):
     before = threading.active_count()
-    with Server(Hub({}), 0) as server:
+    with LiveServer(Hub({}), 0) as server:
         response = get(server, "/events")
         port = server.server_port
     assert list(response)[-1:] == [b"\n"]
-    with Server(Hub({}), port):
+    with LiveServer(Hub({}), port):
         pass
     assert threading.active_count() <= before + 1  # the watcher's own thread may still be ending

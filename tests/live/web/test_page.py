@@ -16,7 +16,7 @@ from live.web.conftest import PERSON, Made, package_files
 
 from memmlp.common.npm import IWER
 from memmlp.live.stream import Offsets, Stream
-from memmlp.tables.browser_rows import read
+from memmlp.tables.rows_measured_in_browsers import read
 
 pytestmark = pytest.mark.slow
 

@@ -17,7 +17,7 @@ from memmlp.motion.formats.bvh import read_bvh
 from memmlp.motion.formats.bvh_writer import TIPS, euler_zxy, write_bvh
 from memmlp.motion.formats.npz import read_clip, write_clip
 from memmlp.motion.importing.convert import NONE
-from memmlp.motion.importing.folder import ImportSettings, import_folder
+from memmlp.motion.importing.import_folder import ImportSettings, import_folder
 from memmlp.motion.synthetic import synthesize_clip
 
 REST = builtin_rest_joints()

@@ -11,7 +11,7 @@ from bvh_samples import TREES, person, read, refuse, write
 
 from memmlp.common.errors import InputError
 from memmlp.motion.formats.bvh import read_bvh
-from memmlp.motion.importing.folder import ImportSettings, import_folder
+from memmlp.motion.importing.import_folder import ImportSettings, import_folder
 from memmlp.motion.importing.mapped_motion import pick_joints
 from memmlp.motion.importing.skeleton import SKELETONS, find_skeleton, load_skeleton, shipped_skeletons
 

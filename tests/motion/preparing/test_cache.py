@@ -22,7 +22,7 @@ from memmlp.motion.preparing import folder_survey
 from memmlp.motion.preparing.cache import ClipFolder, prepare
 from memmlp.motion.preparing.manifest import Manifest
 from memmlp.motion.preparing.splits import SeededSplit
-from memmlp.runs.recipe_numbers import RECIPES
+from memmlp.runs.recipe_versions import RECIPES
 
 
 def motion(length: int, seed: int, fps: float = 60.0) -> Clip:

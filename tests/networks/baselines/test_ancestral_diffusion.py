@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from memmlp.networks.baselines.ancestral_diffusion import AncestralDiffusion, Made, binned_surprise
+from memmlp.networks.baselines.ancestral_diffusion import AncestralDiffusion, Denoised, binned_surprise
 from memmlp.networks.baselines.diffusion import linear_schedule
 
 OPEN = torch.tensor(-9.0), torch.tensor(9.0)
@@ -33,9 +33,9 @@ def test_the_linear_schedule_is_the_papers():
     assert torch.all(linear_schedule(5) > 0)
 
 
-def made(noisy: torch.Tensor, time: torch.Tensor) -> Made:
+def made(noisy: torch.Tensor, time: torch.Tensor) -> Denoised:
     """An affine map of the noisy signal and the time."""
-    return Made(0.7 * noisy + 0.01 * time.view(-1, 1, 1), 0.1 * noisy - 0.3)
+    return Denoised(0.7 * noisy + 0.01 * time.view(-1, 1, 1), 0.1 * noisy - 0.3)
 
 
 @pytest.mark.parametrize("count", [1, 4, 53])
@@ -66,7 +66,7 @@ def test_sampling_is_an_independent_numpy_computation(count):
 
 def test_the_share_says_where_a_variance_lies_between_the_least_and_the_largest():
     diffusion, share = AncestralDiffusion(60, 3).double(), torch.tensor([0.5, -1.0, 1.0]).double()
-    _, variance = diffusion.step(share, Made(share, share), 0, OPEN)
+    _, variance = diffusion.step(share, Denoised(share, share), 0, OPEN)
     _, _, least, largest = (table[-1] for table in tables(kept(60)[[19, 39, 59]]))
     np.testing.assert_allclose(variance, [largest**0.75 * least**0.25, least, largest], rtol=1e-5)
 
@@ -77,7 +77,7 @@ def test_the_losses_are_an_independent_numpy_computation():
     clean, noise = (torch.randn(3, 1, 1, generator=draw).double() for _ in range(2))
     time = torch.tensor([19, 7, 2])
     noisy = diffusion.noised(clean, time, noise)
-    guess = Made(*(part.requires_grad_() for part in made(noisy, time)))
+    guess = Denoised(*(part.requires_grad_() for part in made(noisy, time)))
     error, bound = diffusion.losses(clean, noise, time, guess, OPEN)
     first, second, least, largest = (table[time][:, None, None] for table in tables(kept(20)))
     share = (guess.share.detach().numpy() + 1) / 2
@@ -102,7 +102,7 @@ def test_at_the_first_step_the_bound_is_the_surprise_of_the_true_signal():
     diffusion, clean = AncestralDiffusion(20, 2).double(), torch.tensor([[0.3], [0.3]]).double()
     noise, share = torch.zeros(2, 1).double(), -torch.ones(2, 1).double()
     for offset in (0.0, 0.5):
-        guess = Made(noise + offset, share)
+        guess = Denoised(noise + offset, share)
         _, bound = diffusion.losses(clean, noise, torch.zeros(2).long(), guess, OPEN)
         signal = float(diffusion.signal[0])
         mean = 0.3 - offset * math.sqrt(1 - signal) / math.sqrt(signal)

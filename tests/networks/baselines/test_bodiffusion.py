@@ -13,7 +13,7 @@ from memmlp.evaluation.evaluation import Evaluation
 from memmlp.evaluation.ik import NoIK
 from memmlp.motion.body import ROTATION, SPARSE_DIM
 from memmlp.networks.baselines import ancestral_diffusion as ancestral
-from memmlp.networks.baselines.ancestral_diffusion import Made
+from memmlp.networks.baselines.ancestral_diffusion import Denoised
 from memmlp.networks.baselines.bodiffusion import DiTBlock
 from memmlp.networks.streaming import has_stream, streaming
 
@@ -85,7 +85,7 @@ def test_learning_takes_what_a_perfect_denoiser_would_leave():
 
     def perfect(noisy, time, _):
         signal = model.diffusion.signal[time][:, None, None]
-        return Made((noisy - signal.sqrt() * encoded) / (1 - signal).sqrt(), torch.zeros_like(noisy))
+        return Denoised((noisy - signal.sqrt() * encoded) / (1 - signal).sqrt(), torch.zeros_like(noisy))
 
     model.denoise = perfect
     motion, *_ = model.learn(truth[:, -1:, :SPARSE_DIM], model.true_state(truth[:, :-1]), truth)

@@ -13,18 +13,18 @@ from chromium import Browser
 from report.ui.conftest import SEEDS, begun, made, run_of
 from report.ui.test_replay import motion
 
-from memmlp.cli.rounds import look
+from memmlp.cli.seed_rounds import look
 from memmlp.evaluation.units import UNITS
 from memmlp.report.ui.answers import Answers
 from memmlp.report.ui.one_file import ReportedSweep, page_text, query, rounded
-from memmlp.report.ui.server import Server
+from memmlp.report.ui.server import RunsServer
 from memmlp.runs.run import Run
 from memmlp.sweep.kept_sweep import kept
 from memmlp.sweep.plan import Plan
 from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.measured_run import load
-from memmlp.tables.rounds import begin
 from memmlp.tables.runs_of_plan import finder
+from memmlp.tables.seed_rounds import begin
 
 EVIL = "<img src=x onerror=owned=1>"
 READY = "document.documentElement.dataset.ready"
@@ -54,8 +54,8 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def server(home: Path) -> Iterator[Server]:
-    with Server(Answers(home, predict), 0, every=0.05) as running:
+def server(home: Path) -> Iterator[RunsServer]:
+    with RunsServer(Answers(home, predict), 0, every=0.05) as running:
         yield running
 
 
@@ -76,7 +76,7 @@ def go(browser: Browser, base: str, route: str, until: str) -> None:
 pytestmark = pytest.mark.slow
 
 
-def test_filter_sort_and_the_address(browser: Browser, server: Server):
+def test_filter_sort_and_the_address(browser: Browser, server: RunsServer):
     go(browser, server.url, "runs", "document.querySelectorAll('.runs tbody tr').length >= 9")
     browser.value(
         "const f = document.querySelector('#filter'); f.value = 'memory=gru stream.MPJPE<99'; "
@@ -98,7 +98,7 @@ def test_filter_sort_and_the_address(browser: Browser, server: Server):
     assert browser.value(NAMES) == names[::-1]
 
 
-def test_chosen_runs_are_compared(browser: Browser, server: Server, home: Path):
+def test_chosen_runs_are_compared(browser: Browser, server: RunsServer, home: Path):
     go(browser, server.url, "runs?filter=memory%3Dgru", f"{NAMES}.length == 3")
     browser.click(".runs thead input")
     browser.wait("document.querySelector('a.button').textContent == 'Compare 3'")
@@ -109,7 +109,7 @@ def test_chosen_runs_are_compared(browser: Browser, server: Server, home: Path):
     assert label.startswith("training loss by step. memory=gru · seed")
 
 
-def test_a_run_s_page_and_its_replay(browser: Browser, server: Server, home: Path):
+def test_a_run_s_page_and_its_replay(browser: Browser, server: RunsServer, home: Path):
     run = run_of(home, "gru", 0)
     go(
         browser,
@@ -132,7 +132,7 @@ def test_a_run_s_page_and_its_replay(browser: Browser, server: Server, home: Pat
     assert browser.value("document.querySelectorAll('.meter').length") == 12
 
 
-def test_a_sweep_s_effects_and_curves(browser: Browser, server: Server):
+def test_a_sweep_s_effects_and_curves(browser: Browser, server: RunsServer):
     go(browser, server.url, "sweep/mine", "document.querySelectorAll('.plot svg').length >= 2")
     label = browser.value("document.querySelector('.plot svg').ariaLabel")
     assert label.startswith("MPJPE [cm], differences from the control. gru: \N{MINUS SIGN}")
@@ -162,7 +162,7 @@ def test_units_and_directions_of_metrics_of_ones_own(
     none, gru = (run_of(tmp_path, arm, 0) for arm in ("none", "gru"))
     scored(none, Score=5.0, Odd=1.0)
     scored(gru, Score=7.0, Odd=2.0)
-    with Server(Answers(tmp_path, kept=False), 0, every=0.05) as running:
+    with RunsServer(Answers(tmp_path, kept=False), 0, every=0.05) as running:
         go(browser, running.url, f"run/{gru.id}", "document.querySelectorAll('.grid').length >= 2")
         rows = browser.value("[...document.querySelectorAll('.grid tbody tr')].map(r => r.textContent)")
         (row,) = (row for row in rows if row.startswith("Score"))
@@ -187,7 +187,7 @@ def test_units_and_directions_of_metrics_of_ones_own(
 def test_rounds_of_a_sweep(browser: Browser, tmp_path: Path):
     sweep, folder = made(tmp_path), tmp_path / "sweeps" / "mine"
     look(sweep, tmp_path, begin(sweep), Plan.load(folder / "plan.json"))
-    with Server(Answers(tmp_path, kept=False), 0, every=0.05) as running:
+    with RunsServer(Answers(tmp_path, kept=False), 0, every=0.05) as running:
         go(browser, running.url, "sweep/mine", "document.body.textContent.includes('Rounds')")
         words = browser.value("document.body.textContent")
         assert "2 of 2 comparisons are decided" in words
@@ -197,7 +197,7 @@ def test_rounds_of_a_sweep(browser: Browser, tmp_path: Path):
         assert "gru203\N{EN DASH}" in rows
 
 
-def test_news_are_shown_without_a_touch(browser: Browser, server: Server, home: Path):
+def test_news_are_shown_without_a_touch(browser: Browser, server: RunsServer, home: Path):
     run = Run.of(home, "abcdef0123456789")
     go(browser, server.url, f"run/{run.id}", "document.querySelector('.plot svg')")
     data = "document.querySelector('.plot svg')?.ariaLabel"
@@ -207,7 +207,7 @@ def test_news_are_shown_without_a_touch(browser: Browser, server: Server, home: 
     browser.wait(f"{data}?.includes('ends at 2.5')")
 
 
-def test_data_is_never_markup_and_damage_is_told(browser: Browser, server: Server):
+def test_data_is_never_markup_and_damage_is_told(browser: Browser, server: RunsServer):
     for route in ("runs?kind=all", f"run/{'e' * 16}", f"compare?runs={'e' * 16},abcdef0123456789"):
         go(browser, server.url, route, "document.body.textContent.includes('<img src=x')")
         assert browser.value("document.querySelectorAll('main img').length") == 0
@@ -217,7 +217,7 @@ def test_data_is_never_markup_and_damage_is_told(browser: Browser, server: Serve
     assert "manifest.json, config.yaml cannot be read" in words
 
 
-def test_a_phone_s_page_is_not_wider_than_the_phone(browser: Browser, server: Server):
+def test_a_phone_s_page_is_not_wider_than_the_phone(browser: Browser, server: RunsServer):
     browser.size(390, 844)
     for route in ("runs", "sweep/mine", "sweeps", "run/abcdef0123456789", "searches"):
         go(browser, server.url, route, "document.querySelector('h1')")
@@ -227,7 +227,7 @@ def test_a_phone_s_page_is_not_wider_than_the_phone(browser: Browser, server: Se
     assert browser.value("document.querySelector('.runs thead th.n').getBoundingClientRect().right") <= 390
 
 
-def test_colours_are_a_choice_that_is_kept(browser: Browser, server: Server):
+def test_colours_are_a_choice_that_is_kept(browser: Browser, server: RunsServer):
     paper = "getComputedStyle(document.body).backgroundColor"
     go(browser, server.url, "runs", "document.querySelector('h1')")
     light = browser.value(paper)
@@ -247,7 +247,7 @@ def test_a_replay_says_that_the_other_run_s_is_being_computed(browser: Browser, 
             seen.wait()
         return predict(run, clip, mode)
 
-    with Server(Answers(home, slow, kept=False), 0, every=0.05) as server:
+    with RunsServer(Answers(home, slow, kept=False), 0, every=0.05) as server:
         go(browser, server.url, f"run/{run_of(home, 'gru', 1).id}", "document.querySelector('.view .wait')")
         assert browser.value("document.querySelector('.view .wait').textContent") == "computing …"
         seen.set()

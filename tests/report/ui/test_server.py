@@ -15,7 +15,7 @@ from report.ui.conftest import begun, run_of
 from memmlp.common.errors import InputError
 from memmlp.report.ui import pages
 from memmlp.report.ui.answers import Answers
-from memmlp.report.ui.server import Server
+from memmlp.report.ui.server import RunsServer
 
 TOKEN = "a token of many letters"
 
@@ -30,7 +30,7 @@ class Answer(NamedTuple):
         return json.loads(self.body)
 
 
-def get(server: Server, path: str, **headers: str) -> Answer:
+def get(server: RunsServer, path: str, **headers: str) -> Answer:
     """Ask the server for a path, literally as it is given."""
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=60)
     connection.putrequest("GET", path, skip_host="Host" in headers)
@@ -44,12 +44,12 @@ def get(server: Server, path: str, **headers: str) -> Answer:
 
 
 @pytest.fixture
-def server(outputs: Path) -> Iterator[Server]:
-    with Server(Answers(outputs), 0, every=0.05) as running:
+def server(outputs: Path) -> Iterator[RunsServer]:
+    with RunsServer(Answers(outputs), 0, every=0.05) as running:
         yield running
 
 
-def test_runs_and_only_what_changed_since(server: Server, outputs: Path):
+def test_runs_and_only_what_changed_since(server: RunsServer, outputs: Path):
     first = get(server, "/api/runs").json
     assert (len(first["rows"]), first["whole"]) == (6, True)
     row = next(row for row in first["rows"] if row["id"] == run_of(outputs, "gru", 2).id)
@@ -66,7 +66,7 @@ def test_runs_and_only_what_changed_since(server: Server, outputs: Path):
     assert get(server, since).json["whole"]  # its config has values that no other run has
 
 
-def test_pages_of_a_run_a_sweep_and_curves(server: Server, outputs: Path):
+def test_pages_of_a_run_a_sweep_and_curves(server: RunsServer, outputs: Path):
     run, control = run_of(outputs, "gru", 1), run_of(outputs, "none", 1)
     page = get(server, f"/api/run/{run.id}").json
     assert page["name"] == "memory=gru · seed 1"
@@ -91,17 +91,17 @@ def test_pages_of_a_run_a_sweep_and_curves(server: Server, outputs: Path):
         "/files/{id}/evaluations/stream-0.json", "/files/..%2Fruns%2F{id}/config.yaml", "/files//etc/passwd",
     ],
 )  # fmt: skip
-def test_nothing_else_is_sent(server: Server, outputs: Path, path: str):
+def test_nothing_else_is_sent(server: RunsServer, outputs: Path, path: str):
     answer = get(server, path.replace("{id}", run_of(outputs).id))
     assert answer.code == 404
     assert answer.json.keys() == {"error"}
 
 
-def test_the_page_says_what_it_reads_before_it_has_read_it(server: Server):
+def test_the_page_says_what_it_reads_before_it_has_read_it(server: RunsServer):
     assert b"Reading the run folders" in get(server, "/").body
 
 
-def test_what_is_missing_is_named(server: Server, outputs: Path):
+def test_what_is_missing_is_named(server: RunsServer, outputs: Path):
     assert (
         get(server, "/api/run/nope").json["error"].startswith(f"run nope: it is not in {outputs / 'runs'};")
     )
@@ -112,12 +112,12 @@ def test_what_is_missing_is_named(server: Server, outputs: Path):
 @pytest.mark.parametrize(
     "path", ["/api/runs?since=x", "/api/replay/{id}?mode=other&clip=c", "/api/replay/{id}"]
 )
-def test_a_bad_question_is_one_line(server: Server, outputs: Path, path: str):
+def test_a_bad_question_is_one_line(server: RunsServer, outputs: Path, path: str):
     answer = get(server, path.replace("{id}", run_of(outputs).id))
     assert (answer.code, list(answer.json)) == (400, ["error"])
 
 
-def test_the_page_s_files_and_their_policy(server: Server):
+def test_the_page_s_files_and_their_policy(server: RunsServer):
     for name in pages.FILES:
         answer = get(server, f"/{name}")
         assert (answer.code, len(answer.body) > 100) == (200, True)
@@ -127,7 +127,7 @@ def test_the_page_s_files_and_their_policy(server: Server):
     assert answer.headers["X-Content-Type-Options"] == "nosniff"
 
 
-def test_a_run_s_file_is_text_without_any_right(server: Server, outputs: Path):
+def test_a_run_s_file_is_text_without_any_right(server: RunsServer, outputs: Path):
     run = run_of(outputs)
     answer = get(server, f"/files/{run.id}/config.yaml")
     assert (answer.code, answer.headers["Content-Type"]) == (200, "text/plain; charset=utf-8")
@@ -146,18 +146,18 @@ def test_a_run_s_file_is_text_without_any_right(server: Server, outputs: Path):
         ({"Sec_Fetch_Site": "same-origin"}, 200),
     ],
 )
-def test_other_hosts_and_other_pages_get_nothing(server: Server, headers: dict[str, str], code: int):
+def test_other_hosts_and_other_pages_get_nothing(server: RunsServer, headers: dict[str, str], code: int):
     assert get(server, "/api/runs", **headers).code == code
 
 
-def test_a_link_on_another_page_may_open_the_page_alone(server: Server):
+def test_a_link_on_another_page_may_open_the_page_alone(server: RunsServer):
     elsewhere = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"}
     assert get(server, "/", **elsewhere).code == 200
     assert get(server, "/api/runs", **elsewhere).code == 403
 
 
 def test_another_address_needs_the_token(outputs: Path):
-    with Server(Answers(outputs), 0, "0.0.0.0", TOKEN) as server:
+    with RunsServer(Answers(outputs), 0, "0.0.0.0", TOKEN) as server:
         for path in ("/", "/api/runs", "/style.css", "/events", "/?token=wrong", "/api/runs?token="):
             answer = get(server, path)
             assert (answer.code, b"runs" in answer.body) == (403, False)
@@ -168,11 +168,11 @@ def test_another_address_needs_the_token(outputs: Path):
         assert len(get(server, "/api/runs", Cookie=cookie.partition(";")[0]).json["rows"]) == 6
         assert get(server, "/api/runs", Cookie=cookie.partition("=")[0] + "=other").code == 403
         assert f"?token={quote(TOKEN)}" in server.url
-    with Server(Answers(outputs), 0, "0.0.0.0") as server:
+    with RunsServer(Answers(outputs), 0, "0.0.0.0") as server:
         assert len(server.access.token or "") >= 32
 
 
-def test_news_come_when_something_changed(server: Server, outputs: Path):
+def test_news_come_when_something_changed(server: RunsServer, outputs: Path):
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=60)
     connection.request("GET", "/events")
     news = connection.getresponse()
@@ -184,14 +184,14 @@ def test_news_come_when_something_changed(server: Server, outputs: Path):
     connection.close()
 
 
-def test_a_port_that_is_taken_is_one_line(server: Server, outputs: Path):
+def test_a_port_that_is_taken_is_one_line(server: RunsServer, outputs: Path):
     with pytest.raises(InputError, match=f"--port {server.server_port}: .*; allowed are"):
-        Server(Answers(outputs), server.server_port)
+        RunsServer(Answers(outputs), server.server_port)
     with pytest.raises(InputError, match=r"--host nowhere\.invalid"):
-        Server(Answers(outputs), 0, "nowhere.invalid")
+        RunsServer(Answers(outputs), 0, "nowhere.invalid")
 
 
-def test_a_bug_in_an_answer_is_an_answer(server: Server, monkeypatch: pytest.MonkeyPatch):
+def test_a_bug_in_an_answer_is_an_answer(server: RunsServer, monkeypatch: pytest.MonkeyPatch):
     def broken(*_: object) -> dict:
         raise ZeroDivisionError("a bug")
 

@@ -10,7 +10,7 @@ import pytest
 from fake_runs import fake_run
 from report.ui.conftest import begun, run_of
 
-from memmlp.cli.rounds import look
+from memmlp.cli.seed_rounds import look
 from memmlp.report.ui.index import Index
 from memmlp.report.ui.sweeps import NOT_KEPT, OTHERS, ROUNDS, Sweeps
 from memmlp.runs.run import Run
@@ -20,8 +20,8 @@ from memmlp.sweep.spec import Scale
 from memmlp.tables.build_table import finished_runs, make_table
 from memmlp.tables.formats import as_json
 from memmlp.tables.measured_run import load
-from memmlp.tables.rounds import Rounds, begin
 from memmlp.tables.runs_of_plan import finder, states
+from memmlp.tables.seed_rounds import Rounds, begin
 
 
 def sweeps_of(outputs: Path) -> Sweeps:

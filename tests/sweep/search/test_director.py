@@ -26,7 +26,7 @@ from optuna.trial import TrialState
 from memmlp.common.errors import InputError
 from memmlp.sweep.plan import RunTask
 from memmlp.sweep.search import study as study_module
-from memmlp.sweep.search.board import figures
+from memmlp.sweep.search.progress_table import figures
 from memmlp.sweep.search.spec import Value
 from memmlp.sweep.search.study import Study
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from memmlp.tables.statistics.crossed import error
-from memmlp.tables.statistics.effect_regression import Line, fit
+from memmlp.tables.statistics.effect_regression import FittedLine, fit
 from memmlp.tables.statistics.paired_differences import paired_effects
 
 STEPS = np.array([500, 1000, 2000, 2000, 2000, 2000, 4000, 8000, 2000, 2000, 2000])
@@ -119,7 +119,7 @@ def test_groups_of_clips_count_by_their_clips():
     d = np.random.default_rng(6).normal(size=(11, 6))
     groups = np.array([0, 0, 0, 1, 2, 2])
     line = fit(d, X, groups)
-    assert isinstance(line, Line)
+    assert isinstance(line, FittedLine)
     assert line.effects == pytest.approx(d.mean(1))
     assert line.means.shape == (11, 3)
 

@@ -1,0 +1,277 @@
+"""`memmlp sweep --until-decided`: seeds are added in rounds, for the arms whose verdicts are open."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import click
+
+from memmlp.common.errors import InputError
+
+if TYPE_CHECKING:
+    from memmlp.sweep.plan import Plan
+    from memmlp.sweep.spec import Sweep
+    from memmlp.tables.effects import RunsBySeed
+    from memmlp.tables.seed_rounds import Look, Rounds
+
+
+def rounds_path(sweep: Sweep, outputs: Path) -> Path:
+    """Return the file where a sweep's rounds are kept."""
+    from memmlp.config.plan_sweep import sweep_folder
+    from memmlp.tables.seed_rounds_file import NAME
+
+    return sweep_folder(sweep, outputs) / NAME
+
+
+def current_rounds(sweep: Sweep, outputs: Path, most: int | None) -> Rounds:
+    """Return the rounds of a sweep as far as they went; new ones where no look was taken yet.
+
+    Args:
+        sweep: the sweep as it is now.
+        outputs: the folder of runs and caches.
+        most: the seeds of an arm at most (--max-seeds); None for those of the kept rounds, or the default.
+
+    Raises:
+        InputError: where looks were taken of another sweep than it is now, or with another maximum.
+    """
+    from memmlp.tables.seed_rounds import MOST, begin
+    from memmlp.tables.seed_rounds_file import read
+
+    path = rounds_path(sweep, outputs)
+    kept = read(path)
+    if kept is None or not kept.taken:
+        return begin(sweep, most or MOST)
+    wanted = begin(sweep, most or len(kept.seeds))
+    if len(wanted.seeds) != len(kept.seeds):
+        raise InputError(f"--max-seeds {most}: the looks of {path} are of up to {len(kept.seeds)} seeds")
+    if other := _difference(kept, wanted):
+        raise InputError(f"{path}: its looks were taken with other {other}; remove it to begin anew")
+    return kept
+
+
+def check(overrides: Sequence[str], wanted: bool, most: int | None) -> None:
+    """Refuse words of the command line that don't go together. Raises InputError."""
+    from memmlp.tables.seed_rounds import MOST
+    from memmlp.tables.statistics import looks
+
+    if most is not None and not wanted:
+        raise InputError("--max-seeds: goes with --until-decided")
+    if most is not None and most < (first := looks(MOST)[0]):
+        raise InputError(f"--max-seeds {most}: allowed is at least {first}, the seeds of the first look")
+    for word in overrides:
+        if wanted and word.startswith("seed="):
+            raise InputError(f"{word}: not with --until-decided, which takes the file's seeds and goes on")
+
+
+def run_until_decided(
+    sweep: Sweep, outputs: Path, rounds: Rounds, work: Callable[[Sweep, Plan], None], fail_fast: bool
+) -> tuple[Rounds, Plan]:
+    """Take look after look until none can be taken, and return the last rounds and plan.
+
+    Args:
+        sweep: the sweep as it was begun with.
+        outputs: the folder of runs and caches.
+        rounds: the rounds so far.
+        work: brings the runs of a sweep's plan to their end.
+        fail_fast: whether the first failed run ends it.
+    """
+    from dataclasses import replace
+
+    from memmlp.config.plan_sweep import make_plan
+    from memmlp.tables.seed_rounds_file import same_runs
+
+    while True:
+        spent = rounds.spent(sweep)
+        plan = replace(make_plan(spent, outputs, prepare=True), fail_fast=fail_fast)
+        same_runs(rounds, sweep, plan, rounds_path(sweep, outputs))
+        if plan.left():
+            work(spent, plan)
+        if plan.stopped:
+            return rounds, plan
+        after = look(sweep, outputs, rounds, plan)
+        if after == rounds:
+            return rounds, plan
+        rounds = after
+        click.echo("\n".join(told(rounds, sweep, rounds.taken[-1])))
+
+
+def look(sweep: Sweep, outputs: Path, rounds: Rounds, plan: Plan) -> Rounds:
+    """Take the next look that can be taken, record it, and return the rounds.
+
+    Another process may have taken a look in the meantime; its rounds are returned then.
+    """
+    from memmlp.common.files import write_json
+    from memmlp.common.lease import Lock
+    from memmlp.tables.build_table import finished_runs
+    from memmlp.tables.measured_run import load
+    from memmlp.tables.runs_of_plan import finder
+    from memmlp.tables.seed_rounds import advanced, as_json
+    from memmlp.tables.seed_rounds_file import read
+
+    path = rounds_path(sweep, outputs)
+    with Lock(path.parent).hold():
+        kept = read(path)
+        if kept is not None and len(kept.taken) > len(rounds.taken):
+            return kept
+        runs: dict[str, RunsBySeed] = finished_runs(rounds.spent(sweep), finder(plan, load))
+        after = advanced(rounds, sweep, runs, names(rounds, sweep, plan))
+        write_json(path, as_json(after))
+    return after
+
+
+def names(rounds: Rounds, sweep: Sweep, plan: Plan) -> dict[str, str]:
+    """Return, by label, a digest of the runs that each arm's next look will compare."""
+    from memmlp.tables.seed_rounds_file import name_of
+
+    looks = {label: rounds.looks[number] for label, number in rounds.next_looks(sweep).items()}
+    return {label: name_of(rounds, sweep, plan, label, seeds) for label, seeds in looks.items()}
+
+
+def _difference(kept: Rounds, wanted: Rounds) -> str | None:
+    """Name in a word what differs between two rounds of a sweep; None where nothing does."""
+    if kept.seeds != wanted.seeds:
+        return "seeds"
+    if (kept.looks, kept.levels) != (wanted.looks, wanted.levels):
+        return "looks"
+    return next((key for key, value in wanted.subject.items() if kept.subject.get(key) != value), None)
+
+
+class SweepToShow(NamedTuple):
+    """What a table shows of a sweep whose seeds may have been spent in rounds.
+
+    Attributes:
+        sweep: the sweep with the seeds that were spent.
+        plan: the plan of its runs.
+        rounds: the rounds whose verdicts stand; None where no verdict of rounds does.
+        flags: what a reader has to know where rounds were taken of something else.
+    """
+
+    sweep: Sweep
+    plan: Plan
+    rounds: Rounds | None
+    flags: tuple[str, ...] = ()
+
+
+def sweep_to_show(sweep: Sweep, overrides: Sequence[str], outputs: Path) -> SweepToShow:
+    """Return the sweep with its rounds, where rounds were taken and fit what the sweep is now.
+
+    Otherwise the sweep is shown with its own seeds, and a flag says so where rounds were taken.
+    """
+    from memmlp.config.plan_sweep import make_plan
+    from memmlp.tables.seed_rounds_file import read, same_runs
+
+    path = rounds_path(sweep, outputs)
+    kept = read(path)
+    if kept is None or not kept.taken:
+        return SweepToShow(sweep, make_plan(sweep, outputs), None)
+    chosen = any(word.startswith("seed=") for word in overrides)
+    if flag := of_another(kept, sweep, chosen):
+        return SweepToShow(sweep, make_plan(sweep, outputs), None, (flag,))
+    spent = kept.spent(sweep)
+    plan = make_plan(spent, outputs)
+    try:
+        same_runs(kept, sweep, plan, path)
+    except InputError as error:
+        return SweepToShow(
+            spent, plan, None, (f"seeds were spent in rounds, but not of these runs: {error}",)
+        )
+    return SweepToShow(spent, plan, kept)
+
+
+def of_another(kept: Rounds, sweep: Sweep, chosen: bool = False) -> str | None:
+    """Return a flag if the kept looks were taken of a different sweep than today's; else None.
+
+    `chosen` says that the sweep's seeds were chosen by hand.
+    """
+    from memmlp.tables.seed_rounds import begin
+
+    other = "seeds" if chosen else _difference(kept, begin(sweep, len(kept.seeds)))
+    return (
+        f"seeds were spent in rounds with other {other}: these verdicts do not keep the 5 %"
+        if other
+        else None
+    )
+
+
+def spent_before(sweep: Sweep, outputs: Path) -> tuple[str, ...]:
+    """Return a flag for a table of a fixed number of seeds if rounds were taken of the sweep before."""
+    from memmlp.tables.seed_rounds_file import read
+
+    kept = read(rounds_path(sweep, outputs))
+    if kept is None or not kept.taken:
+        return ()
+    return ("seeds were spent in rounds before; memmlp table has their verdicts, these do not keep the 5 %",)
+
+
+def schedule(rounds: Rounds) -> str:
+    """Say at how many seeds there are looks, and what share of the 5 % each one spends."""
+    words = [
+        f"{seeds} ({100 * level:.2g} %)" for seeds, level in zip(rounds.looks, rounds.levels, strict=True)
+    ]
+    return f"looks at {', '.join(words)} seeds; together they spend 5 %"
+
+
+def told(rounds: Rounds, sweep: Sweep, last: Look | None = None) -> list[str]:
+    """Say how far each arm is: comparisons decided and open, seeds so far, and its next look."""
+    from memmlp.tables.seed_rounds import standings
+
+    arms = standings(rounds, sweep)
+    decided = sum(arm.decided for arm in arms)
+    head = f"look at {last.seeds} seeds ({100 * last.level:.2g} %): " if last else ""
+    rows = [("arm", "decided", "open", "seeds", "next")]
+    for arm in arms:
+        following = f"look at {arm.next}" if arm.next else ""
+        rows.append((arm.label, str(arm.decided), str(arm.open), str(arm.seeds), following))
+    return [f"{head}{decided} of {len(rounds.family(sweep))} comparisons decided", *_lined(rows)]
+
+
+def closing(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> list[str]:
+    """Say why the rounds ended, what more seeds could do, and how many runs were spent."""
+    latest = [finding for finding, _ in rounds.latest().values()]
+    still = [finding for finding in latest if finding.verdict == "open"]
+    evaluated = {mode for found in runs.values() for run in found.values() for mode in run.means}
+    unseen = Counter(key.label for key in rounds.unseen(sweep) if key.mode in evaluated)
+    lines = [] if still or unseen or rounds.next_looks(sweep) else ["all verdicts are decided"]
+    lines += [
+        f"of '{label}' {number} comparisons have no verdict: the runs have nothing to compare"
+        for label, number in unseen.items()
+    ]
+    if any(finding.p is None for finding in still):
+        lines.append("the test clips are one group: no number of seeds decides")
+    return [*lines, *_outlooks(rounds, sweep, runs), _spent(rounds, sweep)]
+
+
+def _outlooks(rounds: Rounds, sweep: Sweep, runs: Mapping[str, RunsBySeed]) -> list[str]:
+    """Return a line for each arm that has open comparisons and no next look."""
+    from memmlp.tables.seed_rounds import outlook
+
+    arms: dict[str, list[int | None]] = {}
+    for key, number in outlook(rounds, sweep, runs).items():
+        arms.setdefault(key.label, []).append(number)
+    lines = []
+    for label, numbers in arms.items():
+        some = [number for number in numbers if number is not None]
+        words = [f"{len(some)} would take about {max(some)} seeds"] if some else []
+        if len(some) < len(numbers):
+            words.append(f"{len(numbers) - len(some)} no number of seeds: the groups of clips are too few")
+        lines.append(f"open of '{label}', if its effects are as measured: {'; '.join(words)}")
+    return lines
+
+
+def _spent(rounds: Rounds, sweep: Sweep) -> str:
+    """Say how many runs were spent, beside how many a fixed number of seeds would have taken."""
+    used, arms = sum(rounds.counts(sweep).values()), len(sweep.runnable())
+    last = max((look.seeds for look in rounds.taken), default=rounds.looks[0])
+    fixed = [f"{arms * seeds} with {seeds} seeds for every arm" for seeds in sorted({last, rounds.looks[-1]})]
+    return f"{used} runs were spent; {', '.join(fixed)}"
+
+
+def _lined(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Align rows of words in columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    ]

@@ -1,0 +1,179 @@
+"""A run's side of tracking: what it tells the process that follows it, which it never waits for."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pickle
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from memmlp.experiment_tracking.tracker import Tracker
+from memmlp.runs.run import Run
+
+SHARE = 0.01  # of a run's time, for which its end may be waited for
+MOST = 10.0  # seconds of that at most
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """Where an experiment's runs are shown; nowhere, if there are no trackers.
+
+    Attributes:
+        trackers: the trackers.
+        outputs: the outputs folder.
+    """
+
+    trackers: tuple[Tracker, ...]
+    outputs: Path
+
+    @contextlib.contextmanager
+    def following(self, run: Run) -> Iterator[None]:
+        """Show a run, which has begun, while the context lasts, and then its end or failure.
+
+        Nothing of that can fail: at worst there is a line on stderr.
+        """
+        feed, begun = feed_of(self), time.monotonic()
+        feed.tell("begin", run.folder)
+        try:
+            yield
+        finally:
+            feed.tell("end", run.folder)
+            feed.wait(run.folder, min(SHARE * (time.monotonic() - begun), MOST))
+
+    def sweep(self, folder: Path, seconds: float = MOST) -> None:
+        """Show a sweep's runs as one group, by what its folder says, and wait so long for it at most."""
+        feed = feed_of(self)
+        feed.tell("sweep", folder)
+        feed.wait(folder, seconds)
+
+
+class Feed:
+    """The pipe to a process that shows runs. Nothing of it blocks or raises.
+
+    Attributes:
+        dropped: how many events the process did not take, because it is gone or its pipe is full.
+    """
+
+    def __init__(self, tracking: Tracking):
+        self.dropped = 0
+        self.names = [tracker.name for tracker in tracking.trackers]
+        self.answers: dict[tuple[str, str], str] = {}
+        self.answered = threading.Condition()
+        self.process = self._start(tracking) if tracking.trackers else None
+
+    def _start(self, tracking: Tracking) -> subprocess.Popen[bytes] | None:
+        environment = os.environ | {
+            "OMP_NUM_THREADS": "1",
+            "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+        }
+        given = {
+            "path": sys.path,
+            "trackers": pickle.dumps(tracking.trackers),
+            "outputs": str(tracking.outputs.absolute()),
+        }
+        try:
+            log = tracking.outputs / "tracking" / "follower.log"
+            log.parent.mkdir(parents=True, exist_ok=True)
+            with open(log, "ab") as errors:
+                process = subprocess.Popen(
+                    [sys.executable, "-m", "memmlp.experiment_tracking.follower"],
+                    stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors,
+                    start_new_session=True, env=environment,
+                )  # fmt: skip
+            assert process.stdin is not None
+            assert process.stdout is not None
+            process.stdin.write(pickle.dumps(given))
+            process.stdin.flush()
+            os.set_blocking(process.stdin.fileno(), False)
+        except OSError as error:
+            warn(f"runs are not shown by {', '.join(self.names)}: {error}")
+            return None
+        self.listener = threading.Thread(target=self._listen, args=(process.stdout,), daemon=True)
+        self.listener.start()
+        return process
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process is there."""
+        return self.process is not None and self.process.poll() is None
+
+    def tell(self, event: str, folder: Path) -> None:
+        """Tell the process of an event. A line that it can't take at once is dropped and counted."""
+        if self.process is None:
+            return
+        assert self.process.stdin is not None
+        where = str(folder.absolute())
+        for name in self.names:
+            self.answers.pop((where, name), None)
+        line = json.dumps({"event": event, "folder": where}).encode() + b"\n"
+        try:
+            if os.write(self.process.stdin.fileno(), line) < len(line):  # the kernel takes a short one whole
+                raise BlockingIOError
+        except OSError:
+            self.dropped += 1
+            warn(f"the {event} of {folder.name} is not shown: its follower does not listen")
+
+    def wait(self, folder: Path, seconds: float) -> bool:
+        """Wait at most so long until all trackers have shown or missed a run's end; say if so."""
+        wanted = [(str(folder.absolute()), name) for name in self.names]
+        with self.answered:
+            return self.answered.wait_for(
+                lambda: not self.alive or all(one in self.answers for one in wanted), seconds
+            )
+
+    def close(self) -> None:
+        """Let the process end, once it has shown what it was told."""
+        if self.process is not None and self.process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self.process.stdin.close()
+
+    def _listen(self, answers: IO[bytes]) -> None:
+        """Read what the process says, until it ends."""
+        with contextlib.suppress(ValueError, OSError), answers:
+            for line in answers:
+                answer = json.loads(line)
+                with self.answered:
+                    self._take(answer)
+                    self.answered.notify_all()
+        with self.answered:
+            self.answered.notify_all()
+
+    def _take(self, answer: dict[str, str]) -> None:
+        tracker, what = answer["tracker"], Path(answer["folder"]).name
+        if answer["event"] in ("shown", "missed"):
+            self.answers[answer["folder"], tracker] = answer["event"]
+        if answer["event"] == "trouble":
+            warn(f"{what} is not shown by {tracker} at present: {answer['reason']}")
+        elif answer["event"] == "missed":
+            warn(f"{tracker} lacks {what}: {answer['reason']}; memmlp track sync fills it in")
+        elif answer["event"] == "dropped":
+            warn(f"{tracker} was too slow for {answer['reason']} events; memmlp track sync fills them in")
+
+
+_FEEDS: dict[Tracking, Feed] = {}
+"""The feeds of this process; the processes behind them end with it."""
+
+
+def feed_of(tracking: Tracking) -> Feed:
+    """Return this process' feed of these trackers; a new one where its process has died."""
+    feed = _FEEDS.get(tracking)
+    if feed is not None and tracking.trackers and not feed.alive:
+        feed.close()
+        feed = None
+    if feed is None:
+        feed = _FEEDS[tracking] = Feed(tracking)
+    return feed
+
+
+def warn(line: str) -> None:
+    """Print a line to stderr, if there is one."""
+    with contextlib.suppress(OSError, ValueError):
+        print(f"memmlp: warning: {line}", file=sys.stderr, flush=True)

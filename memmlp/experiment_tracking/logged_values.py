@@ -1,0 +1,223 @@
+"""What trackers show: facts and points, all read from the folders of runs and sweeps."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from memmlp.common.files import file_digest, plain, read_json
+from memmlp.runs.identity import flatten
+from memmlp.runs.metrics_log import Metrics, parsed
+from memmlp.runs.notes import read_notes
+from memmlp.runs.run import Run
+from memmlp.runs.shown_name import run_name
+
+SYSTEM = "system.jsonl"
+"""The log of what a run's machine did meanwhile, in its folder."""
+
+
+class CurvePoint(NamedTuple):
+    """A value of a curve.
+
+    Attributes:
+        key: the curve's name, PHASE/NAME.
+        value: the value, possibly NaN.
+        step: the training step.
+        time: seconds since 1970, UTC.
+    """
+
+    key: str
+    value: float
+    step: int
+    time: float
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """What a run's folder says of it beside its curves.
+
+    Attributes:
+        id: the run's id.
+        name: a name that people can read.
+        folder: its folder.
+        status: "running", "done", "failed" or "killed".
+        reason: why it failed; None if it did not.
+        started, ended: seconds since 1970; `ended` is None while it runs.
+        config: its config by dotted key, as text.
+        origin: facts of its origin by name.
+        tags: the tags that people gave it.
+        note: their note; empty for none.
+        data: name and digest of its data.
+        results: its results by name, as curves of one point.
+        files: the small files that are worth showing.
+    """
+
+    id: str
+    name: str
+    folder: Path
+    status: str
+    reason: str | None
+    started: float
+    ended: float | None
+    config: Mapping[str, str]
+    origin: Mapping[str, str]
+    tags: tuple[str, ...]
+    note: str
+    data: tuple[str, str]
+    results: Mapping[str, float]
+    files: tuple[Path, ...]
+
+    @property
+    def title(self) -> str:
+        """The name with the beginning of the id, which tells runs of the same name apart."""
+        return f"{self.name} · {self.id[:8]}"
+
+
+def facts_of(run: Run, running: bool = False) -> RunFacts:
+    """Read the facts of a begun run.
+
+    Args:
+        run: the run.
+        running: whether somebody is at it; its end is told as the folder has it, if not.
+    """
+    manifest, config, notes = run.manifest, run.config, read_notes(run)
+    status = "running" if running else _status(run)
+    started = _seconds(manifest.get("started"))
+    own = (
+        run.config_path, run.results_path, run.picture, run.folder / "code.patch",
+        run.onnx, run.preferred_deployment.latency,
+    )  # fmt: skip
+    return RunFacts(
+        id=run.id,
+        name=run_name(manifest, flatten(config)),
+        folder=run.folder.absolute(),
+        status=status,
+        reason=run.failure if status == "failed" else None,
+        started=started,
+        ended=None if status == "running" else _ended(run, started),
+        config={key: str(value) for key, value in flatten(config).items()},
+        origin=_origin(manifest),
+        tags=notes.tags,
+        note=notes.note,
+        data=(str((config.get("data") or {}).get("name") or "data"), str(manifest.get("data"))),
+        results={k.replace(".", "/"): float(v) for k, v in flatten(run.results).items() if _number(v)},
+        files=tuple(path for path in own if path.is_file()),
+    )
+
+
+def _status(run: Run) -> str:
+    """A run that nobody is at, and that neither finished nor failed, was killed or stopped."""
+    return "failed" if run.failure else "done" if run.done else "killed"
+
+
+def _ended(run: Run, started: float) -> float:
+    """When the run finished or failed; else the time of its last line."""
+    when = read_json(run.folder / "FAILED").get("when") or run.manifest.get("finished")
+    return _seconds(when) if when else max((entry.time for entry in run.metrics()), default=started)
+
+
+def _origin(manifest: Mapping[str, Any]) -> dict[str, str]:
+    """Return what the manifest says of the run's origin, as far as it is known."""
+    git = manifest.get("git") or {}
+    names = ("kind", "data", "upstream", "started", "version", "user", "host", "device", "gpu", "threads")
+    tags = {name: manifest.get(name) for name in names}
+    tags |= {"commit": git.get("commit"), "changed since the commit": git.get("dirty")}
+    return {name: str(value) for name, value in tags.items() if value is not None}
+
+
+def points(entry: Metrics) -> Iterator[CurvePoint]:
+    """Yield the values of one record of a metrics log."""
+    for key, value in entry.values.items():
+        yield CurvePoint(f"{entry.phase}/{key}", value, entry.step, entry.time)
+
+
+def final(facts: RunFacts, step: int) -> list[CurvePoint]:
+    """Return the results as points at the last training step."""
+    time = facts.ended or facts.started
+    return [CurvePoint(key, value, step, time) for key, value in facts.results.items()]
+
+
+def fingerprint(run: Run, facts: RunFacts) -> str:
+    """Return a digest of all that a tracker shows of the run."""
+    logs = [file_digest(path) for path in (run.metrics_path, run.folder / SYSTEM) if path.exists()]
+    files = [file_digest(path) for path in facts.files]
+    text = json.dumps(plain([asdict(facts), logs, files]), sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+class Tail:
+    """Reads a run's logs: first all that there is, then what is added, at most so many lines at a time."""
+
+    MOST = 1000
+
+    def __init__(self, run: Run):
+        self.places = {run.metrics_path: 0, run.folder / SYSTEM: 0}
+
+    def history(self) -> list[CurvePoint]:
+        """Return all values so far; of a step that a resumed run repeated, the last ones."""
+        entries = {(entry.phase, entry.step): entry for entry in self._entries(sys.maxsize)}
+        return [point for entry in entries.values() for point in points(entry)]
+
+    def read(self) -> list[CurvePoint]:
+        """Return the values of lines that were added since the last call."""
+        return [point for entry in self._entries(self.MOST) for point in points(entry)]
+
+    def _entries(self, most: int) -> Iterator[Metrics]:
+        for path in filter(Path.exists, self.places):
+            with open(path, "rb") as file:
+                file.seek(self.places[path])
+                for line in itertools.islice(file, most):
+                    if not line.endswith(b"\n"):  # it is being written
+                        break
+                    self.places[path] += len(line)
+                    yield parsed(line)
+
+
+@dataclass(frozen=True)
+class SweepFacts:
+    """What a sweep's folder says of it.
+
+    Attributes:
+        name: the sweep's name.
+        folder: its folder.
+        status: "running", "done" or "failed".
+        arms: run id -> the label of its arm.
+        aggregates: means over seeds, by LABEL/MODE/METRIC.
+        verdicts: verdicts on differences from the controls, by LABEL/MODE/METRIC.
+        files: its table as Markdown and HTML.
+    """
+
+    name: str
+    folder: Path
+    status: str
+    arms: Mapping[str, str]
+    aggregates: Mapping[str, float]
+    verdicts: Mapping[str, str]
+    files: tuple[Path, ...]
+
+    RECORD = "summary.json"
+
+    @classmethod
+    def read(cls, folder: Path) -> SweepFacts | None:
+        """Read a sweep's facts; None where it left none."""
+        found = read_json(folder / cls.RECORD)
+        if not {"name", "status", "labels", "aggregates", "verdicts"} <= found.keys():
+            return None
+        files = tuple(path for path in (folder / "table.md", folder / "table.html") if path.is_file())
+        own = {name: found[name] for name in ("name", "status", "aggregates", "verdicts")}
+        return cls(folder=folder.absolute(), arms=found["labels"], files=files, **own)
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _seconds(moment: str | None) -> float:
+    return datetime.fromisoformat(moment).timestamp() if moment else 0.0

@@ -1,0 +1,144 @@
+"""The tracking slot: what a tracker is, and a run as one tracker is shown it."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Protocol
+
+from filelock import FileLock, Timeout
+
+from memmlp.common.files import read_json, write_json
+from memmlp.experiment_tracking.logged_values import (
+    CurvePoint,
+    RunFacts,
+    SweepFacts,
+    Tail,
+    facts_of,
+    final,
+    fingerprint,
+)
+from memmlp.runs.run import Run
+
+
+class Shown(Protocol):
+    """A run that a tracker shows at present."""
+
+    def log(self, points: Sequence[CurvePoint]) -> None:
+        """Show further values of the curves."""
+
+    def end(self, facts: RunFacts, results: Sequence[CurvePoint]) -> None:
+        """Show the run's end or failure, its results and its files; nothing more comes."""
+
+    def leave(self) -> None:
+        """Let go of the run, whether it ended or not."""
+
+
+class Tracker(Protocol):
+    """The slot's interface. All of it may block and may raise: no run ever waits for it.
+
+    An implementation can be pickled, for it works in a process of its own.
+
+    Attributes:
+        name: the option's name.
+    """
+
+    name: str
+
+    @property
+    def place(self) -> str:
+        """Where the tracker shows runs: an address or a folder."""
+
+    def has(self, run_id: str) -> bool:
+        """Return whether the tracker shows a run of that id."""
+
+    def begin(self, facts: RunFacts, points: Sequence[CurvePoint]) -> Shown:
+        """Show a run with these facts and points alone, in place of whatever the tracker had of it."""
+
+    def sweep(self, facts: SweepFacts) -> None:
+        """Show a sweep as the parent of its runs; a second call changes nothing."""
+
+
+class Busy(Exception):
+    """Raised when another process shows the run in that tracker at present."""
+
+
+class Session:
+    """A run as one tracker is shown it, from its beginning to its end.
+
+    Args:
+        tracker: the tracker.
+        run: the run, which has begun.
+        ledgers: the folder in which is kept what trackers have.
+
+    Raises:
+        Busy: if another process shows the run in that tracker.
+    """
+
+    def __init__(self, tracker: Tracker, run: Run, ledgers: Path):
+        self.tracker, self.run = tracker, run
+        ledgers.mkdir(parents=True, exist_ok=True)
+        self.ledger = ledgers / f"{run.id}.json"
+        self.lock = FileLock(ledgers / f"{run.id}.lock")
+        self.shown: Shown | None = None
+        try:
+            self.lock.acquire(timeout=0)
+        except Timeout:
+            raise Busy(f"run {run.id} is shown by another process") from None
+
+    def step(self) -> None:
+        """Show what is new of a run that goes on."""
+        if not self.run.manifest_path.exists():
+            return  # it is about to begin
+        with self._trying():
+            if self.shown is None:
+                self._begin(facts_of(self.run, running=True))
+            elif points := self.tail.read():
+                self.shown.log(points)
+
+    def end(self) -> None:
+        """Show the run as its folder says that it is now, and note that this tracker has it."""
+        if not self.run.manifest_path.exists():
+            return  # it never began
+        with self._trying():
+            facts = facts_of(self.run)
+            if self.shown is None:
+                self._begin(facts)
+            assert self.shown is not None
+            while points := self.tail.read():
+                self.shown.log(points)
+            mark = fingerprint(self.run, facts)
+            self.shown.end(facts, final(facts, self.run.step))
+            write_json(self.ledger, {"shown": mark})
+
+    def up_to_date(self) -> bool:
+        """Return whether the tracker has all of the run already."""
+        kept = read_json(self.ledger).get("shown")
+        return kept == fingerprint(self.run, facts_of(self.run)) and self.tracker.has(self.run.id)
+
+    def leave(self) -> None:
+        """Let go of the run."""
+        try:
+            if self.shown is not None:
+                shown, self.shown = self.shown, None
+                shown.leave()
+        finally:
+            self.lock.release()
+
+    def _begin(self, facts: RunFacts) -> None:
+        self.ledger.unlink(missing_ok=True)
+        self.tail = Tail(self.run)
+        self.shown = self.tracker.begin(facts, self.tail.history())
+
+    @contextlib.contextmanager
+    def _trying(self) -> Iterator[None]:
+        """Begin anew after a failure, since nobody knows how much of it the tracker took."""
+        try:
+            yield
+        except BaseException:
+            shown, self.shown = self.shown, None
+            if shown is not None:
+                with contextlib.suppress(Exception):
+                    shown.leave()
+            raise

@@ -1,0 +1,200 @@
+"""Fits a running stream to its wearer, by the page's orders: body height, floor, a T-pose to calibrate in.
+
+Orders come from the server's threads; they are carried out between two samples. Who calibrates has walked
+away from the keyboard, so that this waits for a countdown.
+"""
+
+from __future__ import annotations
+
+import math
+import queue
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from memmlp.common.errors import InputError
+from memmlp.live.calibration_file import Calibration, save_calibration
+from memmlp.live.player.packets import TrackerPoses
+from memmlp.live.spaces import SpaceName
+from memmlp.live.stream import Offsets, Stream
+from memmlp.live.tracker_frames import TRACKERS
+from memmlp.live.wearer import stature
+from memmlp.motion.body import ROOT
+
+COUNTDOWN = 5.0  # seconds
+LONGEST = 60.0  # seconds of a countdown
+FAR = 0.25  # metres from a T-pose's joint, beyond which a device is not worn there
+ACTIONS = ("calibrate", "touch_floor", "height", "floor", "forget", "cancel")
+
+Tell = Callable[[str, Mapping[str, Any]], None]
+
+
+class Order(NamedTuple):
+    """What the page wants.
+
+    Attributes:
+        action: of ACTIONS.
+        value: metres, for height and floor; seconds of the countdown, for calibrate and touch_floor.
+    """
+
+    action: str
+    value: float | None
+
+
+def read_order(fields: object) -> Order:
+    """Read an order: {"action": ..., "value": ...}. Raises InputError for any other."""
+    if not isinstance(fields, dict) or fields.get("action") not in ACTIONS:
+        raise InputError(f"action: allowed are {', '.join(ACTIONS)}")
+    value = fields.get("value")
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
+        raise InputError("value: no number")
+    if value is not None and not math.isfinite(value):
+        raise InputError("value: no finite number")
+    return Order(fields["action"], value)
+
+
+class Fitting:
+    """Fits a stream to its wearer.
+
+    Args:
+        stream: the stream.
+        space: its frame of reference.
+        path: the file that each change is saved to; None for none.
+        tell: gets "wearer" and the state, whenever it changes.
+        clock: returns the time, seconds.
+    """
+
+    def __init__(
+        self,
+        stream: Stream,
+        space: SpaceName,
+        path: Path | None,
+        tell: Tell,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        self.stream, self.space, self.path = stream, space, path
+        self.tell, self.clock = tell, clock
+        self.orders: queue.SimpleQueue[Order] = queue.SimpleQueue()
+        self.waiting: Order | None = None
+        self.due = 0.0
+        self.own_height: float | None = None if stream.wearer.scale == 1 else stream.wearer.height
+        self.actions: dict[str, Callable[[Any], str]] = {
+            "calibrate": self._calibrate,
+            "touch_floor": self._touch_floor,
+            "height": self._height,
+            "floor": self._floor,
+            "forget": self._forget,
+            "cancel": self._cancel,
+        }
+        self._say("")
+
+    def ask(self, fields: object) -> None:
+        """Take an order, from any thread. Raises InputError for what is none."""
+        self.orders.put(read_order(fields))
+
+    def step(self, trackers: TrackerPoses | None) -> None:
+        """Carry out what is due: new orders at once, and one that waits when its time has come.
+
+        Args:
+            trackers: the devices now; None where no sample came.
+        """
+        while not self.orders.empty():
+            self._begin(self.orders.get())
+        if self.waiting and trackers and self.clock() >= self.due:
+            order, self.waiting = self.waiting, None
+            self._carry_out(order, trackers)
+
+    def _begin(self, order: Order) -> None:
+        """Carry out an order, or let it wait for its countdown."""
+        if order.action in ("calibrate", "touch_floor"):
+            seconds = COUNTDOWN if order.value is None else min(max(order.value, 0.0), LONGEST)
+            self.waiting, self.due = order, self.clock() + seconds
+            self._say("")
+        else:
+            self.waiting = None
+            self._carry_out(order, None)
+
+    def _carry_out(self, order: Order, trackers: TrackerPoses | None) -> None:
+        """Carry out an order, save what it changed, and tell how it went."""
+        try:
+            said = self.actions[order.action](order.value if trackers is None else trackers)
+            if order.action != "cancel":
+                self._save()
+        except InputError as error:
+            self._say(str(error), failed=True)
+        else:
+            self._say(said)
+
+    def _calibrate(self, trackers: TrackerPoses) -> str:
+        """Learn the offsets of the devices, unless these cannot be worn in a T-pose."""
+        before = self.stream.offsets
+        apart = distances(self.stream.calibrate(*trackers))
+        worst = int(apart.argmax())
+        if apart[worst] > FAR:
+            self.stream.offsets = before
+            away = f"{TRACKERS[worst]} is {100 * apart[worst]:.0f} cm from where a T-pose has it"
+            raise InputError(f"{away}; stand upright, arms straight to the sides, and give the body height")
+        return f"Calibrated; the devices are up to {100 * apart[worst]:.0f} cm from the joints."
+
+    def _touch_floor(self, trackers: TrackerPoses) -> str:
+        """Take the floor where the lower hand is."""
+        hands = [tracker[0] for tracker in trackers[1:] if tracker is not None]
+        if not hands:
+            raise InputError("floor: no hand was seen; touch the floor with one")
+        floor = min(float(self.stream.space.positions_in(hand)[2]) for hand in hands)
+        return self._floor(round(floor, 4))
+
+    def _height(self, value: float | None) -> str:
+        """Take a body height, metres; None for the network's."""
+        self.stream.fit(value, self.stream.wearer.floor)
+        self.own_height = value
+        return "" if self.stream.offsets is None else "Calibrate again: the offsets are of another height."
+
+    def _floor(self, value: float | None) -> str:
+        """Take a height of the floor, metres."""
+        self.stream.fit(self.own_height, value or 0.0)
+        return f"The floor is at {100 * (value or 0.0):.0f} cm."
+
+    def _forget(self, _: float | None) -> str:
+        """Take the devices for the joints again."""
+        self.stream.offsets = None
+        self.stream.reset()
+        return "The calibration is forgotten."
+
+    def _cancel(self, _: float | None) -> str:
+        return ""
+
+    def _save(self) -> None:
+        if self.path is not None:
+            stream = self.stream
+            body = stature(stream.network.skeleton)
+            made = Calibration(self.space, body, stream.offsets, self.own_height, stream.wearer.floor)
+            save_calibration(self.path, made)
+
+    def _say(self, said: str, failed: bool = False) -> None:
+        stream, waiting = self.stream, self.waiting
+        left = None if waiting is None else round(max(self.due - self.clock(), 0.0), 2)
+        state = {
+            "height": round(100 * stream.wearer.height, 1),
+            "floor": round(100 * stream.wearer.floor, 1),
+            "hips": round(hips_height(stream.rest), 4),
+            "calibrated": stream.offsets is not None,
+            "waiting": waiting and {"action": waiting.action, "seconds": left},
+            "said": said,
+            "failed": failed,
+            "file": self.path and self.path.name,
+        }
+        self.tell("wearer", state)
+
+
+def hips_height(rest: np.ndarray) -> float:
+    """Return how high the hips of a rest pose (22, 3), metres, are above its lowest joint."""
+    return float(rest[ROOT, 1] - rest[:, 1].min())
+
+
+def distances(offsets: Offsets) -> np.ndarray:
+    """Return how far each device is from its joint (3,), metres."""
+    return np.linalg.norm(offsets.positions, axis=1)

@@ -1,0 +1,302 @@
+"""Imports a folder of recordings as AMASS npz, with a record of what came from what, or nothing at all."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+import tempfile
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from memmlp.common.errors import InputError
+from memmlp.common.progress import progress_bar
+from memmlp.motion.body import load_rest_joints
+from memmlp.motion.clip import FRAME_RATE_RANGE, Skipped
+from memmlp.motion.formats.npz import read_clip, write_clip
+from memmlp.motion.importing.convert import AUTO, convert, lowered
+from memmlp.motion.importing.importable_files import find_recordings, read_recording, tells_rate
+from memmlp.motion.importing.rates import HEADER, SIDECAR, folder_key, true_rate
+from memmlp.motion.importing.recording_protocol import Recording
+from memmlp.motion.importing.rest_pose import STRAIGHTEST
+from memmlp.motion.importing.skeleton import SkeletonMap, find_skeleton, is_number, load_skeleton
+from memmlp.motion.preparing.groups import Grouping
+from memmlp.motion.torch_threads import one_thread
+
+RECORD = "import.json"
+
+
+@dataclass(frozen=True)
+class Imported:
+    """One imported clip.
+
+    Attributes:
+        source: the file's path below its folder.
+        sha256: digest of that file.
+        clip: the npz file's path below its folder.
+        skeleton: name of the skeleton map.
+        unit: the file's unit, metres.
+        up: the file's up axis, `y` or `z`.
+        rest_pose: the pose from which the skeleton was read, in words.
+        frames: number of frames.
+        header_fps: frame rate that the file's header tells, Hz.
+        fps: frame rate of the clip, Hz.
+        fps_reason: where that rate is from.
+        floor: height of the floor that was taken off, metres at the body's size; None where none was found or
+            asked for.
+        faults: what is wrong with the clip, a sentence each (`fidelity.compare`).
+    """
+
+    source: str
+    sha256: str
+    clip: str
+    skeleton: str
+    unit: float
+    up: str
+    rest_pose: str
+    frames: int
+    header_fps: float
+    fps: float
+    fps_reason: str
+    floor: float | None
+    faults: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """What an import did.
+
+    Attributes:
+        clips: the clips that it wrote.
+        notes: what a person has to know of them: folders whose header rate it corrected, notes of the maps.
+        skipped: the files that it skipped.
+    """
+
+    clips: tuple[Imported, ...]
+    notes: tuple[str, ...]
+    skipped: tuple[Skipped, ...]
+
+
+@dataclass(frozen=True)
+class ImportSettings:
+    """How files are imported.
+
+    Attributes:
+        skeleton: a shipped map or the path of one; None lets each file's joints decide.
+        fps: true frame rates, Hz, by folder below the source ("" for all); they override what is known of a
+            file, what stands beside it and what its header says.
+        body: `builtin`, or an SMPL-H model.npz.
+        floor: `auto`: the lowest stable contact of the feet is at 0; `none`: left as the file has it; or the
+            floor's height in the files, metres.
+        takes: patterns (regular expressions); clips that match one alike were recorded at once, and have one
+            floor.
+        strict: whether a bad file raises; otherwise it is skipped and reported.
+        sound: whether a clip with faults is skipped, too; otherwise it is written and its faults are told.
+        up: the files' up axis, `y` or `z`; None leaves it to the map.
+    """
+
+    skeleton: str | None = None
+    fps: Mapping[str, float] = field(default_factory=dict)
+    body: str = "builtin"
+    floor: str | float = AUTO
+    takes: Sequence[str] = ()
+    strict: bool = False
+    sound: bool = False
+    up: str | None = None
+
+
+def import_folder(source: Path, out: Path, how: ImportSettings | None = None) -> ImportReport:
+    """Write each file of a folder, or a single one, as out/<its path>.npz, and out/import.json about it.
+
+    Args:
+        source: folder or file.
+        out: folder; it must hold no clips other than this import's.
+        how: how files are imported.
+
+    Raises:
+        InputError: with nothing written, if there are no files, several of the same name, a rate that fits no
+            folder, clips of another import in `out`, or no file that could be imported; also if `out` cannot
+            be written.
+    """
+    how, files = how or ImportSettings(), find_recordings(source)
+    _check_import(files, out, how)
+    rest, clips, skipped = load_rest_joints(how.body), [], []
+    chosen = None if how.skeleton is None else load_skeleton(how.skeleton)
+    sources = [relative.as_posix() for relative in files]
+    takes = Grouping(how.takes).names(dict(zip(sources, sources, strict=True)))
+    maps: dict[str, SkeletonMap] = {}
+    with _staging(out) as staging, one_thread():
+        folder = Path(staging) / "clips"
+        folder.mkdir()
+        for relative, path in progress_bar(files.items(), "import", len(files)):
+            try:
+                recording = read_recording(path)
+                skeleton = find_skeleton(recording, chosen).with_up(how.up)
+                clips.append(_import_file(recording, relative, folder, skeleton, how, rest, source))
+                maps[skeleton.name] = skeleton
+            except InputError as error:
+                if how.strict or len(files) == 1:
+                    raise
+                skipped.append(Skipped(relative.as_posix(), str(error).removeprefix(f"{path}: ")))
+        if not clips:
+            first = f"the first: {skipped[0].file}: {skipped[0].reason}"
+            raise InputError(f"{source}: no usable file of {len(files)}; {first}")
+        clips = _one_floor_a_take(clips, takes, folder)
+        report = ImportReport(tuple(clips), tuple(_notes(clips, maps, how)), tuple(skipped))
+        _publish(folder, out, report, Path(how.body).name)
+    return report
+
+
+def _one_floor_a_take(clips: list[Imported], takes: Mapping[str, str], staging: Path) -> list[Imported]:
+    """Lower the clips of a take by its lowest floor instead of each by its own."""
+    floors: dict[str, float] = {}
+    for clip in clips:
+        if clip.floor is not None:
+            floors[takes[clip.source]] = min(clip.floor, floors.get(takes[clip.source], clip.floor))
+    for index, clip in enumerate(clips):
+        floor = floors.get(takes[clip.source])
+        if floor is not None and floor != clip.floor:
+            path = staging / clip.clip
+            write_clip(path, lowered(read_clip(path, clip.clip), floor - (clip.floor or 0.0)))
+            clips[index] = replace(clip, floor=floor)
+    return clips
+
+
+def _npz(relative: Path) -> Path:
+    """Return a clip's path below `out`, given its source's path below the source folder."""
+    return relative.with_suffix(".npz")
+
+
+def _check_import(files: Mapping[Path, Path], out: Path, how: ImportSettings) -> None:
+    """Raise InputError for two sources of one clip, foreign clips in `out`, wrong takes or rates."""
+    npz, count = Counter(_npz(relative) for relative in files).most_common(1)[0]
+    if count > 1:
+        raise InputError(f"{npz.with_suffix('').as_posix()}: {count} recordings of this name; allowed: one")
+    foreign = sorted({path.relative_to(out) for path in out.rglob("*.npz")} - {_npz(path) for path in files})
+    if foreign or (out.exists() and not out.is_dir()):
+        wrong = f"has other clips, such as {foreign[0].as_posix()}" if foreign else "is a file"
+        raise InputError(f"{out}: {wrong}; allowed: a new folder, or that of the same import")
+    for pattern in how.takes:
+        try:
+            re.compile(pattern)
+        except re.error as error:
+            raise InputError(f"take: {pattern!r}: {error}; allowed: a regular expression") from error
+    folders = sorted({folder_key(folder) for relative in files for folder in relative.parents})
+    for folder, rate in how.fps.items():
+        if folder not in folders or not is_number(rate, *FRAME_RATE_RANGE):
+            allowed = f"1 to 1000 Hz for {', '.join(map(repr, folders))} ('' is all)"
+            raise InputError(f"fps: {rate!r} for {folder!r}; allowed: {allowed}")
+
+
+def _staging(out: Path) -> tempfile.TemporaryDirectory:
+    """Make a folder beside `out`, in which an import grows until it is complete."""
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        return tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-")
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror}); allowed: a new folder") from error
+
+
+def _import_file(
+    recording: Recording,
+    relative: Path,
+    folder: Path,
+    skeleton: SkeletonMap,
+    how: ImportSettings,
+    rest: np.ndarray,
+    source: Path,
+) -> Imported:
+    """Write one clip below the staging folder."""
+    sha256 = hashlib.sha256(recording.path.read_bytes()).hexdigest()
+    top = source if source.is_dir() else source.parent
+    rate = true_rate(recording.fps, relative, sha256, top, how.fps)
+    if rate.reason == HEADER and not tells_rate(recording.path):
+        allowed = f"--fps HZ, {recording.fps:g} for the published files, or {SIDECAR}"
+        raise InputError(f"{recording.path}: this format tells no frame rate; allowed: {allowed}")
+    name = relative.with_suffix("").as_posix()
+    converted = convert(recording, skeleton, rest, name=name, fps=rate.fps, floor=how.floor)
+    if how.sound and converted.fidelity.faults:
+        raise InputError(
+            f"{recording.path}: {'; '.join(converted.fidelity.faults)}; allowed: no faults (--sound)"
+        )
+    write_clip(folder / _npz(relative), converted.clip)
+    return Imported(
+        source=relative.as_posix(),
+        sha256=sha256,
+        clip=_npz(relative).as_posix(),
+        skeleton=skeleton.name,
+        unit=converted.unit,
+        up=converted.up,
+        rest_pose=converted.rest_pose,
+        frames=len(converted.clip),
+        header_fps=recording.fps,
+        fps=rate.fps,
+        fps_reason=rate.reason,
+        floor=converted.floor,
+        faults=converted.fidelity.faults,
+    )
+
+
+def _notes(clips: Sequence[Imported], maps: Mapping[str, SkeletonMap], how: ImportSettings) -> Iterator[str]:
+    """Yield what a person has to know of an import, a line each."""
+    yield from _rate_notes([clip for clip in clips if clip.fps != clip.header_fps])
+    yield from (f"{skeleton.name}: {skeleton.note}" for skeleton in maps.values() if skeleton.note)
+    for name in maps:
+        yield from _family_notes(name, [clip for clip in clips if clip.skeleton == name])
+    floorless = [clip.source for clip in clips if clip.floor is None]
+    if how.floor == AUTO and floorless:
+        more = f" and {len(floorless) - 1} more" if len(floorless) > 1 else ""
+        yield f"{floorless[0]}{more}: no foot stands still, so the floor is as in the file"
+
+
+def _family_notes(name: str, clips: Sequence[Imported]) -> Iterator[str]:
+    """Yield what may differ from clip to clip of one skeleton."""
+    for key in ("up", "unit"):
+        found = Counter(getattr(clip, key) for clip in clips)
+        if len(found) > 1:
+            several = ", ".join(f"{value} in {count} clips" for value, count in found.most_common())
+            yield f"{name}: {key} is found as {several}; tell it in the map if that is wrong"
+    read = [clip for clip in clips if clip.rest_pose.endswith(STRAIGHTEST)]
+    if len(read) > 1:
+        each = f"{len(read)} clips, whose zero pose is no stance, are each read from a frame of their own"
+        yield f"{name}: {each}, so head, hands and feet may be turned differently; a map's rest mends that"
+
+
+def _rate_notes(clips: Sequence[Imported]) -> Iterator[str]:
+    """Describe corrected rates, a line for the clips of a folder that have the same one."""
+    alike: dict[str, list[str]] = {}
+    for clip in clips:
+        told = f"{clip.fps:g} Hz, {clip.fps_reason}; the header says {clip.header_fps:g} Hz"
+        alike.setdefault(f"{Path(clip.source).parent.as_posix()}: {told}", []).append(Path(clip.source).name)
+    for told, names in alike.items():
+        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+        yield f"{told} ({', '.join(names[:3])}{more})"
+
+
+def _publish(staging: Path, out: Path, report: ImportReport, body: str) -> None:
+    """Move clips and record from staging to `out`, and remove earlier clips of the files skipped now.
+
+    A new folder `out` is there with all of them at once. In an earlier import's the record comes last, and
+    its own goes first: a folder without one holds clips of two imports.
+    """
+    record = {"body": body, **asdict(report)}
+    (staging / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    try:
+        if not out.exists():
+            staging.rename(out)
+            return
+        (out / RECORD).unlink(missing_ok=True)
+        for name in [*(clip.clip for clip in report.clips), RECORD]:
+            (out / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.move(staging / name, out / name)
+        for skipped in report.skipped:
+            (out / _npz(Path(skipped.file))).unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{out}: cannot be written ({error.strerror}); allowed: a folder to write to"
+        ) from error

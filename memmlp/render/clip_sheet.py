@@ -1,0 +1,86 @@
+"""A sheet of motion clips, each at a few moments: what an import or a data set looks like at one glance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from memmlp.common.errors import InputError
+from memmlp.motion.body import load_rest_joints
+from memmlp.motion.clip import Skipped
+from memmlp.motion.formats.npz import read_clip
+from memmlp.motion.importing.fidelity import pose
+from memmlp.motion.preparing.find import clip_name, find_clips
+from memmlp.render.canvas import Sheet
+from memmlp.render.raster import Camera, draw
+
+WIDTH, HEIGHT, LABEL, COLUMNS = 150, 220, 26, 12  # pixels; panels a row
+SCALE = 100.0  # pixels a metre
+LENS = 1.0  # metres above the floor that the camera looks at
+ASKEW = np.deg2rad(35)  # the camera stands beside the person's front
+
+
+def some_clips(
+    source: Path, count: int, body: str = "builtin"
+) -> tuple[list[tuple[str, np.ndarray]], list[Skipped], int]:
+    """Read a clip, or so many of a folder's npz files, evenly spread in the order of their names.
+
+    Returns:
+        Name and global joint positions (N, 22, 3), metres, world, of each clip; the files of these that hold
+        none; and how many files there are.
+
+    Raises:
+        InputError: if there are no npz files, or no clip in those that were read.
+    """
+    rest = load_rest_joints(body)
+    files = find_clips(source).files if source.is_dir() else [source.name]
+    top = source if source.is_dir() else source.parent
+    clips, skipped = [], []
+    for index in np.unique(np.linspace(0, len(files) - 1, min(count, len(files))).round().astype(int)):
+        file = files[index]
+        try:
+            clip = read_clip(top / file, clip_name(file))
+        except InputError as error:
+            skipped.append(Skipped(file, str(error).removeprefix(f"{top / file}: ")))
+        else:
+            clips.append((clip.name, pose(clip, rest)[1]))
+    if not clips:
+        first = f"{skipped[0].file}: {skipped[0].reason}"
+        raise InputError(f"{source}: no clip in {len(skipped)} files, the first: {first}")
+    return clips, skipped, len(files)
+
+
+def clip_sheet(clips: Sequence[tuple[str, np.ndarray]], moments: int = 3) -> np.ndarray:
+    """Draw clips side by side, each at evenly spread moments.
+
+    Args:
+        clips: name and global joint positions (N, 22, 3), metres, world (Z up, the floor at 0), of each.
+        moments: pictures of each clip.
+
+    Returns:
+        The picture (height, width, 3), uint8.
+    """
+    across = max(1, COLUMNS // moments)
+    rows = -(-len(clips) // across)
+    sheet = Sheet(across * moments * WIDTH, rows * (HEIGHT + LABEL))
+    for index, (name, joints) in enumerate(clips):
+        left, top = index % across * moments * WIDTH, index // across * (HEIGHT + LABEL)
+        sheet.text(left + moments * WIDTH / 2, top + LABEL / 2, _short(name), 13)
+        for moment in range(moments):
+            frame = (2 * moment + 1) * len(joints) // (2 * moments)
+            panel = sheet.panel(left + moment * WIDTH, top + LABEL, WIDTH, HEIGHT)
+            panel.set_data(draw(_camera(joints[frame]), joints[frame], None, 0.0))
+    return sheet.pixels()
+
+
+def _short(name: str, most: int = 48) -> str:
+    return name if len(name) <= most else "…" + name[1 - most :]
+
+
+def _camera(joints: np.ndarray) -> Camera:
+    """Return a camera beside the front of a person whose left hip is joint 1 and right hip joint 2."""
+    left = joints[1] - joints[2]
+    centre = np.array([*joints[0, :2], LENS])
+    return Camera(centre, np.arctan2(left[1], left[0]) + ASKEW, WIDTH, HEIGHT, SCALE)

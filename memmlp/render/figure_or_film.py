@@ -1,0 +1,39 @@
+"""A take as a file: a figure or a film, by the name's suffix."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from memmlp.common.errors import InputError
+from memmlp.render.clip_piece import Take
+from memmlp.render.figure import POSES, heatmap_png
+from memmlp.render.film import film, pyav
+
+SUFFIXES = (".png", ".gif", ".mp4")
+
+
+def check_picture(path: Path, key: str = "path", suffixes: tuple[str, ...] = SUFFIXES) -> None:
+    """Raise InputError for what is wrong with a picture's file before any of it is made.
+
+    key: what the path was given as. suffixes: of the kinds of picture that can be made.
+    """
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"{key} {path}: no such kind of picture; allowed are {', '.join(suffixes)}")
+    if not path.parent.is_dir():
+        raise InputError(f"{key} {path}: there is no folder {path.parent}")
+    if path.suffix.lower() == ".mp4":
+        pyav()
+
+
+def write_picture(path: Path, take: Take, poses: int = POSES, key: str = "path") -> None:
+    """Write a PNG of so many poses in a row, or a GIF or MP4 of all frames, whole or not at all.
+
+    Raises InputError where the system refuses the file.
+    """
+    try:
+        if path.suffix.lower() == ".png":
+            heatmap_png(path, take, poses)
+        else:
+            film(path, take)
+    except OSError as error:
+        raise InputError(f"{key} {path}: {error.strerror or error}") from None

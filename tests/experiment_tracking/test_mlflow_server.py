@@ -1,0 +1,130 @@
+"""A real MLflow server, killed and restarted: no run is stopped, and at the end it has everything once."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import run as command
+from fake_tracker import a_run, losses
+from processes import until
+
+from memmlp.experiment_tracking.feed import Tracking, feed_of
+from memmlp.experiment_tracking.mlflow_tracker import MLflow, quiet
+from memmlp.runs.run import Run
+
+pytestmark = pytest.mark.slow
+
+# `mlflow server` asks for packages of 800 MB; its handlers and its store need none of them.
+SERVE = """
+import os, sys
+from mlflow.server.constants import ARTIFACT_ROOT_ENV_VAR, BACKEND_STORE_URI_ENV_VAR
+os.environ[BACKEND_STORE_URI_ENV_VAR] = f"sqlite:///{sys.argv[1]}/server.db"
+os.environ[ARTIFACT_ROOT_ENV_VAR] = f"{sys.argv[1]}/artifacts"
+from mlflow.server import app
+app.run("127.0.0.1", int(sys.argv[2]), threaded=True)
+"""
+
+
+class Server:
+    """MLflow's server on a sqlite file, at a port that stays the same."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.url = f"http://127.0.0.1:{self.port}"
+        self.process: subprocess.Popen | None = None
+
+    def start(self) -> None:
+        """Start it, and wait until it answers."""
+        line = [sys.executable, "-c", SERVE, str(self.folder), str(self.port)]
+        with open(self.folder / "server.log", "ab") as log:
+            self.process = subprocess.Popen(line, stdout=log, stderr=log)
+        until(self.answers, f"the server; see {self.folder / 'server.log'}", self.process)
+
+    def answers(self) -> bool:
+        """Whether it does."""
+        try:
+            with urllib.request.urlopen(f"{self.url}/health", timeout=10) as response:
+                return response.status == 200
+        except OSError:
+            return False
+
+    def kill(self) -> None:
+        """Kill it, if it is there."""
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
+        self.process = None
+
+    def shown(self) -> dict[str, Any]:
+        """The runs that it has, by our id; each must be there once."""
+        from mlflow import MlflowClient
+
+        with quiet():
+            client = MlflowClient(self.url)
+            experiment = client.get_experiment_by_name("memmlp")
+            runs = client.search_runs([experiment.experiment_id]) if experiment else []
+        found = {run.data.tags["memmlp.run_id"]: run for run in runs}
+        assert len(found) == len(runs)
+        return found
+
+    def values(self, run: Run) -> list[tuple[str, int, float]]:
+        """The losses that it has of a run."""
+        from mlflow import MlflowClient
+
+        found = self.shown().get(run.id)
+        if found is None:
+            return []
+        with quiet():
+            history = MlflowClient(self.url).get_metric_history(found.info.run_id, "train/loss")
+        return [("train/loss", one.step, one.value) for one in history]
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    pytest.importorskip("flask")
+    pytest.importorskip("flask_cors")
+    made = Server(tmp_path)
+    yield made
+    made.kill()
+
+
+def test_a_server_that_is_killed_and_restarted_has_everything_once(
+    server: Server, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
+    outputs = tmp_path / "outputs"
+    tracking = Tracking((MLflow(server.url, outputs),), outputs)
+    server.start()
+    run = a_run(outputs, "0" * 16)
+    with tracking.following(run):
+        until(lambda: server.values(run) == losses(3), "the curve while it goes on")
+        server.kill()
+        run.log(4, {"loss": 1 / 4})
+        until(lambda: "is not shown by mlflow at present" in capfd.readouterr().err, "the warning")
+        server.start()
+        until(lambda: server.values(run) == losses(4), "what was missed")
+        feed = feed_of(tracking)
+        assert feed.process is not None
+        feed.process.kill()  # who would show the rest
+        feed.process.wait()
+        run.log(5, {"loss": 1 / 5})
+        run.finish([])
+    feed.close()
+    other = a_run(outputs, "1" * 16)
+    other.fail("loss is nan")
+    assert server.values(run) == losses(4)
+
+    words = ["track", "sync", "--uri", server.url, "--outputs", str(outputs)]
+    for more, now in (([], 2), ([], 0), (["--full"], 2)):
+        assert f"2 runs ({now} of them now)" in command(tmp_path, *words, *more)
+        assert (server.values(run), server.values(other)) == (losses(5), losses(3))
+    assert {one.info.status for one in server.shown().values()} == {"FINISHED", "FAILED"}

@@ -1,0 +1,71 @@
+"""A sync fills in what was missed, once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fake_tracker import FakeTracker, a_run, losses
+
+from memmlp.common.files import write_json
+from memmlp.experiment_tracking.follower import ledgers
+from memmlp.experiment_tracking.sync import sync, sync_sweeps
+from memmlp.experiment_tracking.tracker import Session
+from memmlp.runs.notes import add_tags
+
+
+def test_a_second_sync_shows_nothing_again(tmp_path: Path):
+    tracker, said = FakeTracker(), []
+    runs = [a_run(tmp_path, "0" * 16), a_run(tmp_path, "1" * 16)]
+    runs[0].finish([])
+    runs[1].fail("why")
+    assert sync(tracker, runs, tmp_path, said.append) == {"shown": 2}
+    assert sync(tracker, runs, tmp_path, said.append) == {"same": 2}
+    assert tracker.server.status == {runs[0].id: "done", runs[1].id: "failed"}
+    assert tracker.server.values == {run.id: losses(3) for run in runs}
+    assert (tracker.server.begun, said) == (2, [])
+
+
+def test_what_changed_is_shown_and_full_shows_everything(tmp_path: Path):
+    tracker, runs = FakeTracker(), [a_run(tmp_path, "0" * 16), a_run(tmp_path, "1" * 16)]
+    sync(tracker, runs, tmp_path, print)
+    add_tags(runs[0], ["good"])
+    assert sync(tracker, runs, tmp_path, print) == {"shown": 1, "same": 1}
+    assert sync(tracker, runs, tmp_path, print, full=True) == {"shown": 2}
+    assert tracker.server.values == {run.id: losses(3) for run in runs}
+
+
+def test_what_a_tracker_lost_is_filled_in(tmp_path: Path):
+    tracker, run = FakeTracker(), a_run(tmp_path)
+    sync(tracker, [run], tmp_path, print)
+    tracker.server.status.clear()
+    assert sync(tracker, [run], tmp_path, print) == {"shown": 1}
+
+
+def test_runs_that_go_on_are_left_to_their_follower(tmp_path: Path):
+    tracker, run, other = FakeTracker(), a_run(tmp_path, "0" * 16), a_run(tmp_path, "1" * 16)
+    followed = Session(FakeTracker(), run, ledgers(tmp_path, tracker))
+    with other.lock():
+        assert sync(tracker, [run, other], tmp_path, print) == {"live": 2}
+    followed.leave()
+    assert sync(tracker, [run, other], tmp_path, print) == {"shown": 2}
+
+
+def test_one_run_that_fails_does_not_stop_the_others(tmp_path: Path):
+    tracker, said = FakeTracker(), []
+    bad, good = a_run(tmp_path, "0" * 16), a_run(tmp_path, "1" * 16)
+    bad.config_path.write_text("{")
+    assert sync(tracker, [bad, good], tmp_path, said.append) == {"failed": 1, "shown": 1}
+    assert "cannot be read" in said[0]
+
+
+def test_sweeps_that_left_a_summary_are_shown(tmp_path: Path):
+    tracker, said = FakeTracker(), []
+    folders = [tmp_path / "mine", tmp_path / "other"]
+    for folder in folders:
+        folder.mkdir()
+    names = {"name": "mine", "status": "done", "labels": {}, "aggregates": {}, "verdicts": {}}
+    write_json(folders[0] / "summary.json", names)
+    assert sync_sweeps(tracker, folders, said.append) == 1
+    tracker.server.down = True
+    assert sync_sweeps(tracker, folders, said.append) == 0
+    assert said == ["sweep mine is not shown by fake: connection refused"]

@@ -1,0 +1,161 @@
+"""A VRM avatar on the page: its bones stand where the joints are, whatever avatar it is."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from chromium import Browser
+from scipy.spatial.transform import Rotation
+
+from memmlp.common.errors import InputError
+from memmlp.live.player.avatar_files import avatar_files, mannequin_vrm, read_vrm
+from memmlp.live.player.play import UNIT, joints_message, millimetres, rotations_message, with_avatar
+from memmlp.live.player.server import FILES, Hub, LiveServer
+from memmlp.live.rotations import BodyTree
+from memmlp.live.spaces import SPACES
+from memmlp.live.stream import Pose
+from memmlp.motion.body import JOINTS, PARENTS, builtin_rest_joints
+from memmlp.motion.formats.humanoid_bones import VRM
+
+REST = builtin_rest_joints()
+RANDOM = np.random.default_rng(2)
+
+
+def pose() -> Pose:
+    """A person in AMASS' world with each joint turned by up to some 40 degrees, 30 for the whole."""
+    local = Rotation.from_rotvec(RANDOM.uniform(-0.4, 0.4, (22, 3))).as_matrix()
+    local[0] = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) @ local[0]
+    body = BodyTree(JOINTS, PARENTS, REST).positions(local)
+    return Pose(0.0, body + np.array([0.5, -0.25, 1.6]), local, body, (), True, False)
+
+
+def edited(vrm: bytes, edit: Callable[[dict[str, Any]], None]) -> bytes:
+    """A VRM file with other JSON."""
+    (size,) = struct.unpack_from("<I", vrm, 12)
+    content = json.loads(vrm[20 : 20 + size])
+    edit(content)
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    rest = vrm[20 + size :]
+    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
+
+
+def without_chest(content: dict[str, Any]) -> None:
+    """Many avatars have neither chest nor shoulders."""
+    bones = content["extensions"]["VRMC_vrm"]["humanoid"]["humanBones"]
+    for name in ("chest", "upperChest", "leftShoulder", "rightShoulder", "neck", "leftToes", "rightToes"):
+        del bones[name]
+
+
+def of_vrm_0(content: dict[str, Any]) -> None:
+    """The same in VRM 0.0, where avatars face -Z."""
+    bones = content["extensions"].pop("VRMC_vrm")["humanoid"]["humanBones"]
+    content["extensionsUsed"] = ["VRM"]
+    listed = [
+        {"bone": name, "node": about["node"], "useDefaultValues": True} for name, about in bones.items()
+    ]
+    meta = {"title": "old", "author": "nobody", "licenseName": "CC0"}
+    content["extensions"]["VRM"] = {
+        "specVersion": "0.0", "meta": meta, "humanoid": {"humanBones": listed},
+        "blendShapeMaster": {"blendShapeGroups": []}, "firstPerson": {}, "materialProperties": [],
+    }  # fmt: skip
+    for node in content["nodes"]:
+        if "translation" in node:
+            x, y, z = node["translation"]
+            node["translation"] = [-x, y, -z]
+
+
+@pytest.fixture(scope="module")
+def own() -> bytes:
+    return mannequin_vrm(REST)
+
+
+@pytest.fixture
+def browser() -> Iterator[Browser]:
+    with Browser(700, 500) as browser:
+        yield browser
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("edit", [None, without_chest, of_vrm_0], ids=["own", "without chest", "VRM 0"])
+@pytest.mark.parametrize("size", [1.0, 1.2])
+def test_an_avatar_s_bones_are_where_the_joints_are(browser: Browser, own: bytes, edit, size: float):
+    """Within what whole millimetres leave; of a wearer of another size, too.
+
+    An avatar that lacks bones stands otherwise, but all its bones have the right direction.
+    """
+    try:
+        files = avatar_files(edited(own, edit) if edit else own)
+    except InputError as error:
+        pytest.skip(str(error))
+    person, space = pose(), SPACES["amass"]
+    person = person._replace(positions=person.positions * size)
+    words = with_avatar({}, REST * size)["avatar"]
+    given = joints_message(space, person, None) | rotations_message(space, person)
+    joints = np.array(given["joints"]).reshape(22, 3) / 1000
+    script = """
+      import('./avatar.js').then(async ({ Avatar }) => {
+        const avatar = await Avatar.load('avatar.vrm', WORDS);
+        avatar.pose(TURNS, JOINTS);
+        avatar.scene.updateMatrixWorld(true);
+        const at = node => node.getWorldPosition(node.position.clone()).toArray();
+        const bones = WORDS.bones.map(name => avatar.vrm.humanoid.getRawBoneNode(name));
+        window.found = bones.map(node => node && at(node));
+      }).catch(error => { window.failed = String(error.stack); }); 0
+    """
+    for name, value in (("WORDS", words), ("TURNS", given["turns"]), ("JOINTS", joints.ravel().tolist())):
+        script = script.replace(name, json.dumps(value))
+    with LiveServer(Hub({}), 0, files=files) as server:
+        browser.open(f"{server.url}style.css")
+        browser.open(server.url)
+        browser.value(script)
+        browser.wait("window.found || window.failed")
+        assert browser.value("window.failed") is None
+        found = browser.value("window.found")
+    there = [index for index, at in enumerate(found) if at]
+    assert len(there) == (15 if edit is without_chest else 22)
+    bones = [(joint, PARENTS[joint]) for joint in there if PARENTS[joint] in there]
+    assert len(bones) == (11 if edit is without_chest else 21)
+    for joint, above in bones:
+        along = np.array(found[joint]) - np.array(found[above])
+        assert along == pytest.approx(joints[joint] - joints[above], abs=3e-3), VRM[joint]
+    if edit is not without_chest:
+        assert np.linalg.norm(np.array(found) - joints, axis=1).max() < 2e-3
+
+
+def test_the_rotations_of_a_message_are_those_of_vrm_s_t_pose():
+    """Who looks along the page's +Z in T-pose, which is AMASS' -Y, has the identity."""
+    still = np.tile(np.eye(3), (22, 1, 1))
+    still[0] = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    for space in SPACES.values():
+        person = Pose(0.0, np.zeros((22, 3)), space.pose_out(still), np.zeros((22, 3)), (), True, False)
+        found = np.array(rotations_message(space, person)["turns"]).reshape(22, 4)
+        np.testing.assert_array_equal(np.abs(found), np.tile([0, 0, 0, UNIT], (22, 1)))
+    assert millimetres(SPACES["amass"], np.array([[1.0, 2, 3]])) == [1000, 3000, -2000]
+
+
+def test_files_that_are_no_avatar_are_refused(own: bytes, tmp_path: Path):
+    (tmp_path / "own.vrm").write_bytes(own)
+    assert read_vrm(tmp_path / "own.vrm") == own
+    plain = edited(own, lambda content: content.pop("extensions"))
+    for name, content, told in (
+        ("text", b"nothing", "no binary glTF"),
+        ("short", b"glTF", "allowed is a VRM file"),
+        ("cut", own[:100], "allowed is a VRM file"),
+        ("plain", plain, "a glTF file without a VRM avatar"),
+        ("list", struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"[]", "allowed is a VRM file"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=told):
+            read_vrm(tmp_path / name)
+
+
+def test_without_an_avatar_the_page_has_nothing_of_npm():
+    assert not any("npm" in name or "vrm" in name for name in FILES)
+    assert b"npm" not in FILES[""].read()

@@ -1,0 +1,171 @@
+"""Clips and folders of clips -> files of other programs; what is skipped, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Memmlp, one_line
+
+from memmlp.common.errors import InputError
+from memmlp.motion.body import builtin_rest_joints
+from memmlp.motion.clip import Clip
+from memmlp.motion.exporting.export_folder import export, plan_export
+from memmlp.motion.exporting.write import FORMATS, format_of, write_motion
+from memmlp.motion.formats.bvh import read_bvh
+from memmlp.motion.formats.npz import read_clip, write_clip
+
+REST = builtin_rest_joints()
+
+
+def moving(seed: int, fps: float = 120.0) -> Clip:
+    random = np.random.default_rng(seed)
+    return Clip(f"clip {seed}", random.normal(size=(5, 22, 3)), 0.01 * random.normal(size=(5, 3)), fps)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """dance/one.v2.npz, walk.npz, bad.npz, which is none, and AMASS' shape.npz, which is none of motion."""
+    for seed, name in enumerate(["dance/one.v2", "walk"]):
+        write_clip(tmp_path / "clips" / f"{name}.npz", moving(seed))
+    (tmp_path / "clips" / "bad.npz").write_bytes(b"no npz")
+    np.savez(tmp_path / "clips" / "shape.npz", betas=np.zeros(16))
+    return tmp_path / "clips"
+
+
+def files(folder: Path) -> list[str]:
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_names_are_kept_and_a_bad_clip_is_skipped(folder: Path, tmp_path: Path, name: str):
+    report = export(plan_export(folder, tmp_path / "out", name))
+    suffix = FORMATS[name].suffix
+    assert files(tmp_path / "out") == [f"dance/one.v2{suffix}", f"walk{suffix}"]
+    assert [path.relative_to(tmp_path / "out").as_posix() for path in report.written] == files(
+        tmp_path / "out"
+    )
+    assert [skipped.file for skipped in report.skipped] == ["bad.npz"]
+    assert str(tmp_path) not in report.skipped[0].reason
+    assert report.seconds == pytest.approx(2 * 5 / 120)
+
+
+def test_strict_stops_at_a_bad_clip(folder: Path, tmp_path: Path):
+    with pytest.raises(InputError, match=r"bad\.npz: no zip"):
+        export(plan_export(folder, tmp_path / "out", "bvh"), strict=True)
+
+
+def test_nothing_usable_is_an_error(folder: Path, tmp_path: Path):
+    for name in ("walk", "dance/one.v2"):
+        (folder / f"{name}.npz").write_bytes(b"no npz")
+    with pytest.raises(InputError, match=r"no usable clip in 4 files; the first: bad\.npz"):
+        export(plan_export(folder, tmp_path / "out", "bvh"))
+    with pytest.raises(InputError, match=r"bad\.npz: no zip"):
+        export(plan_export(folder / "bad.npz", tmp_path / "bad.bvh"))
+    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "bad.bvh").exists()
+
+
+def test_a_clip_keeps_its_rate_or_gets_another(folder: Path, tmp_path: Path):
+    export(plan_export(folder / "walk.npz", tmp_path / "own.bvh"))
+    export(plan_export(folder / "walk.npz", tmp_path / "new" / "half.BVH"), fps=60)
+    own, half = read_bvh(tmp_path / "own.bvh"), read_bvh(tmp_path / "new" / "half.BVH")
+    assert (own.fps, len(own), half.fps, len(half)) == (120, 5, 60, 3)
+    np.testing.assert_allclose(half.kinematics()[1], own.kinematics()[1][::2], atol=1e-4)  # cm
+
+
+def test_npz_is_the_clip_without_its_hands(folder: Path, tmp_path: Path):
+    export(plan_export(folder / "walk.npz", tmp_path / "again.npz"))
+    before, after = read_clip(folder / "walk.npz", "walk"), read_clip(tmp_path / "again.npz", "walk")
+    np.testing.assert_array_equal(after.poses, before.poses)
+    np.testing.assert_array_equal(after.trans, before.trans)
+
+
+def test_what_is_no_person_is_skipped(folder: Path, tmp_path: Path):
+    clip = moving(3)
+    write_clip(folder / "degrees.npz", Clip("degrees", np.degrees(clip.poses), clip.trans, 120.0))
+    report = export(plan_export(folder, tmp_path / "out", "bvh"))
+    assert [skipped.file for skipped in report.skipped] == ["bad.npz", "degrees.npz"]
+    assert "degrees" in report.skipped[1].reason
+
+
+def test_two_files_of_one_name_are_refused(folder: Path, tmp_path: Path):
+    write_clip(folder / "walk.NPZ", moving(5))
+    if len(list(folder.glob("walk.*"))) == 1:
+        pytest.skip("this file system does not tell letter case")
+    with pytest.raises(InputError, match=r"walk\.bvh: 2 npz files of this name"):
+        plan_export(folder, tmp_path / "out", "bvh")
+
+
+def test_a_file_behind_several_links_is_exported_once(folder: Path, tmp_path: Path):
+    (folder / "again").symlink_to(folder)
+    (folder / "other.npz").symlink_to(folder / "walk.npz")
+    assert len(export(plan_export(folder, tmp_path / "out", "bvh")).written) == 2
+
+
+def test_a_folder_of_shapes_has_no_clip(tmp_path: Path):
+    (tmp_path / "in").mkdir()
+    np.savez(tmp_path / "in" / "shape.npz", betas=np.zeros(16))
+    np.savez(tmp_path / "in" / "neutral.npz", betas=np.zeros(16))
+    with pytest.raises(InputError, match="no usable clip in 2 files; allowed"):
+        export(plan_export(tmp_path / "in", tmp_path / "out", "bvh"), strict=True)
+
+
+@pytest.mark.parametrize(
+    ("source", "out", "name", "words"),
+    [
+        ("none.npz", "a.bvh", None, ("none.npz", "no such file or folder")),
+        ("walk.npz", "a.fbx", None, ("--out", "a.fbx", ".bvh, .npz, .glb")),
+        ("walk.npz", "a", "bvh", ("--out", "no such kind of file")),
+        ("walk.npz", "a.glb", "bvh", ("--out", "not a file of --format bvh", "*.bvh")),
+        ("walk.npz", "dance", "bvh", ("--out", "is a folder")),
+        ("walk.npz", "walk.npz", None, ("--out", "over its source")),
+        (".", "../a", None, ("--format", "bvh, npz, gltf")),
+        (".", "../a.bvh", "bvh", ("--out", "allowed for several clips: a folder")),
+        (".", "../file", "bvh", ("--out", "allowed for several clips: a folder")),
+        (".", "below", "npz", ("--out", "a folder beside it")),
+        ("dance", ".", "npz", ("--out", "a folder beside it")),
+        ("empty", "../a", "npz", ("no npz below",)),
+    ],
+)
+def test_what_is_unclear_or_dangerous_is_refused(
+    folder: Path, source: str, out: str, name: str | None, words: tuple[str, ...]
+):
+    (folder.parent / "file").write_text("")
+    (folder / "empty").mkdir()
+    before = files(folder.parent)
+    with pytest.raises(InputError) as error:
+        plan_export(folder / source, folder / out, name)
+    for word in words:
+        assert word in str(error.value)
+    assert len(str(error.value).splitlines()) == 1
+    assert files(folder.parent) == before
+
+
+def test_a_place_that_cannot_be_written_is_named(folder: Path):
+    path = folder / "walk.npz" / "a.glb"
+    with pytest.raises(InputError, match="cannot be written"):
+        write_motion(path, moving(0), REST, format_of(path))
+
+
+# The command
+
+
+def test_the_command_says_what_it_did(folder: Path, memmlp: Memmlp, tmp_path: Path):
+    ran = memmlp("data", "export", str(folder), "--out", "out", "--format", "gltf")
+    assert ran.code == 0
+    assert ran.out.startswith("skipped bad.npz: no zip")
+    assert ran.out.endswith("\n2 clips, 0.0 minutes, in out\n")
+    assert memmlp("data", "export", str(folder / "walk.npz"), "--out", "w.bvh", "--fps", "30").code == 0
+    assert read_bvh(tmp_path / "w.bvh").fps == 30
+
+
+def test_the_command_refuses_in_one_line(folder: Path, memmlp: Memmlp):
+    assert one_line(memmlp("data", "export", "none", "--out", "a.bvh"), "none", "no such file")
+    walk = str(folder / "walk.npz")
+    assert one_line(
+        memmlp("data", "export", walk, "--out", "a.bvh", "--body", "no.npz"), "data.body", "no.npz"
+    )
+    assert one_line(memmlp("data", "export", walk, "--out", "a.bvh", "--fps", "nan"), "--fps")
+    assert one_line(memmlp("data", "export", str(folder / "bad.npz"), "--out", "a.bvh"), "bad.npz")

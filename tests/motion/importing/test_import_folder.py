@@ -1,0 +1,336 @@
+"""Folders of BVH files -> folders of clips: rates, damaged files, what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bvh_samples import mutate, performed, person, random_turns, refuse, tree, write
+from plain_kinematics import npz_kinematics
+from scipy.spatial.transform import Rotation
+
+from memmlp.common.errors import InputError
+from memmlp.motion.body import JOINTS, builtin_rest_joints
+from memmlp.motion.formats.bvh import read_bvh
+from memmlp.motion.formats.npz import read_clip
+from memmlp.motion.importing.convert import NONE, convert
+from memmlp.motion.importing.fidelity import pose
+from memmlp.motion.importing.import_folder import ImportSettings, import_folder
+from memmlp.motion.importing.skeleton import SKELETONS, find_skeleton, load_skeleton
+from memmlp.motion.importing.verify import verify
+from memmlp.motion.synthetic import synthesize_clip
+
+REST = builtin_rest_joints()
+
+
+# Damaged files
+
+
+def test_damaged_files_are_refused_in_one_line(tmp_path: Path) -> None:
+    """200 pieces of damage: each gives a finite clip or one line that names the file."""
+    data, refused = person("cmu_daz", 4, 7).text().encode(), []
+    for seed in range(200):
+        path = write(tmp_path, mutate(data, seed), f"damaged {seed}.bvh")
+        try:
+            bvh = read_bvh(path)
+            clip = convert(bvh, find_skeleton(bvh), REST, name="clip").clip
+        except InputError as error:
+            refused.append((path, str(error)))
+        else:
+            assert len(clip) > 0
+            assert np.isfinite(clip.poses).all()
+            assert np.isfinite(clip.trans).all()
+    for path, message in refused:
+        assert message.startswith(str(path))
+        assert len(message.splitlines()) == 1
+    assert 150 <= len(refused) < 200
+
+
+# Folders
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    """salsa/01, salsa/02, indian/01 and top.bvh, 3 frames at 120 Hz by the header; salsa has 60 Hz."""
+    for seed, name in enumerate(["salsa/01", "salsa/02", "indian/01", "top"]):
+        write(tmp_path / "source", person("cmu_daz", 3, seed).text("\r\n"), f"{name}.bvh")
+    write(tmp_path / "source", "no motion", "readme.txt")
+    write(tmp_path / "source", "fps: 60", "salsa/motion.yaml")
+    return tmp_path / "source"
+
+
+def rates(out: Path) -> dict[str, float]:
+    files = sorted(out.rglob("*.npz"))
+    return {name: read_clip(path, name).fps for path in files for name in [path.relative_to(out).as_posix()]}
+
+
+def test_import_writes_clips_and_record(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    report = import_folder(source, out, ImportSettings(floor=NONE))
+    assert rates(out) == {"indian/01.npz": 120, "salsa/01.npz": 60, "salsa/02.npz": 60, "top.npz": 120}
+    assert [clip.source for clip in report.clips] == [
+        "indian/01.bvh",
+        "salsa/01.bvh",
+        "salsa/02.bvh",
+        "top.bvh",
+    ]
+    assert report.notes == ("salsa: 60 Hz, in salsa/motion.yaml; the header says 120 Hz (01.bvh, 02.bvh)",)
+    record = json.loads((out / "import.json").read_text())
+    assert [clip["clip"] for clip in record["clips"]] == sorted(rates(out))
+    assert record["clips"][3]["sha256"] == hashlib.sha256((source / "top.bvh").read_bytes()).hexdigest()
+    assert str(tmp_path) not in (out / "import.json").read_text()
+    assert not [path for path in tmp_path.iterdir() if path.name not in ("source", "out")]
+    bvh = read_bvh(source / "salsa/02.bvh")
+    expected = convert(bvh, find_skeleton(bvh), REST, name="clip").clip
+    clip = read_clip(out / "salsa/02.npz", "salsa/02")
+    np.testing.assert_array_equal(clip.poses.astype(np.float32), expected.poses.astype(np.float32))
+
+
+def test_import_twice_is_the_same(source: Path, tmp_path: Path) -> None:
+    first = import_folder(source, tmp_path / "out")
+    record = (tmp_path / "out" / "import.json").read_bytes()
+    assert import_folder(source, tmp_path / "out") == first
+    assert (tmp_path / "out" / "import.json").read_bytes() == record
+
+
+@pytest.mark.parametrize(
+    ("fps", "expected"),
+    [
+        ({"salsa": 100}, [120, 100, 100, 120]),
+        ({"": 50}, [50, 50, 50, 50]),
+        ({"": 50, "salsa": 120}, [50, 120, 120, 50]),
+        ({"indian": 30.5}, [30.5, 60, 60, 120]),
+    ],
+)
+def test_given_rates(source: Path, tmp_path: Path, fps: dict[str, float], expected: list[float]) -> None:
+    report = import_folder(source, tmp_path / "out", ImportSettings(fps=fps, floor=NONE))
+    assert list(rates(tmp_path / "out").values()) == expected
+    assert [clip.fps for clip in report.clips] == expected
+    assert all("given" in clip.fps_reason for clip in report.clips if clip.fps not in (60, 120))
+    corrected = {Path(clip.source).parent.as_posix() for clip in report.clips if clip.fps != 120}
+    assert {note.split(":")[0] for note in report.notes} == corrected
+
+
+@pytest.mark.parametrize(
+    "fps", [{"waltz": 60}, {"salsa": 0}, {"salsa": float("nan")}, {"": 5000}, {"salsa/": 60}]
+)
+def test_wrong_rates_are_refused(source: Path, tmp_path: Path, fps: dict[str, float]) -> None:
+    with refuse("fps: ", "'indian', 'salsa'"):
+        import_folder(source, tmp_path / "out", ImportSettings(fps=fps, floor=NONE))
+
+
+def test_known_rate_holds_for_the_folder_or_file_itself(source: Path, tmp_path: Path) -> None:
+    assert import_folder(source / "salsa", tmp_path / "a").clips[0].fps == 60
+    assert import_folder(source / "salsa" / "01.bvh", tmp_path / "b").clips[0].fps == 60
+    assert (tmp_path / "b" / "01.npz").is_file()
+
+
+def test_a_header_that_is_right_is_not_corrected(source: Path, tmp_path: Path) -> None:
+    write(source, person("cmu_daz", 3, 0).text(dt="0.0166667"), "indian/01.bvh")
+    report = import_folder(source / "indian/01.bvh", tmp_path / "out", ImportSettings(floor=NONE))
+    assert (report.clips[0].fps, report.clips[0].fps_reason) == (60, "the header's")
+    assert report.notes == ()
+
+
+def test_bad_files_are_skipped(source: Path, tmp_path: Path) -> None:
+    import_folder(source, tmp_path / "out")
+    write(source, "HIERARCHY", "salsa/01.bvh")
+    report = import_folder(source, tmp_path / "out")
+    assert [skipped.file for skipped in report.skipped] == ["salsa/01.bvh"]
+    assert report.skipped[0].reason.startswith("no MOTION")
+    assert list(rates(tmp_path / "out")) == ["indian/01.npz", "salsa/02.npz", "top.npz"]
+    assert str(tmp_path) not in (tmp_path / "out" / "import.json").read_text()
+
+
+def test_a_new_folder_is_there_with_all_its_clips_at_once(source: Path, tmp_path: Path, monkeypatch) -> None:
+    seen, rename = [], Path.rename
+
+    def renamed(self: Path, target: Path) -> Path:
+        seen.append((target, sorted(path.suffix for path in self.rglob("*.*"))))
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", renamed)
+    monkeypatch.setattr("shutil.move", None)
+    report = import_folder(source, tmp_path / "new")
+    assert seen == [(tmp_path / "new", [".json", *[".npz"] * len(report.clips)])]
+    assert sorted(path.name for path in tmp_path.iterdir() if path.name.startswith(".")) == []
+
+
+def test_an_earlier_record_is_gone_before_its_clips_are(source: Path, tmp_path: Path, monkeypatch) -> None:
+    out = tmp_path / "out"
+    import_folder(source, out)
+    monkeypatch.setattr(
+        "shutil.move", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device"))
+    )
+    with pytest.raises(InputError, match="No space left"):
+        import_folder(source, out)
+    assert not (out / "import.json").exists()
+
+
+def test_strict_import_leaves_nothing(source: Path, tmp_path: Path) -> None:
+    write(source, "HIERARCHY", "salsa/01.bvh")
+    with refuse(source / "salsa/01.bvh", "no MOTION"):
+        import_folder(source, tmp_path / "out", ImportSettings(strict=True))
+    assert [path.name for path in tmp_path.iterdir()] == ["source"]
+
+
+def test_strict_import_leaves_an_earlier_one_alone(source: Path, tmp_path: Path) -> None:
+    import_folder(source, tmp_path / "out")
+    before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.*")}
+    write(source, person("cmu_daz", 9, 9).text(), "indian/01.bvh")
+    write(source, "HIERARCHY", "top.bvh")
+    with pytest.raises(InputError):
+        import_folder(source, tmp_path / "out", ImportSettings(strict=True))
+    assert {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.*")} == before
+
+
+def test_nothing_to_import_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    for source in (tmp_path / "empty", tmp_path / "missing", write(tmp_path, "", "clip.txt")):
+        with refuse(source):
+            import_folder(source, tmp_path / "out")
+    for name in ("a", "b"):
+        write(tmp_path / "bad", "HIERARCHY", f"{name}.bvh")
+    with pytest.raises(InputError, match=r"no usable file of 2; the first: a\.bvh"):
+        import_folder(tmp_path / "bad", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_files_of_one_clip_are_refused(source: Path, tmp_path: Path) -> None:
+    write(source, person("cmu_daz", 3, 0).text(), "salsa/01.BVH")
+    if len(list((source / "salsa").iterdir())) == 2:
+        pytest.skip("the file system does not tell 01.bvh from 01.BVH")
+    with refuse("salsa/01", "2 recordings"):
+        import_folder(source, tmp_path / "out")
+
+
+def test_foreign_clips_in_out_are_refused(source: Path, tmp_path: Path) -> None:
+    write(tmp_path / "out", "", "walk/01.npz")
+    with refuse(tmp_path / "out", "walk/01.npz"):
+        import_folder(source, tmp_path / "out")
+    with refuse(source / "top.bvh", "is a file"):
+        import_folder(source, source / "top.bvh")
+
+
+# Floors, takes, notes
+
+
+@pytest.fixture
+def takes(tmp_path: Path) -> Path:
+    """Walks a and b of take 1 on floors of 0.3 and 0.5 m, and one of take 2 on a floor of 0.9 m."""
+    chosen = load_skeleton("cmu_daz")
+    walk = synthesize_clip("walking", 1, seconds=2.0)
+    for name, floor in (("1a", 0.3), ("1b", 0.5), ("2a", 0.9)):
+        raised = replace(walk, trans=walk.trans + np.array([0, 0, floor]))
+        text = performed(chosen, raised, sample=tree("cmu_daz")).text(dt="0.0166667")
+        write(tmp_path / "source", text, f"{name}.bvh")
+    return tmp_path / "source"
+
+
+def toes(out: Path) -> dict[str, float]:
+    """The lower toe's tenth percentile of each clip, metres."""
+    feet = [JOINTS.index("left_foot"), JOINTS.index("right_foot")]
+    return {
+        path.stem: float(np.percentile(npz_kinematics(path)[1][:, feet, 2].min(1), 10))
+        for path in sorted(out.rglob("*.npz"))
+    }
+
+
+def test_each_clip_is_put_on_its_floor(takes: Path, tmp_path: Path) -> None:
+    report = import_folder(takes, tmp_path / "out")
+    assert report.notes == ()
+    assert max(abs(height - 0.02) for height in toes(tmp_path / "out").values()) < 0.01
+    found = [float(clip.floor or 0) for clip in report.clips]
+    assert np.diff(found) == pytest.approx([0.2, 0.4], abs=0.01)
+
+
+def test_clips_of_a_take_share_its_lowest_floor(takes: Path, tmp_path: Path) -> None:
+    apart = import_folder(takes, tmp_path / "apart")
+    report = import_folder(takes, tmp_path / "out", ImportSettings(takes=[r"^(\d)"]))
+    assert [clip.floor for clip in report.clips] == [apart.clips[index].floor for index in (0, 0, 2)]
+    heights = toes(tmp_path / "out")
+    assert heights["1b"] - heights["1a"] == pytest.approx(0.2, abs=0.01)
+    assert heights["2a"] == pytest.approx(0.02, abs=0.01)
+
+
+def test_floors_as_told(takes: Path, tmp_path: Path) -> None:
+    left = import_folder(takes, tmp_path / "left", ImportSettings(floor=NONE))
+    told = import_folder(takes, tmp_path / "told", ImportSettings(floor=0.3))
+    assert [clip.floor for clip in left.clips] == [None] * 3
+    scale = {clip.floor for clip in told.clips}
+    assert len(scale) == 1
+    taken = np.subtract(list(toes(tmp_path / "left").values()), list(toes(tmp_path / "told").values()))
+    np.testing.assert_allclose(taken, scale.pop(), atol=1e-5)
+    zero = import_folder(takes, tmp_path / "zero", ImportSettings(floor=0))
+    assert [clip.floor for clip in zero.clips] == [0.0] * 3
+
+
+def test_a_clip_without_a_floor_says_so(takes: Path, tmp_path: Path) -> None:
+    write(takes, person("cmu_daz", 9, 9).text(), "flying.bvh")
+    report = import_folder(takes, tmp_path / "out")
+    assert report.notes == ("flying.bvh: no foot stands still, so the floor is as in the file",)
+    assert {clip.source: clip.floor for clip in report.clips}["flying.bvh"] is None
+
+
+def test_patterns_of_takes_are_checked(takes: Path, tmp_path: Path) -> None:
+    with refuse("take: '('"):
+        import_folder(takes, tmp_path / "out", ImportSettings(takes=["("]))
+
+
+def test_clips_that_are_each_read_from_a_frame_are_noted(tmp_path: Path) -> None:
+    chosen, walk = load_skeleton("cmu_daz"), synthesize_clip("walking", 1, seconds=2.0)
+    turns = random_turns(tree("cmu_daz"), 1)
+    text = performed(chosen, walk, sample=tree("cmu_daz"), turns=turns).text()
+    for name in "ab":
+        write(tmp_path / "source", text, f"{name}.bvh")
+    notes = import_folder(tmp_path / "source", tmp_path / "out").notes
+    assert [note for note in notes if note.startswith("cmu_daz: 2 clips, whose zero pose is no stance")]
+
+
+def test_several_up_axes_of_one_skeleton_are_noted(tmp_path: Path) -> None:
+    chosen = replace(load_skeleton("cmu_daz"), up=None)
+    walk, path = synthesize_clip("walking", 1, seconds=2.0), tmp_path / "auto.yaml"
+    path.write_text((SKELETONS / "cmu_daz.yaml").read_text().replace("up: y", "up: auto"))
+    for name, up in (("a", "y"), ("b", "z"), ("c", "y")):
+        text = performed(replace(chosen, up=up), walk).text()
+        write(tmp_path / "source", text, f"{name}.bvh")
+    notes = import_folder(tmp_path / "source", tmp_path / "out", ImportSettings(skeleton=str(path))).notes
+    assert "cmu_daz: up is found as y in 2 clips, z in 1 clips; tell it in the map if that is wrong" in notes
+
+
+def test_who_lies_is_imported_lying_where_up_is_told(tmp_path: Path) -> None:
+    chosen, walk = load_skeleton("smpl_words"), synthesize_clip("walking", 1, seconds=2.0)
+    poses, trans = walk.poses.astype(float), np.tile([0.0, 0.0, -0.8], (len(walk), 1))
+    poses[:, 0] = (Rotation.from_euler("x", 90, degrees=True) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+    write(tmp_path, performed(chosen, replace(walk, poses=poses, trans=trans)).text())
+    with refuse(tmp_path / "clip.bvh", "stands along y in the zero pose, but along z in the motion"):
+        import_folder(tmp_path / "clip.bvh", tmp_path / "out")
+    import_folder(tmp_path / "clip.bvh", tmp_path / "out", ImportSettings(up="y"))
+    places = pose(read_clip(tmp_path / "out" / "clip.npz", "clip"), REST)[1]
+    assert np.abs(places[:, 15, 2] - places[:, 0, 2]).max() < 0.2  # the head is as high as the pelvis
+    assert verify(tmp_path / "clip.bvh", up="y").mm.value < 1
+
+
+def test_faults_are_kept_in_the_record(tmp_path: Path) -> None:
+    chosen, walk = load_skeleton("cmu_daz"), synthesize_clip("walking", 1, seconds=2.0)
+    write(tmp_path, performed(chosen, replace(walk, trans=walk.trans + np.array([0, 0, 2.0]))).text())
+    report = import_folder(tmp_path / "clip.bvh", tmp_path / "out", ImportSettings(floor=NONE))
+    assert report.clips[0].faults[0].startswith("the feet stay 2.")
+    record = json.loads((tmp_path / "out" / "import.json").read_text())
+    assert record["clips"][0]["faults"] == list(report.clips[0].faults)
+
+
+def test_clips_with_faults_are_left_out_where_only_sound_ones_are_wanted(tmp_path: Path) -> None:
+    chosen, walk = load_skeleton("cmu_daz"), synthesize_clip("walking", 1, seconds=2.0)
+    write(tmp_path / "in", performed(chosen, walk).text(), "sound.bvh")
+    hanging = replace(walk, trans=walk.trans + np.array([0, 0, 2.0]))
+    write(tmp_path / "in", performed(chosen, hanging).text(), "hanging.bvh")
+    report = import_folder(tmp_path / "in", tmp_path / "out", ImportSettings(floor=NONE, sound=True))
+    assert [clip.clip for clip in report.clips] == ["sound.npz"]
+    assert report.skipped[0].file == "hanging.bvh"
+    assert "the feet stay 2." in report.skipped[0].reason
+    assert not (tmp_path / "out" / "hanging.npz").exists()

@@ -1,0 +1,73 @@
+"""Sheets of clips: which clips, how many panels, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from memmlp.common.errors import InputError
+from memmlp.motion.formats.npz import write_clip
+from memmlp.motion.synthetic import synthesize_clip
+from memmlp.render.clip_sheet import COLUMNS, HEIGHT, LABEL, WIDTH, clip_sheet, some_clips
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    clip = synthesize_clip("walking", 1, seconds=0.5)
+    for number in range(7):
+        (tmp_path / "clips" / f"{number}").mkdir(parents=True)
+        write_clip(tmp_path / "clips" / f"{number}" / "walk.npz", clip)
+    return tmp_path / "clips"
+
+
+@pytest.mark.parametrize(("count", "numbers"), [(1, [0]), (3, [0, 3, 6]), (7, range(7)), (99, range(7))])
+def test_clips_are_evenly_spread(folder: Path, count: int, numbers: list[int]):
+    clips, skipped, total = some_clips(folder, count)
+    assert [name for name, _ in clips] == [f"{number}/walk" for number in numbers]
+    assert (skipped, total) == ([], 7)
+    assert clips[0][1].shape[1:] == (22, 3)
+
+
+def test_one_clip(folder: Path):
+    clips, _, total = some_clips(folder / "2" / "walk.npz", 12)
+    assert ([name for name, _ in clips], total) == (["walk"], 1)
+
+
+def test_bad_files_are_named(folder: Path):
+    (folder / "0" / "walk.npz").write_bytes(b"no")
+    clips, skipped, _ = some_clips(folder, 7)
+    assert len(clips) == 6
+    assert [file.file for file in skipped] == ["0/walk.npz"]
+    assert str(folder) not in skipped[0].reason
+
+
+def test_nothing_to_show_is_refused(folder: Path, tmp_path: Path):
+    (folder / "0" / "walk.npz").write_bytes(b"no")
+    with pytest.raises(InputError, match=r"no clip in 1 files.*0/walk\.npz"):
+        some_clips(folder, 1)
+    with pytest.raises(InputError, match="No such file"):
+        some_clips(tmp_path / "none.npz", 1)
+
+
+@pytest.mark.slow
+def test_a_sheet_has_a_row_for_every_few_clips(folder: Path):
+    clips = some_clips(folder, 5)[0]
+    sheet = clip_sheet(clips)
+    assert sheet.shape == (2 * (HEIGHT + LABEL), COLUMNS * WIDTH, 3)
+    blank = [
+        (sheet[HEIGHT + 2 * LABEL :, left : left + WIDTH] == 255).all()
+        for left in range(0, sheet.shape[1], WIDTH)
+    ]
+    assert blank == [False] * 3 + [True] * 9  # the fifth clip has three panels in the second row
+
+
+def test_panels_show_different_moments(folder: Path):
+    (name, joints), *_ = some_clips(folder, 1)[0]
+    lifted = joints + np.linspace(0, 0.4, len(joints))[:, None, None] * [0.0, 0.0, 1.0]
+    sheet = clip_sheet([(name, lifted)])[LABEL:]
+    tops = [
+        np.nonzero((sheet[:, left : left + WIDTH] < 200).any((1, 2)))[0][0] for left in (0, WIDTH, 2 * WIDTH)
+    ]
+    assert tops[0] > tops[1] > tops[2]

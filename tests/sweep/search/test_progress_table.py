@@ -1,0 +1,45 @@
+"""The board of a search says on which devices its runs are worked on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from fake_search import director, finish, open_study
+from rich.console import Console
+
+from memmlp.sweep.search.progress_table import line, render
+
+CARD = {"device": "cuda", "gpu": "A card", "gpu_index": "1"}
+
+
+def drawn(study, folder: Path) -> str:
+    console = Console(width=120)
+    with console.capture() as said:
+        console.print(render(study, folder))
+    return said.get()
+
+
+def test_the_devices_of_runs_under_way_are_counted(tmp_path: Path):
+    study = open_study(tmp_path)
+    plan = director(study, tmp_path).look(3)
+    assert "running on" not in drawn(study, tmp_path)
+    runs = [plan.run_of(task) for task in plan.tasks]
+    for run, task, facts in zip(runs, plan.tasks, (CARD, {"device": "cpu"}, CARD), strict=True):
+        run.begin("memmlp", task.config, data="d", upstream=None)
+        run.write_manifest(facts)
+    with runs[0].lock(), runs[1].lock(), runs[2].lock():
+        assert "running on GPU 1 (A card): 2, cpu: 1" in drawn(study, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("facts", "said"), [(CARD, "complete on GPU 1 (A card): "), ({"device": None}, "complete: ")]
+)
+def test_a_trial_that_ended_says_on_which_device(tmp_path: Path, facts: dict, said: str):
+    study = open_study(tmp_path)
+    one = director(study, tmp_path)
+    plan = one.look(1)
+    finish(plan)
+    plan.run_of(plan.tasks[0]).write_manifest(facts)
+    one.look(1)
+    assert f"; trial 0 {said}" in line(study.search, study.trials[0], 1, tmp_path)

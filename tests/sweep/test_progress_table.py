@@ -1,0 +1,73 @@
+"""The board says on which devices runs are worked on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from memmlp.runs.run import Run
+from memmlp.sweep.plan import Entry, Plan, RunTask
+from memmlp.sweep.progress_table import device_name, progress_text, render
+
+CARD = {"device": "cuda", "gpu": "A card", "gpu_index": "1"}
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> Plan:
+    """Three runs on a GPU and one on the CPU, of which the last one is done."""
+    tasks = tuple(RunTask(str(number) * 16, "memmlp", {"optim": {"steps": 9}}) for number in range(4))
+    made = Plan("trial", tmp_path, tuple(Entry("arm", n, t.id) for n, t in enumerate(tasks)), tasks)
+    for task, facts in zip(tasks, (CARD, CARD, {"device": "cpu", "gpu": None}, CARD), strict=True):
+        made.run_of(task).folder.mkdir(parents=True)
+        made.run_of(task).write_manifest(facts)
+    return made
+
+
+def test_running_runs_are_counted_by_device(plan: Plan, capsys: pytest.CaptureFixture):
+    states = dict(zip([task.key for task in plan.tasks], ["running"] * 3 + ["done"], strict=True))
+    Console(width=200).print(render(plan, states))
+    assert "running on GPU 1 (A card): 2, cpu: 1" in capsys.readouterr().out
+    Console(width=200).print(render(plan, dict.fromkeys(states, "done")))
+    assert "running on" not in capsys.readouterr().out
+
+
+def test_what_a_finished_cell_shows_is_said_below(
+    plan: Plan, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    states = dict.fromkeys([task.key for task in plan.tasks], "done")
+    Console(width=200).print(render(plan, states))
+    assert "MPJPE" not in capsys.readouterr().out
+    monkeypatch.setattr(Run, "results", {"stream": {"rotation": {"MPJPE": 4.321}}})
+    Console(width=200).print(render(plan, states))
+    said = capsys.readouterr().out
+    assert "4.32 cm" in said
+    assert "cm: done; MPJPE in stream mode of the rotation branch" in said
+
+
+def test_a_run_whose_training_is_over_shows_its_stage(plan: Plan):
+    run = plan.run_of(plan.tasks[0])
+    with run.lock():
+        assert progress_text(run, 9) == "starting"
+        run.attempt("deployment")
+        assert progress_text(run, 9) == "exporting"
+
+
+def test_names(plan: Plan):
+    assert [device_name(plan.run_of(task)) for task in plan.tasks[1:3]] == ["GPU 1 (A card)", "cpu"]
+    assert device_name(plan.run_of(RunTask("f" * 16, "memmlp", {}))) == ""
+
+
+def test_a_name_is_not_broken_into_letters_where_there_are_many_seeds(
+    plan: Plan, capsys: pytest.CaptureFixture
+):
+    """Seen with five seeds at 80 columns: an arm's name had three letters a line."""
+    only = plan.entries[0]
+    wide = replace(
+        plan, entries=tuple(replace(only, label="AvatarPoser + refiner", seed=n) for n in range(5))
+    )
+    states = dict.fromkeys([task.key for task in plan.tasks], "trained")
+    Console(width=80).print(render(wide, states))
+    assert "AvatarPoser +" in capsys.readouterr().out
