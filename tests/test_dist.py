@@ -101,7 +101,7 @@ def test_the_wheel_has_what_the_commands_need(wheel: Path):
     package = {path.relative_to(ROOT) for path in (ROOT / "memmlp").rglob("*") if path.is_file()}
     kept = {path.as_posix() for path in package if "__pycache__" not in path.parts}
     assert {
-        "memmlp/live/player/page/index.html",
+        "memmlp/live/session/page/index.html",
         "memmlp/report/ui/page/index.html",
         "memmlp/py.typed",
     } <= kept

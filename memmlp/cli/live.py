@@ -25,8 +25,8 @@ from memmlp.cli.options import (
 if TYPE_CHECKING:
     from memmlp.live.calibration_file import Calibration
     from memmlp.live.outputs.output import Output, Outputs
-    from memmlp.live.player.server import File
-    from memmlp.live.player.sources import ClipSource, TrackedClip, TrackerSource
+    from memmlp.live.session.server import File
+    from memmlp.live.session.sources import ClipSource, TrackedClip, TrackerSource
     from memmlp.live.spaces import SpaceName
     from memmlp.live.stream import Stream
 
@@ -178,7 +178,7 @@ def check_options(given: InputOptions, shown: ShowOptions, send: bool) -> None:
     """Raise InputError for options that contradict each other, or need what is not installed."""
     from memmlp.common.errors import InputError
     from memmlp.common.page_access import check_token
-    from memmlp.live.player.packets import needs_osc
+    from memmlp.live.session.packets import needs_osc
 
     ports = [number for number in (given.udp, given.osc) if number is not None]
     if len(ports) > 1 or (ports and given.clip is not None and not send):
@@ -207,8 +207,8 @@ def check_options(given: InputOptions, shown: ShowOptions, send: bool) -> None:
 
 def source_of(given: InputOptions) -> TrackerSource:
     """Return the source of the poses: packets at a port, or a clip that is repeated."""
-    from memmlp.live.player.packets import from_json, from_osc
-    from memmlp.live.player.sources import PacketSource
+    from memmlp.live.session.packets import from_json, from_osc
+    from memmlp.live.session.sources import PacketSource
 
     if given.udp is not None:
         return PacketSource("UDP", given.udp, from_json, given.space, given.senders, note)
@@ -219,7 +219,7 @@ def source_of(given: InputOptions) -> TrackerSource:
 
 def clip_source(given: InputOptions, rounds: float = float("inf")) -> ClipSource:
     """Return a source that plays the clip in real time, `rounds` times."""
-    from memmlp.live.player.sources import ClipSource
+    from memmlp.live.session.sources import ClipSource
 
     return ClipSource(load_clip(given), given.hz, rounds)
 
@@ -232,7 +232,7 @@ def load_clip(given: InputOptions) -> TrackedClip:
     """
     from memmlp.common.errors import InputError
     from memmlp.live.exported import ExportedNetwork
-    from memmlp.live.player.sources import TrackedClip, npz_frames
+    from memmlp.live.session.sources import TrackedClip, npz_frames
 
     if given.clip is not None and given.clip.endswith(".npz"):
         body = ExportedNetwork(network_file(given)[0]).skeleton.rest
@@ -250,8 +250,8 @@ def load_clip(given: InputOptions) -> TrackedClip:
 
 def send_clip(given: InputOptions) -> None:
     """Send the clip's packets once to the port of the options, in the frame of reference of --space."""
-    from memmlp.live.player.packets import to_json, to_osc
-    from memmlp.live.player.sources import send
+    from memmlp.live.session.packets import to_json, to_osc
+    from memmlp.live.session.sources import send
     from memmlp.live.spaces import space_of
 
     source = clip_source(given, rounds=1)
@@ -267,9 +267,9 @@ def serve(given: InputOptions, shown: ShowOptions) -> None:
     import webbrowser
 
     from memmlp.common.termination import closed_in_peace
-    from memmlp.live.player.play import greeting, play, with_avatar
-    from memmlp.live.player.server import Hub, LiveServer
-    from memmlp.live.player.wearer_fitting import Fitting
+    from memmlp.live.session.play import greeting, play, with_avatar
+    from memmlp.live.session.server import Hub, LiveServer
+    from memmlp.live.session.wearer_fitting import Fitting
 
     with contextlib.closing(source_of(given)) as source:
         stream, name = open_stream(given, source.space, shown)
@@ -349,11 +349,11 @@ def outputs_of(shown: ShowOptions, stream: Stream) -> Outputs:
 
 def page_files(avatar: str | None, stream: Stream) -> Mapping[str, File]:
     """Return the files of the page, with those of an avatar where one is asked for."""
-    from memmlp.live.player.server import FILES
+    from memmlp.live.session.server import FILES
 
     if avatar is None:
         return FILES
-    from memmlp.live.player.avatar_files import avatar_files, mannequin_vrm, read_vrm
+    from memmlp.live.session.avatar_files import avatar_files, mannequin_vrm, read_vrm
 
     return avatar_files(mannequin_vrm(stream.rest) if avatar == OWN else read_vrm(Path(avatar)))
 

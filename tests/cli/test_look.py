@@ -21,8 +21,8 @@ from conftest import Memmlp, one_line
 from PIL import Image
 from processes import PATIENCE, started
 
-from memmlp.live.player.packets import Packet
-from memmlp.live.player.sources import PacketSource
+from memmlp.live.session.packets import Packet
+from memmlp.live.session.sources import PacketSource
 from memmlp.runs.lookup import list_runs
 from memmlp.runs.run import Run
 

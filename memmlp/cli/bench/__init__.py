@@ -13,7 +13,7 @@ from memmlp.cli.bench.stream_evaluation import stream
 from memmlp.cli.bench.time_to_error import train
 from memmlp.cli.bench.tracking import tracking
 from memmlp.cli.bench.ui_page import ui
-from memmlp.cli.bench.verdict_simulation import calibration
+from memmlp.cli.bench.verdict_simulation import verdicts
 
 
 @click.group("bench")
@@ -22,6 +22,6 @@ def bench() -> None:
 
 
 for command in (
-    prepare, stream, train, latency, live_frame, soak, tracking, chaos, chaos_tune, calibration, ui,
+    prepare, stream, train, latency, live_frame, soak, tracking, chaos, chaos_tune, verdicts, ui,
 ):  # fmt: skip
     bench.add_command(command)

@@ -1,4 +1,4 @@
-"""`memmlp bench calibration`: simulate tables to see whether the verdicts' promises are kept."""
+"""`memmlp bench verdicts`: simulate tables to see whether the verdicts' promises are kept."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def markdown(rows: Sequence[dict[str, Any]], seed: int) -> str:
     return "\n".join([text, "", *(f"- {line}" for line in remarks(rows, seed))]) + "\n"
 
 
-@click.command("calibration")
+@click.command("verdicts")
 @click.option(
     "--tables",
     default=5000,
@@ -100,7 +100,7 @@ def markdown(rows: Sequence[dict[str, Any]], seed: int) -> str:
     "--json", "file", type=click.Path(path_type=Path), help="File to write all rates into, as JSON."
 )
 @click.option("--markdown", "as_markdown", is_flag=True, help="Print the table as Markdown.")
-def calibration(tables: int, quick: bool, seed: int, file: Path | None, as_markdown: bool) -> None:
+def verdicts(tables: int, quick: bool, seed: int, file: Path | None, as_markdown: bool) -> None:
     """Simulate how often verdicts are wrong.
 
     The simulation covers a grid of seeds, clips, groups and shares of variance. Exits with 1 where a cell

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from memmlp.live.player.sources import TrackedClip
 from memmlp.live.rotations import matrix_to_quaternion
+from memmlp.live.session.sources import TrackedClip
 from memmlp.live.spaces import SPACES
 from memmlp.motion.body import FPS
 

@@ -20,7 +20,7 @@ from memmlp.common.errors import InputError
 from memmlp.common.files import file_digest, now, read_json
 from memmlp.common.lease_fences import publish, temporary
 from memmlp.deploy.latency import yardstick
-from memmlp.live.player.play import TOP
+from memmlp.live.session.play import TOP
 from memmlp.live.web.clips import SiteClip, write_clips
 from memmlp.live.web.networks import SiteNetwork, Writer
 from memmlp.live.web.packages import write_packages
@@ -29,7 +29,7 @@ from memmlp.motion.limb_shapes import LIMBS
 from memmlp.render.error_colours import HEAT
 
 SHARED = {
-    "memmlp.live.player": ("stage.js", "history.js"),
+    "memmlp.live.session": ("stage.js", "history.js"),
     "memmlp.common": ("theme.js", "dom.js", "style.css"),
 }
 """Files of other rooms' pages that a site has, too."""

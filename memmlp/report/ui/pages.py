@@ -12,7 +12,7 @@ from importlib import resources
 from typing import Any
 
 TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css"}
-HERE, PLAYER, SHARED = "memmlp.report.ui", "memmlp.live.player", "memmlp.common"
+HERE, PLAYER, SHARED = "memmlp.report.ui", "memmlp.live.session", "memmlp.common"
 MODULES = {
     **{name: HERE for name in (
         "main.js", "store.js", "format.js", "charts.js", "runs.js", "run.js", "sweeps.js",

@@ -11,10 +11,10 @@ import pytest
 from chromium import Browser
 from processes import PATIENCE, until
 
-from memmlp.live.player.play import greeting, play
-from memmlp.live.player.server import Hub, LiveServer
-from memmlp.live.player.sources import ClipSource, TrackedClip
-from memmlp.live.player.wearer_fitting import Fitting
+from memmlp.live.session.play import greeting, play
+from memmlp.live.session.server import Hub, LiveServer
+from memmlp.live.session.sources import ClipSource, TrackedClip
+from memmlp.live.session.wearer_fitting import Fitting
 from memmlp.live.stream import Stream
 
 pytestmark = pytest.mark.slow
@@ -99,7 +99,7 @@ class Worn(ClipSource):
 def test_the_wearer_fits_the_stream_from_the_page(
     browser: Browser, network: Path, clip: TrackedClip, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("memmlp.live.player.wearer_fitting.FAR", 0.0)  # nobody stands so well in a T-pose
+    monkeypatch.setattr("memmlp.live.session.wearer_fitting.FAR", 0.0)  # nobody stands so well in a T-pose
     stopped, source, stream = threading.Event(), Worn(clip, 60), Stream(network)
     hub = Hub(greeting(source, "tiny"))
     fitting = Fitting(stream, "amass", None, hub.tell, clock=lambda: 0.0)  # a countdown ends when cancelled

@@ -13,10 +13,10 @@ import pytest
 from processes import PATIENCE
 
 from memmlp.common.errors import InputError
-from memmlp.live.player import server as module
-from memmlp.live.player.play import JUMPS, Jumps, greeting, play
-from memmlp.live.player.server import FILES, Hub, LiveServer
-from memmlp.live.player.sources import ClipSource, SourceSample, TrackedClip
+from memmlp.live.session import server as module
+from memmlp.live.session.play import JUMPS, Jumps, greeting, play
+from memmlp.live.session.server import FILES, Hub, LiveServer
+from memmlp.live.session.sources import ClipSource, SourceSample, TrackedClip
 from memmlp.live.stream import Stream
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.live.calibration_file import Calibration, save_calibration
-from memmlp.live.player.packets import TrackerPoses
+from memmlp.live.session.packets import TrackerPoses
 from memmlp.live.spaces import SpaceName
 from memmlp.live.stream import Offsets, Stream
 from memmlp.live.tracker_frames import TRACKERS

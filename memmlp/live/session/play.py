@@ -11,9 +11,9 @@ import numpy as np
 
 from memmlp.common.errors import InputError
 from memmlp.live.outputs.output import Outputs
-from memmlp.live.player.sources import SourceSample, TrackerSource
-from memmlp.live.player.wearer_fitting import Fitting, hips_height
 from memmlp.live.rotations import matrix_to_quaternion
+from memmlp.live.session.sources import SourceSample, TrackerSource
+from memmlp.live.session.wearer_fitting import Fitting, hips_height
 from memmlp.live.spaces import SPACES, Space
 from memmlp.live.stream import Pose, Stream
 from memmlp.live.tracker_frames import GAP

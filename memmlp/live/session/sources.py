@@ -14,8 +14,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from memmlp.common.errors import InputError
-from memmlp.live.player.packets import Packet, Parse, TrackerPoses
 from memmlp.live.rotations import matrix_to_quaternion, quaternion_to_matrix, sixd_to_matrix
+from memmlp.live.session.packets import Packet, Parse, TrackerPoses
 from memmlp.live.spaces import Space, SpaceName
 from memmlp.live.tracker_frames import TrackerSample, between
 from memmlp.motion.body import (

@@ -13,7 +13,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from memmlp.common.errors import InputError
-from memmlp.live.player.packets import Packet, from_json, from_osc, needs_osc, to_json, to_osc
+from memmlp.live.session.packets import Packet, from_json, from_osc, needs_osc, to_json, to_osc
 
 KINDS = {"json": (to_json, from_json), "osc": (to_osc, from_osc)}
 POSE = (np.array([0.5, -1.25, 1.75]), np.array([0.5, 0.5, -0.5, 0.5]))

@@ -11,9 +11,9 @@ import pytest
 from processes import PATIENCE
 
 from memmlp.common.errors import InputError
-from memmlp.live.player.packets import from_json, from_osc, to_json, to_osc
-from memmlp.live.player.sources import HOST, PAUSE, ClipSource, PacketSource, TrackedClip, send
 from memmlp.live.rotations import quaternion_to_matrix
+from memmlp.live.session.packets import from_json, from_osc, to_json, to_osc
+from memmlp.live.session.sources import HOST, PAUSE, ClipSource, PacketSource, TrackedClip, send
 from memmlp.live.spaces import SPACES
 
 PACKETS = {"udp": (to_json, from_json), "osc": (to_osc, from_osc)}

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 from memmlp.common.errors import InputError
 from memmlp.common.page_access import Access
-from memmlp.live.player.sources import EVERYWHERE, HOST
+from memmlp.live.session.sources import EVERYWHERE, HOST
 
 QUEUED = 240  # the most frames that wait for a watcher; beyond, its oldest are dropped
 QUIET = 2.0  # seconds without a frame after which a comment shows that the connection lives
@@ -49,7 +49,7 @@ class File(NamedTuple):
 
 def read_page(name: str) -> bytes:
     """Return the content of a file of the page that comes with memmlp."""
-    return resources.files("memmlp.live.player").joinpath("page", name).read_bytes()
+    return resources.files("memmlp.live.session").joinpath("page", name).read_bytes()
 
 
 FILES: dict[str, File] = {

@@ -11,8 +11,8 @@ import pytest
 
 from memmlp.common.errors import InputError
 from memmlp.live.calibration_file import read_calibration
-from memmlp.live.player.wearer_fitting import COUNTDOWN, Fitting, read_order
 from memmlp.live.rotations import matrix_to_quaternion
+from memmlp.live.session.wearer_fitting import COUNTDOWN, Fitting, read_order
 from memmlp.live.stream import Stream
 from memmlp.live.tracker_frames import t_pose
 

@@ -1,4 +1,4 @@
-"""A tiny network as an ONNX file, and a clip, for the tests of memmlp.live.player."""
+"""A tiny network as an ONNX file, and a clip, for the tests of memmlp.live.session."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import tiny
 import wearer
 
 from memmlp.deploy.export import export
-from memmlp.live.player.sources import TrackedClip
+from memmlp.live.session.sources import TrackedClip
 from memmlp.networks.memory import NoMemory
 from memmlp.networks.streaming import streaming
 
