@@ -12,10 +12,10 @@ from rich.table import Table
 from memmlp.evaluation.units import UNITS
 from memmlp.pipeline.run_stages import Outcome
 from memmlp.runs.run import Run
+from memmlp.sweep.spec import BRANCHES
 from memmlp.tables.measured_run import Errors, as_deployed, deployed_precision, load
 
 STAGES = ("training", "evaluation", "deployment")
-BRANCHES = ("rotation", "position", "combined")
 COLUMNS = [(mode, branch) for mode in ("stream", "window") for branch in BRANCHES]
 
 

@@ -159,20 +159,20 @@ def build_architecture(cfg: DictConfig) -> Architecture:
     network = build_network(cfg)
     if cfg.refiner is None:
         return network
-    space = {name: getattr(network, name) for name in ("coordinates", "normalize", "vqvae")}
-    return RefinedArchitecture(**space, network=network, refiner=built(cfg.refiner))
+    frame = {name: getattr(network, name) for name in ("coordinates", "normalize", "vqvae")}
+    return RefinedArchitecture(**frame, network=network, refiner=built(cfg.refiner))
 
 
 def build_network(cfg: DictConfig) -> Architecture:
     """Build the architecture of a checked config's network, without a refiner."""
-    space = {"coordinates": build_coordinates(cfg.frame.coordinates), "normalize": cfg.frame.normalize}
+    frame = {"coordinates": build_coordinates(cfg.frame.coordinates), "normalize": cfg.frame.normalize}
     vqvae = partial(VQVAE, **{name: cfg.vqvae[name] for name in VQVAE_SETTINGS})
     if "_target_" in cfg.model:
         family = PlainArchitecture if cfg.upstream is None else PartedArchitecture
-        return family(**space, vqvae=vqvae, network=built(cfg.model))
+        return family(**frame, vqvae=vqvae, network=built(cfg.model))
     memory, kind = built(cfg.memory), memory_class(cfg)
     return MemMLPArchitecture(
-        **space,
+        **frame,
         vqvae=vqvae,
         frames=cfg.model.frames,
         hidden=cfg.model.width,

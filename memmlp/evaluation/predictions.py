@@ -25,7 +25,7 @@ from memmlp.motion.normalizer import Normalizer
 from memmlp.motion.preparing.cache import frame_blocks
 from memmlp.networks.motion_model import MotionModel
 
-BRANCHES = {"rotation": "predicted", "combined": "combined", "truth": "true"}
+KINDS_OF_POSES = {"rotation": "predicted", "combined": "combined", "truth": "true"}
 """Names of what can be made a clip -> the beginnings of its arrays' names (`prediction_arrays`)."""
 
 
@@ -99,7 +99,7 @@ class ClipPredictor:
     Attributes:
         model: the network.
         mode: "stream" or "window".
-        branch: of BRANCHES: the rotation branch with the head on its tracker, the result of the evaluation's
+        branch: of KINDS_OF_POSES: the rotation branch with the head on its tracker, the result of the evaluation's
             inverse kinematics, or the truth, which is what came in.
         evaluation: how the network is evaluated: batches, inverse kinematics, seed.
     """
@@ -127,7 +127,7 @@ class ClipPredictor:
 
     def _clip(self, name: str, arrays: Mapping[str, np.ndarray]) -> Clip:
         """Return the branch of `prediction_arrays` as a clip."""
-        kind = BRANCHES[self.branch]
+        kind = KINDS_OF_POSES[self.branch]
         return motion_clip(name, arrays[f"{kind}_rotations"], arrays[f"{kind}_positions"], self.rest)
 
     def export(self, plan: ExportPlan, *, strict: bool = False) -> ExportReport:

@@ -33,7 +33,7 @@ from memmlp.evaluation.units import HIGHER, UNITS
 
 SAMPLERS = ("tpe", "random", "grid")
 PRUNERS = ("median", "none")
-BRANCHES = ("rotation", "position")
+OBJECTIVE_BRANCHES = ("rotation", "position")
 KEYS = (
     "name", "base", "space", "objectives", "n_trials", "seeds", "sampler", "startup", "seed", "pruner",
     "prune_after", "storage",
@@ -265,11 +265,11 @@ def _objective(text: str) -> Objective:
 def _term(part: str, text: str) -> tuple[float, str]:
     """Parse a term into its weight and metric; without a branch it is the rotation branch's."""
     match = re.fullmatch(r"(?:(\d+\.?\d*(?:[eE][+-]?\d+)?)\s*\*\s*)?(?:(\w+)\s+)??(\w+(?: PE)?)", part)
-    branch, metric = (match[2] or BRANCHES[0], match[3]) if match else ("", "")
-    if match is None or metric not in UNITS or branch not in BRANCHES:
+    branch, metric = (match[2] or OBJECTIVE_BRANCHES[0], match[3]) if match else ("", "")
+    if match is None or metric not in UNITS or branch not in OBJECTIVE_BRANCHES:
         names = ", ".join(UNITS)
         raise InputError(
-            f"search.objectives: '{text}'; allowed is a sum of [WEIGHT*][{' or '.join(BRANCHES)}] METRIC "
+            f"search.objectives: '{text}'; allowed is a sum of [WEIGHT*][{' or '.join(OBJECTIVE_BRANCHES)}] METRIC "
             f"with a metric of {names}"
         )
     if metric in HIGHER:
