@@ -99,8 +99,8 @@ class ClipPredictor:
     Attributes:
         model: the network.
         mode: "stream" or "window".
-        branch: of KINDS_OF_POSES: the rotation branch with the head on its tracker, the result of the evaluation's
-            inverse kinematics, or the truth, which is what came in.
+        branch: of KINDS_OF_POSES: the rotation branch with the head on its tracker, the result of the
+            evaluation's inverse kinematics, or the truth, which is what came in.
         evaluation: how the network is evaluated: batches, inverse kinematics, seed.
     """
 

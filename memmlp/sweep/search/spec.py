@@ -267,9 +267,9 @@ def _term(part: str, text: str) -> tuple[float, str]:
     match = re.fullmatch(r"(?:(\d+\.?\d*(?:[eE][+-]?\d+)?)\s*\*\s*)?(?:(\w+)\s+)??(\w+(?: PE)?)", part)
     branch, metric = (match[2] or OBJECTIVE_BRANCHES[0], match[3]) if match else ("", "")
     if match is None or metric not in UNITS or branch not in OBJECTIVE_BRANCHES:
-        names = ", ".join(UNITS)
+        names, branches = ", ".join(UNITS), " or ".join(OBJECTIVE_BRANCHES)
         raise InputError(
-            f"search.objectives: '{text}'; allowed is a sum of [WEIGHT*][{' or '.join(OBJECTIVE_BRANCHES)}] METRIC "
+            f"search.objectives: '{text}'; allowed is a sum of [WEIGHT*][{branches}] METRIC "
             f"with a metric of {names}"
         )
     if metric in HIGHER:
