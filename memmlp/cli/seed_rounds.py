@@ -1,4 +1,4 @@
-"""`memmlp sweep --until-decided`: seeds are added in rounds, for the arms whose verdicts are open."""
+"""Seeds in rounds for arms with open verdicts: `memmlp sweep --until-decided`, and tables of such sweeps."""
 
 from __future__ import annotations
 

@@ -118,11 +118,11 @@ def run_training(cfg: DictConfig) -> Outcome | None:
 
     from memmlp.cli.train_summary import show
     from memmlp.config.build import build_experiment
-    from memmlp.pipeline.run_distributed import run_distributed
+    from memmlp.pipeline.run_in_processes import run_in_processes
 
     check(cfg)
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
-    if outcome := run_distributed(build_experiment(cfg)):
+    if outcome := run_in_processes(build_experiment(cfg)):
         show(outcome)
     return outcome

@@ -13,7 +13,7 @@ from memmlp.config.compose import composed
 from memmlp.config.plan_sweep import tasks_of
 from memmlp.config.worker_process import check_identity
 from memmlp.networks.refiner import Refined
-from memmlp.pipeline.run_distributed import run_distributed
+from memmlp.pipeline.run_in_processes import run_in_processes
 from memmlp.runs.lookup import list_runs
 
 SHORT = [
@@ -80,4 +80,4 @@ def test_a_sweep_trains_what_is_upstream_first():
 def test_several_processes_are_refused(monkeypatch):
     monkeypatch.setattr(distributed, "size", lambda: 2)
     with pytest.raises(InputError, match="refiner: several processes"):
-        run_distributed(experiment("refiner=sage"))
+        run_in_processes(experiment("refiner=sage"))

@@ -1,4 +1,4 @@
-"""One run trained by several processes that torchrun started: the first leads, the others train along."""
+"""A run brought to its end in this process alone, or in those of torchrun, of which the first leads."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from memmlp.pipeline.run_stages import Outcome, run_experiment
 from memmlp.runs.run import Run
 
 
-def run_distributed(experiment: Experiment) -> Outcome | None:
+def run_in_processes(experiment: Experiment) -> Outcome | None:
     """Bring the experiment's run to its end; without torchrun that is `run_experiment`.
 
     The first process holds the run's lock, prepares the data, writes, evaluates and deploys. It tells the
