@@ -98,7 +98,7 @@ class Recall(nn.Module):
         """Join the blocks' feature modules into one that computes a frame's features for all of them."""
 
     def forward(self, past: Past | Recurred | None) -> tuple[Pieces, Pieces]:
-        """Return each block's contribution (1, d): for the entering frame, and for frames before the first."""
+        """Return each block's contribution (1, d): of the entering frame, and of frames before the first."""
         if not self.parts:
             return (), ()
         z = self.feature(past)
