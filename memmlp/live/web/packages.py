@@ -1,4 +1,4 @@
-"""The files of npm packages that a site has: onnxruntime-web and three.js, of pinned versions."""
+"""The files of npm packages that a site contains: onnxruntime-web and three.js, in pinned versions."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def write_packages(folder: Path, webgpu: bool) -> dict[str, str]:
     """Write the packages' files into a site's folder, and return the versions by name.
 
     Raises:
-        InputError: where a package cannot be had.
+        InputError: if a package can't be downloaded.
     """
     _write(folder, THREE, DRAWING)
     _write(folder, ONNXRUNTIME_WEB, {**WASM, **WEBGPU} if webgpu else WASM)
