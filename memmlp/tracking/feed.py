@@ -122,7 +122,7 @@ class Feed:
             warn(f"the {event} of {folder.name} is not shown: its follower does not listen")
 
     def wait(self, folder: Path, seconds: float) -> bool:
-        """Wait, at most `seconds`, until all trackers have shown or missed a run's end; return if they have."""
+        """Wait, at most `seconds`, until all trackers have shown or missed a run's end; return whether so."""
         wanted = [(str(folder.absolute()), name) for name in self.names]
         with self.answered:
             return self.answered.wait_for(
