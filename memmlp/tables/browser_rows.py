@@ -127,7 +127,7 @@ def _kind(row: Mapping[str, Any]) -> tuple[str, str, str]:
 
 
 def _label(measured: BrowserBench, row: Mapping[str, Any]) -> str:
-    """Name a row, with its network's size, since a site's networks may differ in size from the table's own."""
+    """Name a row, with its network's size, as a site's networks may differ in size from the table's own."""
     graph, size = GRAPHS.get(row["graph"], row["graph"]), row["parameters"] / 1e6
     how = f"{graph}, {row['precision']}, {row['backend']}"
     return f"{row['network']} of {size:.3g} M parameters, {how}: {measured.name}"
