@@ -262,8 +262,7 @@ class Words:
         return self.verdict(name, row.label, mode, metric) if printed else MISSING
 
     def way(self, name: str, mode: str = "stream") -> str:
-        """Return a table of how each step in a chain of arms changes each metric, with its share of the
-        whole.
+        """Return a table of how each step in a chain of arms changes each metric, and its share of the whole.
 
         In a chain, each arm is the control of the next, and the table's control is the last arm; without a
         chain the text is empty. Shares are parts of the difference between the two ends of the chain, and are
@@ -339,7 +338,7 @@ def _share(cell: Cell, way: Cell, metric: str) -> str:
 
 
 def _whole(cell: Cell) -> str:
-    """Return the change from an arm to its control: the difference, reversed, its verdict, and the paper's."""
+    """Return the change from an arm to its control: the reversed difference, its verdict, and the paper's."""
     if cell.effect is None:
         return MISSING
     verdict = TURNED.get(cell.effect.verdict, cell.effect.verdict) if cell.effect.verdict else "no verdict"

@@ -72,7 +72,7 @@ class Sweeps:
         return [plan for _, plan in sorted(found.values(), key=lambda one: -one[0])]
 
     def stamp(self) -> str:
-        """Return a text that changes when a sweep appears, goes, changes, is planned anew, or takes a look."""
+        """Return a text that changes when a sweep appears, goes, changes, is planned anew, or has a look."""
         found = [(path, seen) for path, (seen, _) in sorted(self.plans.items())]
         beside = [[_changed(path.with_name(name)) for name in (SWEEP_FILE, ROUNDS_FILE)] for path, _ in found]
         return repr([(str(path), seen, *others) for (path, seen), others in zip(found, beside, strict=True)])
