@@ -247,7 +247,7 @@ class Lock:
 
 
 def _open(claim: Claim | None, idle: float) -> bool:
-    """Return whether only waiting can tell if the claim's owner lives, after `idle` seconds without a sign."""
+    """Return whether only waiting can tell if the claim's owner lives, after `idle` seconds without sign."""
     return claim is not None and not claim.free and claim.lives is None and idle <= LEASE
 
 

@@ -107,7 +107,7 @@ class Claims:
         return self.folder / f"{stem}claim.lease-{number}.{uuid.uuid4().hex[:12]}.tmp"
 
     def remove_below(self, number: int) -> None:
-        """Remove superseded claims in ascending order, so that the last one is valid even if it is cut short."""
+        """Remove superseded claims in ascending order: if cut short, it leaves no earlier one as the last."""
         for old in self.numbers():
             if old < number:
                 self.path(old).unlink(missing_ok=True)
