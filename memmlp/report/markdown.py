@@ -262,7 +262,7 @@ class Words:
         return self.verdict(name, row.label, mode, metric) if printed else MISSING
 
     def way(self, name: str, mode: str = "stream") -> str:
-        """Return a table of how each step in a chain of arms changes each metric, and its share of the whole.
+        """Return a table of how each step in a chain of arms changes each metric, and its share of the total.
 
         In a chain, each arm is the control of the next, and the table's control is the last arm; without a
         chain the text is empty. Shares are parts of the difference between the two ends of the chain, and are
