@@ -89,7 +89,7 @@ def active() -> Mapping[str, Plugin]:
 
 
 def folders() -> list[tuple[str, Path]]:
-    """Return the folders of configs searched beside memmlp's: the packages', by name, and the user's own."""
+    """Return the folders of configs searched beside memmlp's: the packages', by name, and the user's."""
     own = _own.get()
     return [*_folders.items(), *([("command-line", own)] if own else [])]
 
@@ -245,7 +245,7 @@ def check_allowed(config: Mapping[str, Any], recorded: Mapping[str, Any], where:
 
 
 def _defined(path: str, name: str) -> bool:
-    """Return whether a package defines what is at a path, and does not just import it, as in mine.os.system."""
+    """Return whether a package defines what is at a path, and not only imports it, as mine.os.system."""
     from memmlp.config.instantiate import located
 
     module = getattr(located(path, name), "__module__", "") or ""
