@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from memmlp.networks.streaming import StreamingGraph
 
 TARGETS = ("onnxruntime", "web", "wasm", "webgpu", "webnn", "unity", "tensorrt", "coreml", "qnn")
-"""Those of memmlp.deploy.operator_support, without importing ONNX Runtime for the help."""
+"""The names in memmlp.deploy.operator_support, repeated so that the help need not import ONNX Runtime."""
 
 FULL_TOLERANCE = 0.1
-"""In metres and in entries of rotation matrices: what fp16 changes is far less, what is broken far more."""
+"""Limit in metres and entries of rotation matrices: fp16 changes far less, a broken file far more."""
 
 
 class Form(NamedTuple):

@@ -63,7 +63,7 @@ REFUSED = {
     errno.ENOSPC,
     errno.EDQUOT,
 }
-"""Errors of the operating system that blame a path which a person gave, or the disk that it is on."""
+"""Errors of the operating system that are about a path given by the user, or about its disk."""
 
 
 class Commands(click.Group):

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from memmlp.live.web.networks import SiteNetwork
 
 BASE = ("profile=paper", "model=avatar_poser")
-"""What the bench compares with: AvatarPoser of the paper's size, with random weights."""
+"""The network with which the bench compares: AvatarPoser in the paper's size, with random weights."""
 
 
 CALIBRATION = 2  # clips: int8's ranges do not matter for the time

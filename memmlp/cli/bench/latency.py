@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     import numpy as np
 
 Timed = tuple[str, str]
-"""A network of MODELS and a graph of VARIANTS."""
+"""A network in MODELS, and a variant in VARIANTS."""
 BASE = ("avatar_poser", "network")
-"""What all steps are compared with: AvatarPoser's network alone, a window of features in, rotations out."""
+"""The step with which all others are compared: AvatarPoser's network alone, from features to rotations."""
 POSE_BASE = ("avatar_poser", "naive")
-"""What all whole poses are compared with: AvatarPoser's."""
+"""The whole pose with which all others are compared: AvatarPoser's."""
 CHECK = ("avatar_poser", "torch")
 """The same layers, written and exported without this project."""
 
@@ -41,7 +41,7 @@ MODELS: dict[str, tuple[str, ...]] = {
     "recurrent_poser": ("model=recurrent_poser",),
 }
 SLOW = ("bodiffusion", "avatar_jlm", "manikin_l", "sage")
-"""Seconds a step, or gigabytes of files: timed where they are asked for."""
+"""Networks with seconds per step, or gigabytes of files, which are timed only if asked for."""
 LOWER = ("fp16", "int8", "int8_blocks")
 DEPLOYED = ("naive", "streaming", *LOWER)
 VARIANTS = ("network", *DEPLOYED)
