@@ -22,7 +22,7 @@ from memmlp.training.train_network import NetworkTraining
 from memmlp.training.training_flops import training_flops
 
 ELSEWHERE = ("seed", "data", "paths", "profile", "tracking", "evaluation", "export", "device", "threads")
-"""Groups and keys that a training's operations don't follow from."""
+"""Groups and keys on which a training's number of operations does not depend."""
 
 
 def flops_of(cfg: DictConfig) -> int:

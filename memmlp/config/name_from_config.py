@@ -24,7 +24,7 @@ from memmlp.runs.shown_name import kind_words
 MOST = 6  # words
 BETWEEN = " · "
 OF_MODELS = ("ema",)
-"""Keys of a profile that a model sets; another value is seen where it is read."""
+"""Keys of a profile that a model sets; other values show up in the groups that read them."""
 
 
 def readable_name(kind: str, config: Mapping[str, Any]) -> str:

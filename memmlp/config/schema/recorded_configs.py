@@ -13,7 +13,7 @@ from memmlp.config.schema.data import SynthDataConfig
 from memmlp.runs.identity import chosen
 
 RENAMED = {"tracker": "tracking"}
-"""The names of today for groups that runs of version 0.1 recorded under other names."""
+"""The present names of groups that runs of version 0.1 recorded under other names."""
 
 
 def restored(config: Mapping[str, Any]) -> DictConfig:
