@@ -52,7 +52,7 @@ INPUTS = ("tracker_positions", "tracker_rotations")
 OUTPUTS = ("rotations", "positions", "joints")
 UNIT = 1e-4  # how far a quaternion's norm may be from 1
 OWN = {"seen": (1, 1), "positions": (1, 3, 3), "rotations": (1, 3, 3, 3)}
-"""States beside the network's: whether there was a frame before, and its trackers in AMASS' world."""
+"""States besides the network's: whether there was an earlier frame, and its trackers in AMASS' world."""
 
 
 def as_they_are(rotations: Tensor) -> Tensor:
@@ -82,7 +82,7 @@ def quaternions(rotations: Tensor) -> Tensor:
 
 
 FORMATS: dict[str, Callable[[Tensor], Tensor]] = {"matrix": as_they_are, "quaternion": quaternions}
-"""How rotations come out, by name."""
+"""The formats of output rotations, by name."""
 
 
 class FullStep(nn.Module):

@@ -44,7 +44,7 @@ def matrix_to_quaternion(matrix: np.ndarray) -> np.ndarray:
 
 
 def turned_by(matrix: np.ndarray, share: np.ndarray | float) -> np.ndarray:
-    """Return rotations (n, 3, 3) about the same axes by a share, (n,) or a number, of their angles (0 to pi)."""
+    """Return rotations (n, 3, 3) about the same axes by a share, (n,) or one, of the angles (0 to pi)."""
     quaternion = matrix_to_quaternion(matrix)
     vector, w = quaternion[:, :3], quaternion[:, 3]
     sine = np.sqrt(np.einsum("ni,ni->n", vector, vector))

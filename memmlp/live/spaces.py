@@ -57,11 +57,11 @@ class Space:
         return self.world.T.astype(rotations.dtype) @ rotations * self.body.astype(rotations.dtype)
 
     def pose_in(self, local: np.ndarray) -> np.ndarray:
-        """Convert local rotations (..., J, 3, 3), the root's global, from this space to AMASS' conventions."""
+        """Convert local rotations (..., J, 3, 3), the root's global, from this space to AMASS' convention."""
         return self._posed(local, self.rotations_in(local[..., 0, :, :]))
 
     def pose_out(self, local: np.ndarray) -> np.ndarray:
-        """Convert local rotations (..., J, 3, 3), the root's global, from AMASS' conventions to this space."""
+        """Convert local rotations (..., J, 3, 3), the root's global, from AMASS' convention to this space."""
         return self._posed(local, self.rotations_out(local[..., 0, :, :]))
 
     def _posed(self, local: np.ndarray, root: np.ndarray) -> np.ndarray:

@@ -120,7 +120,7 @@ class Hold:
         self.shift, self.turn = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1))
 
     def __call__(self, sample: TrackerSample, lost: Lost) -> TrackerSample:
-        """Return the sample with lost trackers filled in, and returning ones on the way to their true poses."""
+        """Return the sample with lost trackers filled in, and returning ones on the way to true poses."""
         last = self.last or self._first(sample, lost)
         returning = [was and not is_lost for was, is_lost in zip(self.lost, lost, strict=True)]
         self.last, self.lost = sample, lost
@@ -221,8 +221,7 @@ class Resampler:
 
 
 class TrackerFrames:
-    """Turns samples of three trackers into frames at the network's rate, by the rules at the top of this
-    file.
+    """Turns samples of three trackers into frames at the network's rate, by the rules at this file's top.
 
     Args:
         skeleton: the network's body.

@@ -16,7 +16,7 @@ from memmlp.common.errors import InputError
 from memmlp.live.rotations import BodyTree
 
 STATURE = 1.72 / 1.57
-"""Body height over the height of the head joint above the lowest joint, as the built-in adult has it."""
+"""The built-in adult's body height, divided by the height of the head joint above the lowest joint."""
 
 HEIGHTS = (0.5, 2.5)  # metres; from a small child to more than the tallest person
 DEEPEST = 100.0  # metres that a floor may be from the height zero

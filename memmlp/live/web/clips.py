@@ -16,7 +16,7 @@ from memmlp.live.spaces import SPACES
 from memmlp.motion.body import FPS
 
 NUMBERS = 9 + 12 + 66
-"""Of a frame: positions and quaternions (xyzw) of head and wrists, true joints; metres, axes of openxr."""
+"""Numbers per frame: positions and quaternions (xyzw) of head and wrists, joints; metres, openxr axes."""
 
 
 class SiteClip(NamedTuple):

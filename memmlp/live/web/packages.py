@@ -27,7 +27,7 @@ WEBGPU = {
 
 
 DOCUMENTED = re.compile(rb"^[ \t]*/\*\*(?!\s*\* @license)(?:(?!\*/).)*\*/[ \t]*\n", re.MULTILINE | re.DOTALL)
-"""A comment for a library's developers, on lines of its own: a third of three.js. Licences stay."""
+"""Comments for a library's developers on lines of their own, a third of three.js; licences are kept."""
 
 
 def write_packages(folder: Path, webgpu: bool) -> dict[str, str]:

@@ -32,7 +32,7 @@ SHARED = {
     "memmlp.live.player": ("stage.js", "history.js"),
     "memmlp.common": ("theme.js", "dom.js", "style.css"),
 }
-"""Files of other rooms' pages that a site has, too."""
+"""Files of other pages of the package that a site uses, too."""
 ABOUT = "site.json"
 
 
