@@ -36,7 +36,7 @@ ORIGIN = {
 
 
 TURNED = {Verdict.HIGHER: Verdict.LOWER, Verdict.LOWER: Verdict.HIGHER}
-"""The verdicts that change when a difference is turned round."""
+"""The verdicts that change when a difference's sign is reversed."""
 
 
 class KeptTable(NamedTuple):

@@ -12,7 +12,7 @@ from memmlp.tables.table_text import places, signed, with_unit
 
 SIGNS = {1: "higher", -1: "lower", 0: "open", None: "no verdict"}
 NEAR = 0.5
-"""A prediction is near where it is beyond the measured range by at most this part of it, in decades."""
+"""A prediction is near if it exceeds the measured range by at most this fraction of the range, in decades."""
 
 
 def scaling_section(found: Trends) -> str:

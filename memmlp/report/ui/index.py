@@ -17,7 +17,7 @@ from memmlp.runs.identity import ID
 from memmlp.runs.run import Run
 
 FORMAT = hashlib.sha256(Path(run_facts.__file__).read_bytes()).hexdigest()[:16]
-"""Facts that other code made are parsed again."""
+"""A digest of the code that makes facts; stored facts from other code are made again."""
 
 FILES = ("config.yaml", "manifest.json", "metrics.jsonl", "DONE", "FAILED", "results.json", "notes.json")
 FOLDERS = ("evaluations", "deployments")

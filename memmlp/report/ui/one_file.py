@@ -19,7 +19,7 @@ SECONDS = 4  # the length of a replay
 MOST_REPLAYS = 4
 ERROR = "stream.rotation.MPJPE"
 CURVES = ("train loss", "val rotation ", "val position MPJPE", "val loss")
-"""The beginnings of the names of the curves that are kept."""
+"""Curves whose names begin like this are kept."""
 
 
 class ReportedSweep(NamedTuple):

@@ -31,7 +31,7 @@ FILES = {
     "theme.js": SHARED,
     **MODULES,
 }
-"""All files that there are, with the package that has them; nothing else is ever sent."""
+"""All files of the page, with the package that contains each; no other file is ever sent."""
 
 
 @cache

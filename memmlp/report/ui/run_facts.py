@@ -19,7 +19,7 @@ from memmlp.runs.run import Run
 from memmlp.runs.shown_name import run_name
 
 HIDDEN = ("paths", "tracking", "tracker", "force", "hydra", "save_predictions")
-"""Groups of the config that say nothing about a run."""
+"""Config groups that are not shown with a run."""
 
 ACTING = {key.split(".")[0] for key in INFERENCE}
 """Groups of the config that say how a trained network is used."""
@@ -31,7 +31,7 @@ COSTS = {
     "parameters": "", "macs": "",
     "onnx_bytes": "",
 }  # fmt: skip
-"""What is shown of a deployment's costs, with units. Lower is better."""
+"""The costs of a deployment that are shown, with units; lower is better."""
 
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 

@@ -26,7 +26,7 @@ SHOWN_FILES = (
     "notes.json",
     "poses.png",
 )
-"""Files of a run that the page may show as they are."""
+"""Files of a run that the page may show unchanged."""
 
 MOST_FILES = 200
 
