@@ -15,13 +15,13 @@ BRANCHES = ("rotation", "position", "combined")
 SIZES = ("FLOPs", "MACs", "parameters", "size")
 """The costs that a network has before it is trained, on any machine."""
 COSTS = (*SIZES, "ms", "network ms", "pose ms", "ratio", "FPS")
-"""Metrics that are costs and no errors.
+"""Metrics that are costs, not errors.
 
-Their units: GFLOP, GMAC, millions, MB, ms, multiples of the yardstick's time, and frames a second.
+Their units: GFLOP, GMAC, millions, MB, ms, multiples of the yardstick's time, and frames per second.
 """
 
 COMPUTE = "compute"
-"""The FLOPs of a cell's training, its control's, as something that effects are shown against."""
+"""The name of the axis of compute: the FLOPs of training a cell's control."""
 
 
 @dataclass(frozen=True)

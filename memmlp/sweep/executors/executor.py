@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 Work = Callable[[], str | None]
-"""What a worker does. It returns None at its end, or a line that says why this worker could do nothing."""
+"""A worker's work. It returns None at its end, or a line that says why this worker could do no work."""
 
 
 class Handle(Protocol):

@@ -10,7 +10,7 @@ from memmlp.common.errors import InputError
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 Share = tuple[str, ...]
-"""The GPUs of one worker, by their names in CUDA_VISIBLE_DEVICES; empty for a worker without."""
+"""The GPUs of one worker, by their names in CUDA_VISIBLE_DEVICES; empty for a worker without GPUs."""
 
 
 def visible_gpus() -> Share:

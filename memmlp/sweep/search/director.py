@@ -32,7 +32,7 @@ DROPPED = (TrialState.PRUNED, TrialState.FAIL)  # states of trials whose runs no
 Compose = Callable[[Mapping[str, Value]], Sequence[Sequence[RunTask]]]
 """Makes a list of tasks for each seed from a trial's values; the last task of a list is the seed's run.
 
-Raises InputError where the config refuses the values.
+Raises InputError if the config rejects the values.
 """
 
 
