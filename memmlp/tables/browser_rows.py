@@ -17,7 +17,7 @@ NUMBER = 17  # the table's, in the paper
 LARGEST = 1_000_000  # bytes of a file
 GRAPHS = {"naive": "as published", "streaming": "stream"}
 BASE = ("AvatarPoser", "naive", "fp32")
-"""What ratios on the page are to: AvatarPoser as published."""
+"""The network to which ratios on the page refer: AvatarPoser as published."""
 
 Check = Callable[[Any], bool]
 

@@ -26,7 +26,7 @@ Groups = np.ndarray | Sequence[object] | None
 
 
 TRUST = 5.0
-"""How much of B may be taken as noise that is not skewed: at most TRUST x level x E.
+"""How much of B may count as noise that is not skewed: at most TRUST x level x E.
 
 It was measured by simulation; see `Error.half` and docs/statistics.md.
 """

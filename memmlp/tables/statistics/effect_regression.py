@@ -36,7 +36,7 @@ from memmlp.tables.statistics.crossed import Error, Groups, by_group
 from memmlp.tables.statistics.paired_differences import LEVEL
 
 LEAST = 2
-"""The least degrees of freedom of a fit: cells beyond as many as it has coefficients."""
+"""The least degrees of freedom of a fit: the number of cells minus the number of coefficients."""
 
 
 class Estimate(NamedTuple):
