@@ -20,7 +20,7 @@ from memmlp.runs.run import Run
 from memmlp.runs.shown_name import run_name
 
 SYSTEM = "system.jsonl"
-"""The log of what a run's machine did meanwhile, in its folder."""
+"""The log of the machine's load during a run, in the run's folder."""
 
 
 class Point(NamedTuple):
