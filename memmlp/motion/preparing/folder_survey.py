@@ -112,7 +112,7 @@ def _inspect(path: Path, file: str, clip: Clip, min_frames: int) -> ClipRecord:
 
 
 def _content(clip: Clip) -> str:
-    """Return a digest of the frames in single precision, the same at any rate and in any type."""
+    """Return a digest of the frames in single precision, whatever their saved type and stated frame rate."""
     numbers = np.concatenate(
         [clip.poses.reshape(len(clip), -1), clip.trans], 1, dtype="<f4", casting="same_kind"
     )
