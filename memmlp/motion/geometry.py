@@ -65,7 +65,10 @@ def matrix_to_sixd(matrix: Tensor) -> Tensor:
 
 
 def sixd_to_matrix(sixd: Tensor) -> Tensor:
-    """Convert 6D (..., 6) to matrices (..., 3, 3) by Gram-Schmidt; any 6 numbers give a rotation."""
+    """Convert 6D (..., 6) to matrices (..., 3, 3) by Gram-Schmidt.
+
+    Any two columns that are not zero and not parallel give a rotation.
+    """
     first = F.normalize(sixd[..., :3], dim=-1)
     second = sixd[..., 3:]
     second = F.normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
