@@ -35,7 +35,7 @@ def scaling_summary(found: Trends) -> str:
 
 
 def picture_name(found: Trends) -> str:
-    """Return the name of the figure's file, beside the page."""
+    """Return the name of the figure's file, which lies in the page's folder."""
     return f"{found.name}.png"
 
 

@@ -66,7 +66,7 @@ PLACED = [joint for joint in range(N_JOINTS) if follows(joint)]
 
 
 class Parts(NamedTuple):
-    """What is predicted of a frame, in the network's coordinates without z-scores.
+    """What the network predicts for a frame, in its own coordinates without z-scores.
 
     Attributes:
         sixd: the local 6D rotations (..., 11, 6) of the root and of the joints KEPT.
